@@ -1,0 +1,1 @@
+"""One file per kind of input folder; each turns it into tiles."""

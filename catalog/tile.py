@@ -1,0 +1,56 @@
+"""One tile: an id, where its cells lie, and where each of its layers is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from catalog.grid import Grid
+
+LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road")
+"""Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and
+terrain heights (m) incl. bridges, true road mask."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Where one layer of a tile is."""
+
+    name: str
+    """One of `LAYERS`."""
+    files: tuple[str, ...]
+    """Files that cover the tile, relative to the tile's root where they lie below it; of files that
+    overlap, the first with a value wins."""
+    values: tuple[int, ...] = ()
+    """Cell values that mean road, for the masks; empty: every value but 0 and nodata."""
+    crs: str | None = None
+    """CRS of files that carry none themselves."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A square of ground with the layers known for it."""
+
+    id: str
+    """Unique in its catalog; `EASTING_NORTHING` of the south-west corner where we cut the tiles."""
+    grid: Grid
+    """The tile's core, without halo."""
+    layers: tuple[Layer, ...]
+    """In the order of `LAYERS`."""
+    root: str
+    """Folder that relative files are relative to (that of the catalog)."""
+    datetime: datetime
+    """When the data was taken, with a time zone."""
+    datetime_assumed: bool = False
+    """True if no tag told the date and the file's time stands in."""
+    stratum: str = ""
+    """Class of area for reports (urban, suburban, rural), or empty."""
+
+    def layer(self, name: str) -> Layer | None:
+        """Return the named layer, or None if the tile has none."""
+        return next((layer for layer in self.layers if layer.name == name), None)
+
+    def paths(self, layer: Layer) -> tuple[Path, ...]:
+        """Return the layer's files as paths that can be opened."""
+        return tuple(Path(self.root) / file for file in layer.files)

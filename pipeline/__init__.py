@@ -1,0 +1,1 @@
+"""What happens to many tiles: configuration, graph, store, execution, report, command line."""
