@@ -2,6 +2,7 @@
 
 from catalog.errors import CatalogError
 from catalog.grid import Bounds, Grid
+from catalog.index import Catalog
 from catalog.tile import LAYERS, Layer, Tile
 
-__all__ = ["LAYERS", "Bounds", "CatalogError", "Grid", "Layer", "Tile"]
+__all__ = ["LAYERS", "Bounds", "Catalog", "CatalogError", "Grid", "Layer", "Tile"]

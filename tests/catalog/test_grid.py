@@ -1,0 +1,76 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catalog import CatalogError, Grid
+
+UTM = "EPSG:25832"
+TILE = Grid(UTM, 295500.0, 5629500.0, 1.0, 250, 250)
+
+
+def test_centres_of_a_paper_tile_span_249_m():
+    assert TILE.eastings[-1] - TILE.eastings[0] == 249
+    assert TILE.northings[0] - TILE.northings[-1] == 249
+    assert TILE.bounds == (295500, 5629250, 295750, 5629500)
+    assert TILE.transform @ (0, 0) == (295500, 5629500)
+
+
+def test_tile_ids_are_the_south_west_corner():
+    assert [i for i, _ in TILE.tiles(250)] == ["295500_5629250"]
+    shifted = Grid(UTM, 295499.0, 5629501.0, 1.0, 10, 10)
+    assert [i for i, _ in shifted.tiles(250)] == [
+        "295250_5629250",
+        "295500_5629250",
+        "295250_5629500",
+        "295500_5629500",
+    ]
+
+
+def test_a_rounding_error_in_the_corner_adds_no_tile():
+    almost = Grid(UTM, 295499.9999, 5629500.0001, 1.0, 250, 250)
+    assert [i for i, _ in almost.tiles(250)] == ["295500_5629250"]
+
+
+def test_ids_west_and_south_of_the_origin():
+    assert [i for i, _ in Grid(UTM, -10.0, -5.0, 1.0, 5, 5).tiles(250)] == ["-250_-250"]
+
+
+@pytest.mark.parametrize("size", [250.5, 0.3])
+def test_a_tile_must_be_whole_metres_and_cells(size):
+    with pytest.raises(CatalogError, match="whole number"):
+        list(TILE.tiles(size))
+
+
+@given(halo=st.floats(0, 60), cell=st.sampled_from([0.25, 0.5, 1.0, 2.0]))
+def test_core_sits_in_the_middle_of_its_buffer(halo, cell):
+    core = Grid(UTM, 500000.0, 5600000.0, cell, 40, 30)
+    outer = core.buffered(halo)
+    rows, cols = outer.window(core)
+    assert (rows.stop - rows.start, cols.stop - cols.start) == core.shape
+    assert rows.start == outer.height - rows.stop == cols.start == outer.width - cols.stop
+    assert halo - 1e-5 <= rows.start * cell < halo + cell + 1e-5
+
+
+def test_window_refuses_another_lattice_and_a_larger_grid():
+    with pytest.raises(CatalogError, match="does not lie"):
+        TILE.window(Grid(UTM, 295500.4, 5629500.0, 1.0, 10, 10))
+    with pytest.raises(CatalogError, match="does not lie"):
+        TILE.window(TILE.buffered(5))
+
+
+@given(row=st.integers(0, 249), col=st.integers(0, 249))
+def test_every_centre_lies_in_its_own_cell(row, col):
+    got = TILE.cells(TILE.eastings[col], TILE.northings[row])
+    assert (int(got[0]), int(got[1])) == (row, col)
+
+
+def test_points_outside_get_the_nearest_cell():
+    row, col = TILE.cells(TILE.west - 5, TILE.south - 5)
+    assert (int(row), int(col)) == (249, 0)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(CatalogError, match="cell size"):
+        Grid(UTM, 0, 0, 0.0, 1, 1)
+    with pytest.raises(CatalogError, match="at least one cell"):
+        Grid(UTM, 0, 0, 1.0, 0, 1)

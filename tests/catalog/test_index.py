@@ -1,0 +1,100 @@
+import json
+import shutil
+from datetime import UTC, datetime
+
+import geopandas
+import pyarrow.parquet as pq
+import pystac
+import pytest
+
+from catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
+
+
+def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
+    grid = Grid(crs, east, 5629500.0, 1.0, 250, 250)
+    made = tuple(
+        Layer(name, (f"{name}/a.tif", f"{name}/b.tif"), (1, 3) if name == "road_mask" else ())
+        for name in LAYERS
+        if name in layers
+    )
+    return Tile(f"{east}_5629250", grid, made, str(root), datetime(2020, 5, 1, 10, tzinfo=UTC), True, "urban")
+
+
+@pytest.mark.parametrize("name", ["catalog.parquet", "catalog.json", "catalog.geojson"])
+def test_round_trip(tmp_path, name):
+    tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS))
+    Catalog(tiles).write(tmp_path / name)
+    assert Catalog.read(tmp_path / name).tiles == tiles
+
+
+def test_round_trip_of_a_crs_without_a_code(tmp_path):
+    from pyproj import CRS
+
+    wkt = CRS("+proj=tmerc +lat_0=1 +lon_0=7 +x_0=300000 +y_0=5000000 +ellps=GRS80 +units=m").to_wkt()
+    tiles = (tile(295500, tmp_path, crs=wkt),)
+    Catalog(tiles).write(tmp_path / "c.parquet")
+    assert Catalog.read(tmp_path / "c.parquet").tiles == tiles
+
+
+def test_schema_is_the_same_for_every_catalog(tmp_path):
+    Catalog((tile(295500, tmp_path, layers=("dsm",)),)).write(tmp_path / "a.parquet")
+    Catalog((tile(295500, tmp_path, layers=LAYERS),)).write(tmp_path / "b.parquet")
+    assert pq.read_schema(tmp_path / "a.parquet").equals(pq.read_schema(tmp_path / "b.parquet"))
+
+
+def test_files_below_the_catalog_move_with_it(tmp_path):
+    home = tmp_path / "home"
+    Catalog((tile(295500, home),)).write(home / "c.json")
+    shutil.move(home, tmp_path / "away")
+    (moved,) = Catalog.read(tmp_path / "away" / "c.json").tiles
+    layer = moved.layer("dsm")
+    assert layer is not None
+    assert layer.files == ("dsm/a.tif", "dsm/b.tif")
+    assert moved.paths(layer)[0] == tmp_path / "away" / "dsm" / "a.tif"
+
+
+def test_files_elsewhere_are_absolute(tmp_path):
+    Catalog((tile(295500, tmp_path / "data"),)).write(tmp_path / "catalogs" / "c.json")
+    (read,) = Catalog.read(tmp_path / "catalogs" / "c.json").tiles
+    assert read.layers[0].files[0] == str(tmp_path / "data" / "dsm" / "a.tif")
+
+
+def test_it_is_stac_and_opens_as_a_map(tmp_path):
+    Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
+    Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.parquet")
+    (feature,) = json.loads((tmp_path / "c.json").read_text())["features"]
+    item = pystac.Item.from_dict(feature)
+    assert item.ext.proj.code == "EPSG:25832"
+    assert item.assets["dsm"].href == "dsm/a.tif"
+    frame = geopandas.read_parquet(tmp_path / "c.parquet")
+    assert frame.crs == "EPSG:4326"
+    west, south, east, north = frame.to_crs("EPSG:25832").total_bounds
+    # The outline in degrees is a straight-edged copy: exact in the corners, so to the centimetre.
+    assert (west, south, east, north) == pytest.approx((295500, 5629250, 295750, 5629500), abs=0.01)
+
+
+def test_select(tmp_path):
+    catalog = Catalog((tile(295500, tmp_path), tile(295750, tmp_path), tile(296000, tmp_path)))
+    assert [t.id for t in catalog.select(ids=["295750_5629250"]).tiles] == ["295750_5629250"]
+    assert [t.id for t in catalog.select(bbox=(295600, 5629300, 295750, 5629310)).tiles] == ["295500_5629250"]
+    with pytest.raises(CatalogError, match="did you mean 295750_5629250"):
+        catalog.select(ids=["295751_5629250"])
+    with pytest.raises(CatalogError, match="no tile touches --bbox 0 0 1 1"):
+        catalog.select(bbox=(0, 0, 1, 1))
+
+
+def test_what_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(CatalogError, match="missing.parquet does not exist"):
+        Catalog.read(tmp_path / "missing.parquet")
+    (tmp_path / "bad.parquet").write_bytes(b"not parquet at all")
+    (tmp_path / "bad.json").write_text('{"features": [{}]}')
+    for name in ("bad.parquet", "bad.json"):
+        with pytest.raises(CatalogError, match=f"{name} is not a FlexRoad catalog"):
+            Catalog.read(tmp_path / name)
+    with pytest.raises(CatalogError, match=r"ends in .parquet"):
+        Catalog(()).write(tmp_path / "catalog.csv")
+
+
+def test_doubled_ids_are_refused(tmp_path):
+    with pytest.raises(CatalogError, match="295500_5629250 stand more than once"):
+        Catalog((tile(295500, tmp_path), tile(295500, tmp_path)))
