@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+from pyproj import CRS
+from rasterio.io import MemoryFile
+
+from catalog.grid import Grid
+from tasks.errors import TaskError
+from tasks.export import cog
+
+GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 600, 250)
+
+
+def plane(grid: Grid) -> np.ndarray:
+    heights = 100 + 0.01 * (grid.eastings - grid.west) + 0.02 * (grid.northings[:, None] - grid.south)
+    heights[:5, :7] = np.nan
+    return heights
+
+
+def test_heights_read_back_in_place():
+    with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
+        assert raster.dtypes == ("float32",)
+        assert np.isnan(raster.nodata)
+        assert raster.crs.to_epsg() == 25832
+        assert raster.bounds == GRID.bounds
+        assert raster.units == ("m",)
+        np.testing.assert_array_equal(raster.read(1), plane(GRID).astype(np.float32))
+        easting, northing = 295500.0 + 400.5, 5629250.0 + 200.5
+        (value,) = next(raster.sample([(easting, northing)]))
+    assert value == pytest.approx(100 + 0.01 * 400.5 + 0.02 * 200.5, abs=1e-5)
+
+
+def test_road_reads_back():
+    road = plane(GRID) > 104
+    with MemoryFile(cog.encode_road(road, GRID)) as file, file.open() as raster:
+        assert raster.dtypes == ("uint8",)
+        np.testing.assert_array_equal(raster.read(1), road)
+
+
+def test_it_is_cloud_optimised():
+    with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
+        structure = raster.tags(ns="IMAGE_STRUCTURE")
+        assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
+        assert raster.overviews(1) == [2]
+
+
+def test_wkt_is_kept():
+    wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=7 +ellps=GRS80 +units=m").to_wkt()
+    grid = Grid(wkt, 0.0, 20.0, 0.5, 40, 40)
+    with MemoryFile(cog.encode_road(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
+        (latitude,) = [
+            p.value for p in CRS(raster.crs.to_wkt()).coordinate_operation.params if "lat" in p.name.lower()
+        ]
+        assert latitude == 50
+        assert raster.res == (0.5, 0.5)
+
+
+def test_a_wrong_shape_is_refused():
+    with pytest.raises(TaskError, match=r"\(250, 599\).*\(250, 600\)"):
+        cog.encode_height(plane(GRID)[:, 1:], GRID)
+
+
+def test_equal_arrays_give_equal_bytes():
+    assert cog.encode_height(plane(GRID), GRID) == cog.encode_height(plane(GRID), GRID)

@@ -1,0 +1,82 @@
+import io
+
+import numpy as np
+import pytest
+import pyvista
+import trimesh
+
+from tasks.export import ply
+from tasks.types import Mesh
+
+
+def roof(crs: str = "EPSG:25832") -> Mesh:
+    vertices = np.array([[0.1, 0.2, 0.3], [10, 0, 1], [10, 10, 2.001], [0, 10, 3.7], [5, 15, 4]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4]], np.int32)
+    return Mesh(crs, (295500.0, 5629250.0, 150.0), vertices, faces, np.array([False, True, False]))
+
+
+def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Header lines, vertices and faces, by the PLY description alone."""
+    head, body = data.split(b"end_header\n", 1)
+    lines = head.decode("ascii").splitlines()
+    kinds = {"double": "<f8", "uchar": "u1", "int": "<i4"}
+    counts, fields, element = {}, {}, ""
+    for words in (line.split() for line in lines):
+        if words[0] == "element":
+            element, counts[words[1]], fields[words[1]] = words[1], int(words[2]), []
+        elif words[:2] == ["property", "list"]:
+            fields[element] += [("count", kinds[words[2]]), (words[4], kinds[words[3]], 3)]
+        elif words[0] == "property":
+            fields[element].append((words[2], kinds[words[1]]))
+    vertices = np.frombuffer(body, np.dtype(fields["vertex"]), counts["vertex"])
+    faces = np.frombuffer(body, np.dtype(fields["face"]), counts["face"], vertices.nbytes)
+    assert len(body) == vertices.nbytes + faces.nbytes
+    return lines, vertices, faces
+
+
+def test_coordinates_are_absolute_and_exact():
+    mesh = roof()
+    _, vertices, faces = parse(ply.encode(mesh))
+    truth = mesh.vertices + np.array(mesh.origin)
+    for axis, name in enumerate("xyz"):
+        np.testing.assert_array_equal(vertices[name], truth[:, axis])
+    assert (faces["count"] == 3).all()
+    np.testing.assert_array_equal(faces["vertex_indices"], mesh.faces)
+    np.testing.assert_array_equal(faces["class"], [2, 11, 2])
+
+
+def test_header_names_crs_and_origin():
+    lines, _, _ = parse(ply.encode(roof()))
+    assert lines[:4] == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment crs EPSG:25832",
+        "comment origin 295500 5629250 150",
+    ]
+
+
+@pytest.mark.parametrize("crs", ['PROJCRS["a",\n  BASEGEOGCRS["b"]]', 'PROJCRS["Réunion"]'])
+def test_wkt_stays_one_ascii_line(crs):
+    lines, vertices, _ = parse(ply.encode(roof(crs)))
+    assert len([line for line in lines if line.startswith("comment crs PROJCRS")]) == 1
+    assert len(vertices) == 5
+
+
+def test_trimesh_reads_it():
+    mesh = roof()
+    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh)), file_type="ply", process=False)
+    np.testing.assert_array_equal(read.vertices, mesh.vertices + np.array(mesh.origin))
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+
+
+def test_vtk_reads_it(tmp_path):
+    mesh = roof()
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(ply.encode(mesh))
+    read = pyvista.read(path)
+    np.testing.assert_array_equal(read.faces.reshape(-1, 4)[:, 1:], mesh.faces)
+    np.testing.assert_allclose(read.points, mesh.vertices + np.array(mesh.origin), rtol=1e-7)
+
+
+def test_equal_meshes_give_equal_bytes():
+    assert ply.encode(roof()) == ply.encode(roof())
