@@ -37,7 +37,7 @@ def encode_height(height: Floats, grid: Grid) -> bytes:
     )
 
 
-def encode_road(road: Bools, grid: Grid) -> bytes:
+def encode_mask(road: Bools, grid: Grid) -> bytes:
     """Return a road mask, ``(H, W)``, as GeoTIFF: uint8, 1 is road.
 
     Raises

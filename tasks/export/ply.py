@@ -12,7 +12,7 @@ from tasks.types import Mesh
 
 VERSION = 1
 NAME = ".ply"
-MEDIA_TYPE = "application/ply"
+MEDIA_TYPE = "application/octet-stream"
 
 ROAD, GROUND = 11, 2
 """Classes of faces: the ASPRS codes that LAS files use for road surface and ground."""

@@ -31,7 +31,7 @@ def test_heights_read_back_in_place():
 
 def test_road_reads_back():
     road = plane(GRID) > 104
-    with MemoryFile(cog.encode_road(road, GRID)) as file, file.open() as raster:
+    with MemoryFile(cog.encode_mask(road, GRID)) as file, file.open() as raster:
         assert raster.dtypes == ("uint8",)
         np.testing.assert_array_equal(raster.read(1), road)
 
@@ -46,7 +46,7 @@ def test_it_is_cloud_optimised():
 def test_wkt_is_kept():
     wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=7 +ellps=GRS80 +units=m").to_wkt()
     grid = Grid(wkt, 0.0, 20.0, 0.5, 40, 40)
-    with MemoryFile(cog.encode_road(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
+    with MemoryFile(cog.encode_mask(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
         (latitude,) = [
             p.value for p in CRS(raster.crs.to_wkt()).coordinate_operation.params if "lat" in p.name.lower()
         ]
