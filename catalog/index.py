@@ -74,7 +74,7 @@ class Catalog:
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, unlike {path.name}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        items = [_item(_rooted(tile, path.resolve().parent)) for tile in self.tiles]
+        items = [item(_rooted(tile, path.resolve().parent)) for tile in self.tiles]
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             (_write_json if path.suffix in JSON_SUFFIXES else _write_parquet)(items, temporary)
@@ -129,7 +129,8 @@ def _to_wgs84(crs: str) -> Transformer:
         raise CatalogError(f"unknown CRS {crs[:60]!r}: {error}") from error
 
 
-def _item(tile: Tile) -> Item:
+def item(tile: Tile) -> Item:
+    """Return the tile as a STAC item; file names as they stand in its layers."""
     grid = tile.grid
     west, south, east, north = grid.bounds
     to_wgs84 = _to_wgs84(grid.crs)
@@ -224,6 +225,6 @@ def _write_parquet(items: list[Item], path: Path) -> None:
 def _everything() -> Item:
     layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832") for name in LAYERS)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
-    item = _item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
-    item["properties"]["proj:wkt2"] = ""
-    return item
+    whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
+    whole["properties"]["proj:wkt2"] = ""
+    return whole

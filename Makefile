@@ -1,0 +1,56 @@
+.DEFAULT_GOAL := help
+.PHONY: help setup reproduce run rerun test lint bench clean
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# At these sizes more than one BLAS thread per process is a loss.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export NUMBA_NUM_THREADS := 1
+
+TILES ?= 6
+SEED ?= 1
+CONFIG ?= paper
+OUT ?= runs/run
+
+help: ## Show this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+
+setup: $(STAMP) ## Install everything into .venv
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	touch $@
+
+reproduce: $(STAMP) ## The paper's main comparison on synthetic tiles with known truth (TILES=6 SEED=1)
+	$(BIN)/flexroad catalog synthetic -o runs/synthetic-$(TILES)-$(SEED) --tiles $(TILES) --seed $(SEED)
+	$(BIN)/flexroad run --config paper --catalog runs/synthetic-$(TILES)-$(SEED)/catalog.parquet --out runs/reproduce-$(TILES)-$(SEED)
+	$(BIN)/flexroad report runs/reproduce-$(TILES)-$(SEED) --format html
+	$(BIN)/flexroad report runs/reproduce-$(TILES)-$(SEED) --format md
+
+run: $(STAMP) ## Run a catalog: make run CONFIG=paper CATALOG=... OUT=...
+	@test -n "$(CATALOG)" || { echo "error: name a catalog: make run CATALOG=catalog.parquet [CONFIG=$(CONFIG)] [OUT=$(OUT)]" >&2; exit 2; }
+	$(BIN)/flexroad run --config $(CONFIG) --catalog $(CATALOG) --out $(OUT)
+
+rerun: $(STAMP) ## Bring tiles of a run up to date: make rerun RUN=... [TILE=...]
+	@test -n "$(RUN)" || { echo "error: name a run: make rerun RUN=runs/run [TILE=295500_5629250]" >&2; exit 2; }
+	$(BIN)/flexroad rerun $(RUN) $(foreach tile,$(TILE),--tile $(tile))
+
+test: $(STAMP) ## Run the tests
+	$(BIN)/python -m pytest
+
+lint: $(STAMP) ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(STAMP) ## Print the benchmarks' tables
+	@for bench in tests/bench/bench_*.py; do echo "== $$bench"; PYTHONPATH=. $(BIN)/python $$bench || exit 1; done
+
+clean: ## Remove the environment, caches and runs
+	rm -rf $(VENV) runs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,383 @@
+"""``flexroad ...``: the command line. Exit code 0: all done, 1: some tiles failed, 2: nothing could start."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from catalog.errors import CatalogError
+from pipeline.errors import ConfigError
+from pipeline.execute import ONE_THREAD
+
+if TYPE_CHECKING:
+    from pipeline.execute import Executor
+    from pipeline.graph import TileGraph
+    from pipeline.run import Run
+    from pipeline.work import TileResult
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Turn aerial geodata into smooth, light, georeferenced 3D road surfaces, for many tiles at once.",
+)
+catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
+configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
+app.add_typer(catalogs, name="catalog")
+app.add_typer(configs, name="config")
+
+SEVERAL = ("--tile", "--road-value")
+"""Options that take several values in a row."""
+FOLDER_FIRST = ("rerun", "rasters")
+"""Commands with a folder of their own, which must come first for that."""
+
+
+def main() -> None:
+    """Run the command line; what the user did wrong becomes one line and exit code 2."""
+    # Before numpy is imported anywhere, here and in the workers that inherit it.
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)
+    try:
+        app(spread(sys.argv[1:]), standalone_mode=True)
+    except (CatalogError, ConfigError) as error:
+        for line in str(error).splitlines():
+            print(f"error: {line}", file=sys.stderr)  # noqa: T201
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)  # noqa: T201
+        sys.exit(130)
+    except BrokenPipeError:
+        # `flexroad ... | head` closed the pipe: no fault of the run.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+def spread(words: Sequence[str]) -> list[str]:
+    """Repeat the name of an option before each of its values: ``--tile a b`` -> ``--tile a --tile b``."""
+    for command, following in itertools.pairwise(words):
+        if command in FOLDER_FIRST and following.startswith("-"):
+            # Of `rerun --tile a b`, b is the run.
+            return list(words)
+    out: list[str] = []
+    name = ""
+    for word in words:
+        if word.startswith("-") and not word.lstrip("-").isdigit():
+            name = word if word in SEVERAL else ""
+        elif name and out[-1] != name:
+            out.append(name)
+        out.append(word)
+    return out
+
+
+def _say(text: str) -> None:
+    typer.echo(text)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
+) -> None:
+    if version:
+        import importlib.metadata
+
+        _say(importlib.metadata.version("flexroad"))
+        raise typer.Exit
+
+
+# --- catalog ------------------------------------------------------------------------------------------
+
+
+@catalogs.command("rasters")
+def catalog_rasters(
+    root: Annotated[Path, typer.Argument(help="Folder of rasters.")],
+    dsm: Annotated[str, typer.Option(help="Files of the surface model, relative to ROOT ('dsm/*.tif').")],
+    dtm: Annotated[str, typer.Option(help="Files of the terrain model.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")],
+    dop: Annotated[str | None, typer.Option(help="Files of the orthophoto.")] = None,
+    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    road_value: Annotated[
+        list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
+    ] = None,
+    reference: Annotated[str | None, typer.Option(help="Files of true heights, for the evaluation.")] = None,
+    reference_road: Annotated[str | None, typer.Option(help="Files of the true road mask.")] = None,
+    tile_size: Annotated[float, typer.Option(help="Size of a tile in m.")] = 250,
+    min_cover: Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")] = 0.25,
+    date: Annotated[datetime | None, typer.Option(help="When the data was taken.")] = None,
+    crs: Annotated[str | None, typer.Option(help="CRS of files that carry none: EPSG:25832.")] = None,
+) -> None:
+    """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
+    from catalog import Catalog
+    from catalog.sources import rasters
+
+    asked = {
+        "dsm": dsm,
+        "dtm": dtm,
+        "dop": dop,
+        "road_mask": road_mask,
+        "reference": reference,
+        "reference_road": reference_road,
+    }
+    found = rasters.index(
+        root,
+        {name: pattern for name, pattern in asked.items() if pattern is not None},
+        road_values=tuple(road_value or ()),
+        tile_size_m=tile_size,
+        date=date.astimezone(UTC) if date else None,
+        crs=crs,
+        min_cover=min_cover,
+    )
+    for note in found.notes:
+        typer.echo(f"note: {note}", err=True)
+    catalog = Catalog(found.tiles)
+    catalog.write(output)
+    _say(f"{len(catalog.tiles)} tiles in {output}")
+    _say(f"next: flexroad run --config paper --catalog {output} --out RUN")
+
+
+@catalogs.command("synthetic")
+def catalog_synthetic(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    tiles: Annotated[int, typer.Option(min=1, help="Number of tiles.")] = 4,
+    seed: Annotated[int, typer.Option(help="The same seed makes the same scenes.")] = 0,
+) -> None:
+    """Make scenes with known truth: rasters, truth and a catalog."""
+    from pipeline.synthesis import write_scenes
+
+    path = write_scenes(output, tiles, seed)
+    _say(f"{tiles} tiles in {path}")
+    _say(f"next: flexroad run --config paper --catalog {path} --out RUN")
+
+
+@catalogs.command("show")
+def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+    """List the tiles of a catalog."""
+    from catalog import Catalog
+
+    catalog = Catalog.read(path)
+    for tile in catalog.tiles:
+        layers = " ".join(f"{layer.name}({len(layer.files)})" for layer in tile.layers)
+        when = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
+        size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
+        _say(f"{tile.id}  {size}  {when}  {tile.stratum or '-'}  {layers}")
+    systems = sorted({tile.grid.crs for tile in catalog.tiles})
+    _say(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
+
+
+# --- run ----------------------------------------------------------------------------------------------
+
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]
+Scheduler = Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")]
+ExecutorName = Annotated[str, typer.Option("--executor", help="dask, or serial: one process, to debug with.")]
+
+
+@app.command("run")
+def run_command(
+    config: Annotated[str, typer.Option(help="Configuration: a YAML file or a shipped name (paper).")],
+    catalog: Annotated[Path, typer.Option(help="Catalog of tiles.")],
+    out: Annotated[Path, typer.Option(metavar="RUN", help="Folder of the run; an old one is resumed.")],
+    tile: Annotated[list[str] | None, typer.Option(help="Only these tiles.")] = None,
+    bbox: Annotated[
+        tuple[float, float, float, float] | None, typer.Option(metavar="W S E N", help="Only tiles here (m).")
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    executor: ExecutorName = "dask",
+    store: Annotated[Path | None, typer.Option(help="Folder of artefacts shared by runs.")] = None,
+    checksum: Annotated[
+        bool, typer.Option(help="Notice changed sources by bytes, not size and time.")
+    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the graph, do nothing.")] = False,
+) -> None:
+    """Bring every tile up to date; the same command resumes after whatever stopped it."""
+    from catalog import Catalog
+    from pipeline.config import load_config
+    from pipeline.run import Run
+
+    chosen = load_config(config)
+    tiles = Catalog.read(catalog).select(tile or (), bbox)
+    if not tiles.tiles:
+        raise ConfigError(f"catalog {catalog} has no tiles")
+    if dry_run:
+        from pipeline.graph import tile_graphs
+        from pipeline.plan import plan
+
+        root = store or out / "store"
+        for line in plan(tile_graphs(tiles, chosen, checksum), root, out):
+            _say(line)
+        return
+    run = Run.create(out, chosen, tiles, store, checksum)
+    _carry_out(run, _executor(executor, workers, scheduler))
+
+
+@app.command()
+def rerun(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    tile: Annotated[list[str] | None, typer.Option(help="These tiles.")] = None,
+    failed: Annotated[bool, typer.Option("--failed", help="The tiles that failed.")] = False,
+    from_stage: Annotated[
+        str | None, typer.Option("--from", metavar="STAGE", help="Compute this stage and what follows anew.")
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    executor: ExecutorName = "dask",
+) -> None:
+    """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
+    from pipeline.graph import STAGE_NAMES
+    from pipeline.run import Run, select
+
+    if from_stage is not None and from_stage not in STAGE_NAMES:
+        raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
+    anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
+    run = Run.open(path)
+    only = select(run, tile or (), failed)
+    _carry_out(run, _executor(executor, workers, scheduler), only, anew)
+
+
+def _executor(name: str, workers: int | None, scheduler: str | None) -> Executor:
+    from pipeline.execute import DaskExecutor, SerialExecutor
+
+    if name == "serial":
+        return SerialExecutor()
+    if name == "dask":
+        return DaskExecutor(workers, scheduler)
+    raise ConfigError(f"--executor {name}: there are dask and serial")
+
+
+def _carry_out(
+    run: Run,
+    executor: Executor,
+    only: Callable[[TileGraph], bool] | None = None,
+    anew: frozenset[str] = frozenset(),
+) -> None:
+    from rich.console import Console
+
+    from pipeline.progress import Watch
+    from pipeline.run import execute, summary
+
+    only = only or (lambda graph: True)
+    total = sum(1 for graph in run.graphs() if only(graph))
+    results: list[TileResult]
+    with Watch(total, Console(stderr=True)) as watch:
+        results = execute(run, executor, only, anew, watch)
+    how = summary(run)
+    _say(
+        f"{how.tiles} tiles: {how.done} done ({how.cached} of them before), {how.failed} failed, "
+        f"{how.pending} pending; results in {run.path}"
+    )
+    if results and all(result.status == "cached" for result in results):
+        _say("nothing had changed; `flexroad rerun RUN --from load` computes all anew")
+    if how.failed:
+        _say(f"next: flexroad status {run.path}, then flexroad rerun {run.path} --failed")
+        raise typer.Exit(1)
+    _say(f"next: flexroad report {run.path} --format html")
+
+
+@app.command()
+def status(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Tell how a run stands, and what failed why."""
+    import json
+    from dataclasses import asdict
+
+    from pipeline.run import Run, summary
+
+    how = summary(Run.open(path))
+    if as_json:
+        failures = [
+            {key: value for key, value in asdict(failure).items() if key != "trace"}
+            for failure in how.failures
+        ]
+        _say(json.dumps(asdict(how) | {"failures": failures}, indent=1))
+        return
+    counts = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
+    _say(f"{how.tiles} tiles: {counts}")
+    for failure in how.failures:
+        _say(f"  {failure.tile_id}  {failure.line}{f'  [{failure.file}]' if failure.file else ''}")
+
+
+# --- results ------------------------------------------------------------------------------------------
+
+
+@app.command()
+def report(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
+) -> None:
+    """Write RUN/report.<format>: the paper's main table over the run, worst tiles, steps, failures."""
+    from pipeline.report import FORMATS, write_report
+    from pipeline.run import Run
+
+    if form not in FORMATS:
+        raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
+    written = write_report(Run.open(path), form)
+    if form != "html":
+        _say(written.read_text())
+    typer.echo(f"written to {written}", err=True)
+
+
+@app.command()
+def query(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    points: Annotated[Path, typer.Option(help="CSV with columns easting and northing (m).")],
+    variant: Annotated[str | None, typer.Option(help="Which surface; default: the exported one.")] = None,
+) -> None:
+    """Tell height, unit normal, tile and class of the ground under points, as CSV."""
+    from pipeline.query import query_csv
+
+    query_csv(path, points, variant, sys.stdout)
+
+
+# --- config -------------------------------------------------------------------------------------------
+
+
+@configs.command("show")
+def config_show(
+    name: Annotated[
+        str | None, typer.Argument(help="A YAML file or a shipped name; default: list them.")
+    ] = None,
+) -> None:
+    """Show a configuration as it is resolved, every option of every variant."""
+    import yaml
+
+    from pipeline.config import load_config, shipped
+
+    if name is None:
+        for known, path in shipped().items():
+            _say(f"{known:10} {path.read_text().splitlines()[0].lstrip('# ')}")
+        return
+    found = load_config(name)
+    chains = {
+        variant: {stage: options.model_dump(mode="json") for stage, options in chain.items()}
+        for variant, chain in found.chains.items()
+    }
+    _say(
+        yaml.safe_dump({"export": found.export.model_dump(mode="json"), "variants": chains}, sort_keys=False)
+    )
+
+
+@configs.command("template")
+def config_template() -> None:
+    """Print a configuration with every option, its default and its meaning."""
+    from pipeline.config import template
+
+    typer.echo(template(), nl=False)
+
+
+@configs.command("schema")
+def config_schema() -> None:
+    """Print the JSON schema of a configuration, for editors."""
+    import json
+
+    from pipeline.config import schema
+
+    _say(json.dumps(schema(), indent=1))

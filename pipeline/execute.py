@@ -1,0 +1,141 @@
+"""Run jobs one after the other or on Dask; the only file that knows Dask.
+
+One Dask task is one tile: its graph is pulled inside a single process, so that no raster ever travels
+(``docs/decisions.md`` has the measurement against one task per stage).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import Any, Protocol, TypeVar
+
+from pipeline.errors import ConfigError
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "GDAL_NUM_THREADS",
+    ),
+    "1",
+)
+"""Set before numpy is imported: at these sizes two BLAS threads are up to 400 times slower than one."""
+
+
+class Executor(Protocol):
+    """Runs a function over jobs."""
+
+    def map(
+        self,
+        function: Callable[[J], R],
+        jobs: Iterable[J],
+        lost: Callable[[J, str], R],
+    ) -> Iterator[R]:
+        """Yield results as they come, in any order, with a bounded number of jobs in flight.
+
+        ``lost`` makes the result of a job whose process died more often than is bearable.
+        """
+
+
+class SerialExecutor:
+    """One job after the other in this process; the one to debug with."""
+
+    def map(self, function: Callable[[J], R], jobs: Iterable[J], lost: Callable[[J, str], R]) -> Iterator[R]:
+        """Yield results in the jobs' order."""
+        for job in jobs:
+            yield function(job)
+
+
+class DaskExecutor:
+    """Local worker processes of one thread each, or a running cluster.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Number of processes; by default one per core.
+    scheduler : str, optional
+        Address of a running Dask scheduler, used instead.
+    tries : int
+        How often a job may lose its worker before it counts as lost.
+    """
+
+    def __init__(self, workers: int | None = None, scheduler: str | None = None, tries: int = 2) -> None:
+        self.workers = workers
+        self.scheduler = scheduler
+        self.tries = tries
+
+    def map(self, function: Callable[[J], R], jobs: Iterable[J], lost: Callable[[J, str], R]) -> Iterator[R]:
+        """Yield results as tiles finish."""
+        from distributed import as_completed
+
+        queue = iter(jobs)
+        with self._client() as client:
+            # Twice the threads keeps every worker busy while constant memory holds the rest back.
+            window = max(2, 2 * sum(client.nthreads().values()))
+            flying: dict[Any, J] = {}
+            running = as_completed(raise_errors=False)
+            for job in islice(queue, window):
+                flying[_submit(client, function, job, running)] = job
+            for future in running:
+                job = flying.pop(future)
+                yield _result(future, job, lost)
+                future.release()
+                for following in islice(queue, 1):
+                    flying[_submit(client, function, following, running)] = following
+
+    @contextlib.contextmanager
+    def _client(self) -> Iterator[Any]:
+        import dask
+        from distributed import Client, LocalCluster
+
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": self.tries - 1}))
+            if self.scheduler:
+                try:
+                    client = stack.enter_context(Client(self.scheduler, timeout=10))
+                except OSError as error:
+                    raise ConfigError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
+                if not client.nthreads():
+                    raise ConfigError(f"the Dask scheduler at {self.scheduler} has no workers")
+            else:
+                scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
+                cluster = LocalCluster(
+                    n_workers=self.workers or os.cpu_count() or 1,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    local_directory=scratch,
+                    env=ONE_THREAD,
+                    silence_logs=logging.CRITICAL,
+                )
+                stack.enter_context(cluster)
+                client = stack.enter_context(Client(cluster))
+            yield client
+
+
+def _submit(client: Any, function: Callable[[J], R], job: J, running: Any) -> Any:
+    # Not pure: the store, not Dask, knows what is done already.
+    future = client.submit(function, job, pure=False)
+    running.add(future)
+    return future
+
+
+def _result(future: Any, job: J, lost: Callable[[J, str], R]) -> R:
+    from distributed import KilledWorker
+
+    try:
+        result: R = future.result()
+    except KilledWorker as error:
+        return lost(job, f"the worker process died {error.allowed_failures + 1} times on this tile")
+    return result

@@ -1,0 +1,159 @@
+"""The paper as a graph: tile x variant x stage, every node named by what makes it.
+
+Read `STAGES` and then the files it names, in that order, and you have read the paper::
+
+    Tile -> load -> segment -> ecsrc -> fit -> sample -> evaluate -> row
+
+A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; a source layer counts
+by (path relative to the catalog, size, mtime), or by its bytes. Variants that agree up to a stage share its
+node, so it is computed once; a node whose artefact lies in the store is not computed at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from types import ModuleType
+from typing import Any
+
+from catalog import Catalog, Layer, Tile
+from pipeline.config import Config, Export
+from tasks.options import Options
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the paper."""
+
+    name: str
+    inputs: tuple[str, ...]
+    """Stages whose results it takes, in the order of its arguments."""
+
+
+STAGES = (
+    Stage("load", ()),
+    Stage("segment", ("load",)),
+    Stage("ecsrc", ("load", "segment")),
+    Stage("fit", ("load", "ecsrc")),
+    Stage("sample", ("fit", "segment", "ecsrc")),
+    Stage("evaluate", ("sample", "load", "segment")),
+)
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+@dataclass(frozen=True)
+class Node:
+    """One stage of one tile with one set of options."""
+
+    fingerprint: str
+    stage: str
+    options: Options
+    inputs: tuple[str, ...]
+    """Fingerprints of the nodes whose results it takes."""
+    stored: bool
+    """Whether its result is worth keeping: not what was only read or copied, nor a mesh nobody asked for."""
+
+    @property
+    def module(self) -> ModuleType:
+        """The file that does the work: where the options' model is defined."""
+        return sys.modules[type(self.options).__module__]
+
+
+@dataclass(frozen=True)
+class TileGraph:
+    """All that is to be known about one tile: the union of its variants' chains."""
+
+    tile: Tile
+    nodes: dict[str, Node]
+    """By fingerprint; inputs come before what takes them."""
+    variants: dict[str, dict[str, str]]
+    """Variant -> stage -> fingerprint."""
+    export: Export
+    fingerprint: str
+    """Of everything asked for; the tile is done when its item carries it."""
+
+    def chain(self, variant: str) -> list[Node]:
+        """Return the variant's nodes in the paper's order."""
+        return [self.nodes[self.variants[variant][stage]] for stage in STAGE_NAMES]
+
+
+def digest(value: Any) -> str:
+    """Return a name for anything that JSON can hold."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def tile_graphs(catalog: Catalog, config: Config, checksum: bool = False) -> Iterator[TileGraph]:
+    """Yield the graph of every tile, in the catalog's order."""
+    for tile in catalog.tiles:
+        yield tile_graph(tile, config, checksum)
+
+
+def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
+    """Build one tile's graph.
+
+    Parameters
+    ----------
+    checksum : bool
+        Name sources by their bytes instead of size and time.
+    """
+    source = _source(tile, checksum)
+    nodes: dict[str, Node] = {}
+    variants: dict[str, dict[str, str]] = {}
+    for variant, chain in config.chains.items():
+        made: dict[str, str] = {}
+        for stage in STAGES:
+            inputs = tuple(made[name] for name in stage.inputs)
+            node = _node(
+                stage, chain[stage.name], inputs, source, keep_mesh=variant in config.export.variants
+            )
+            known = nodes.get(node.fingerprint)
+            if known is None or (node.stored and not known.stored):
+                nodes[node.fingerprint] = node
+            made[stage.name] = node.fingerprint
+        variants[variant] = made
+    exported = [variants[variant]["sample"] for variant in config.export.variants]
+    asked = [tile.id, tile.stratum, _names(variants), exported, config.export.model_dump(mode="json")]
+    return TileGraph(tile, nodes, variants, config.export, digest(asked))
+
+
+def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
+    return [[variant, made["evaluate"]] for variant, made in variants.items()]
+
+
+def _node(
+    stage: Stage, options: Options, inputs: tuple[str, ...], source: list[Any], keep_mesh: bool
+) -> Node:
+    module = sys.modules[type(options).__module__]
+    made_of = [
+        stage.name,
+        module.__name__,
+        module.VERSION,
+        options.model_dump(mode="json"),
+        list(inputs) if stage.inputs else source,
+    ]
+    stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
+    return Node(digest(made_of), stage.name, options, inputs, stored)
+
+
+def _source(tile: Tile, checksum: bool) -> list[Any]:
+    return [asdict(tile.grid), [_layer(tile, layer, checksum) for layer in tile.layers]]
+
+
+def _layer(tile: Tile, layer: Layer, checksum: bool) -> list[Any]:
+    files: list[list[str | int | None]] = []
+    for name, path in zip(layer.files, tile.paths(layer), strict=True):
+        try:
+            if checksum:
+                with path.open("rb") as file:
+                    files.append([name, hashlib.file_digest(file, "sha256").hexdigest()])
+            else:
+                stat = path.stat()
+                files.append([name, stat.st_size, stat.st_mtime_ns])
+        except OSError:
+            # A missing file is `load`'s to report; when it comes back the name changes.
+            files.append([name, None])
+    return [layer.name, files, list(layer.values), layer.crs]

@@ -1,0 +1,78 @@
+"""Show how a run goes: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from pipeline.work import TileResult
+
+PLAIN_EVERY_S = 10.0
+
+
+class Watch:
+    """Told of every tile; shows counts by status and stage, and when it will be over."""
+
+    def __init__(self, total: int, console: Console) -> None:
+        self.total = total
+        self.console = console
+        self.status: Counter[str] = Counter()
+        self.stages: Counter[str] = Counter()
+        self.start = self.said = time.monotonic()
+        self.progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("ETA"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self.bar = self.progress.add_task("tiles", total=total)
+
+    def __enter__(self) -> Watch:
+        self.progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()
+
+    def __call__(self, result: TileResult) -> None:
+        """Take note of a tile."""
+        self.status[result.status] += 1
+        self.stages.update(result.computed)
+        for failure in result.failures:
+            self.console.print(f"failed {failure.tile_id}: {failure.line}", markup=False, highlight=False)
+        self.progress.update(self.bar, advance=1, description=self.counts())
+        if not self.console.is_terminal and time.monotonic() - self.said > PLAIN_EVERY_S:
+            self.said = time.monotonic()
+            self.console.print(self.line(), markup=False, highlight=False)
+
+    def counts(self) -> str:
+        """Return the counts by status, then what was computed by stage."""
+        parts = [f"{self.status[name]} {name}" for name in ("done", "cached", "failed")]
+        stages = " ".join(f"{stage}:{count}" for stage, count in self.stages.items())
+        return ", ".join(parts) + (f" [{stages}]" if stages else "")
+
+    def line(self) -> str:
+        """Return the state in one plain line."""
+        tried = sum(self.status.values())
+        spent = time.monotonic() - self.start
+        left = spent / tried * (self.total - tried) if tried else float("nan")
+        return f"{tried}/{self.total} tiles, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"

@@ -1,0 +1,134 @@
+"""Ask a run for the ground under points.
+
+>>> from pipeline.query import Ground
+>>> ground = Ground.open("RUN")                       # doctest: +SKIP
+>>> ground.at(eastings, northings).height             # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from shapely import STRtree, box, points
+
+from pipeline.errors import ConfigError
+from pipeline.graph import TileGraph
+from pipeline.run import Run
+from pipeline.store import Store
+from pipeline.work import Pull, StageError
+from tasks.types import Floats, RoadMask, Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What is known of n points; NaN and empty strings outside the run's tiles."""
+
+    height: Floats
+    """``(n,)``, m."""
+    normal: Floats
+    """``(n, 3)``, upward unit vectors: east, north, up."""
+    tile: NDArray[np.str_]
+    """``(n,)``, tile ids."""
+    kind: NDArray[np.str_]
+    """``(n,)``, ``road`` or ``terrain`` by the segmented mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The fitted surfaces of a run's finished tiles as one ground.
+
+    Surfaces come from the store; the sources are not needed for NURBS surfaces.
+    """
+
+    run: Run
+    variant: str
+    graphs: tuple[TileGraph, ...]
+
+    @classmethod
+    def open(cls, path: Path | str, variant: str | None = None) -> Ground:
+        """Open a run.
+
+        Raises
+        ------
+        ConfigError
+            If it is no run, has no such variant, or no tile is done.
+        """
+        run = Run.open(Path(path))
+        variant = variant or run.config.export.variants[0]
+        if variant not in run.config.chains:
+            raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
+        graphs = tuple(graph for graph in run.graphs() if run.folder(graph.tile.id).done(graph))
+        if not graphs:
+            raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
+        return cls(run, variant, graphs)
+
+    def at(self, easting: Floats, northing: Floats) -> Answer:
+        """Return height, normal, tile and class under n points (m, in the run's CRS).
+
+        A point on the edge of two tiles belongs to the one first in the catalog.
+        """
+        easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
+        northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
+        height = np.full(easting.shape, np.nan)
+        normal = np.full((*easting.shape, 3), np.nan)
+        tile = np.zeros(easting.shape, dtype=object)
+        kind = np.full(easting.shape, "", dtype=object)
+        owner = self._owners(easting, northing)
+        tile[:] = ""
+        for i in np.unique(owner[owner >= 0]):
+            here = np.flatnonzero(owner == i)
+            graph = self.graphs[i]
+            surface, road = self._tile(graph)
+            height[here] = surface.height(easting[here], northing[here])
+            normal[here] = surface.normal(easting[here], northing[here])
+            tile[here] = graph.tile.id
+            kind[here] = np.where(
+                road.mask[road.grid.cells(easting[here], northing[here])], "road", "terrain"
+            )
+        return Answer(height, normal, tile.astype(str), kind.astype(str))
+
+    def _owners(self, easting: Floats, northing: Floats) -> NDArray[np.intp]:
+        tree = STRtree([box(*graph.tile.grid.bounds) for graph in self.graphs])
+        point, tile = tree.query(points(easting, northing), predicate="intersects")
+        owner = np.full(easting.shape, len(self.graphs), dtype=np.intp)
+        np.minimum.at(owner, point, tile)
+        owner[owner == len(self.graphs)] = -1
+        return owner
+
+    def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
+        pull = Pull(graph, Store(self.run.store))
+        made = graph.variants[self.variant]
+        try:
+            return pull(made["fit"]), pull(made["segment"])
+        except StageError as error:
+            raise ConfigError(f"tile {graph.tile.id}: {error}") from error
+
+
+def query_csv(run: Path, csv: Path, variant: str | None, out: TextIO) -> None:
+    """Answer a CSV of points with a CSV: its columns, then height_m, nx, ny, nz, tile, class.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing or lacks the columns easting and northing, or a value is no number.
+    """
+    try:
+        table = pd.read_csv(csv)
+        easting = table["easting"].to_numpy(np.float64)
+        northing = table["northing"].to_numpy(np.float64)
+    except KeyError as error:
+        raise ConfigError(f"{csv}: no column {error}; it needs easting and northing (m)") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{csv}: not readable as a table of points: {error}") from error
+    answer = Ground.open(run, variant).at(easting, northing)
+    table["height_m"] = answer.height
+    for i, name in enumerate(("nx", "ny", "nz")):
+        table[name] = answer.normal[:, i]
+    table["tile"] = answer.tile
+    table["class"] = answer.kind
+    table.to_csv(out, index=False, float_format="%.9g")

@@ -1,0 +1,37 @@
+"""Turn a run's rows into pages: Markdown, CSV, and one HTML file with pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.report.content import gather
+from pipeline.report.pages import csv_page, html_page, markdown_page
+from pipeline.run import Run
+from pipeline.store import write_atomic
+
+FORMATS = ("md", "csv", "html")
+
+
+def write_report(run: Run, form: str) -> Path:
+    """Write RUN/report.<form> and return its path.
+
+    Parameters
+    ----------
+    form : str
+        One of `FORMATS`.
+
+    Raises
+    ------
+    ConfigError
+        If the run has no rows yet.
+    """
+    content = gather(run)
+    if form == "html":
+        from pipeline.report.pictures import tile_pictures
+
+        text = html_page(content, tile_pictures(run, content))
+    else:
+        text = {"md": markdown_page, "csv": csv_page}[form](content)
+    path = run.path / f"report.{form}"
+    write_atomic(path, text.encode())
+    return path

@@ -1,0 +1,101 @@
+"""A report's tables as Markdown, CSV and HTML."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+import pandas as pd
+from markupsafe import Markup
+
+from pipeline.report.content import Content
+
+
+@dataclass(frozen=True, eq=False)
+class TilePictures:
+    """What the page shows of one tile."""
+
+    tile_id: str
+    pictures: tuple[tuple[str, bytes], ...]
+    """Caption and PNG."""
+    notes: tuple[str, ...] = ()
+
+
+def markdown_page(content: Content) -> str:
+    """Return the report as Markdown."""
+    parts = [f"# {content.title}", content.state + ".", content.reference]
+    for title, table in _sections(content):
+        parts += [f"## {title}", _markdown(table)]
+    versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
+    parts += ["## Configuration", f"```yaml\n{content.config}```", f"Versions: {versions}."]
+    return "\n\n".join(parts) + "\n"
+
+
+def csv_page(content: Content) -> str:
+    """Return the main table, every digit of it."""
+    return content.main.to_csv(index=False)
+
+
+def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
+    """Return one self-contained page."""
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters["table"] = _html
+    environment.filters["inline"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return environment.get_template("page.html.j2").render(
+        content=content, sections=list(_sections(content)), tiles=tiles
+    )
+
+
+def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame]]:
+    """Yield the tables that have something to say."""
+    named = (
+        ("Mean over tiles", content.main),
+        ("Median over tiles", content.median),
+        ("Further figures, mean over tiles", content.beside),
+        ("Per stratum, mean over tiles", content.strata),
+        ("Worst tiles by road L2", content.worst),
+        ("Height steps between neighbouring tiles", content.steps.head(10)),
+        ("Failures", content.failures),
+    )
+    return ((title, table) for title, table in named if len(table))
+
+
+def _cell(value: object, column: str) -> str:
+    if pd.isna(value):  # type: ignore[call-overload]
+        return "–"
+    if isinstance(value, float) and column != "T":
+        return f"{value:.3f}"
+    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def _cells(table: pd.DataFrame) -> list[list[str]]:
+    columns = list(table.columns)
+    return [
+        [_cell(value, name) for name, value in zip(columns, row, strict=True)]
+        for row in table.itertuples(index=False, name=None)
+    ]
+
+
+def _markdown(table: pd.DataFrame) -> str:
+    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes]
+    lines = [list(table.columns), ["---:" if number else "---" for number in numeric], *_cells(table)]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def _html(table: pd.DataFrame) -> Markup:
+    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes]
+    head = Markup("").join(Markup("<th>{}</th>").format(name) for name in table.columns)
+    body = Markup("").join(
+        Markup("<tr>{}</tr>").format(
+            Markup("").join(
+                Markup('<td class="{}">{}</td>').format("number" if number else "text", cell)
+                for number, cell in zip(numeric, row, strict=True)
+            )
+        )
+        for row in _cells(table)
+    )
+    return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(head, body)

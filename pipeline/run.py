@@ -1,0 +1,292 @@
+"""A run: a folder that remembers what was asked, and the loop that brings its tiles up to date.
+
+::
+
+    RUN/config.yaml      the configuration, resolved
+    RUN/catalog.parquet  the tiles asked for
+    RUN/run.json         store, origin, versions
+    RUN/tiles/           products and markers
+    RUN/store/           artefacts, unless the store is shared
+    RUN/metrics.parquet  one row per (tile, variant)
+    RUN/failures.csv     one row per failure
+    RUN/log.jsonl        one event per line
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from catalog import Catalog
+from pipeline.config import Config, load_config
+from pipeline.errors import ConfigError
+from pipeline.execute import Executor
+from pipeline.graph import TileGraph, tile_graphs
+from pipeline.store import TileFolder, check_writable, write_atomic
+from pipeline.tables import write_tables
+from pipeline.work import Failure, Job, TileResult, do_tile, failed_row, give_up
+
+PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
+
+
+@dataclass(frozen=True)
+class Run:
+    """An opened run folder."""
+
+    path: Path
+    config: Config
+    catalog: Catalog
+    store: Path
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) all meshes are placed against; fixed when the run is made."""
+    checksum: bool
+    versions: dict[str, str]
+
+    @classmethod
+    def create(
+        cls, path: Path, config: Config, catalog: Catalog, store: Path | None = None, checksum: bool = False
+    ) -> Run:
+        """Make a run folder, or bring an old one up to date with a new configuration or catalog.
+
+        Raises
+        ------
+        ConfigError
+            If the folder or the store cannot be written.
+        """
+        old = _read_json(path / "run.json")
+        origin = old["origin"] if old else _origin(catalog)
+        store = store or (Path(old["store"]) if old and old["shared_store"] else path / "store")
+        run = cls(path, config, catalog, store, (origin[0], origin[1]), checksum, versions())
+        try:
+            for folder in (path, store):
+                folder.mkdir(parents=True, exist_ok=True)
+                check_writable(folder)
+            run._write()
+        except OSError as error:
+            raise ConfigError(f"cannot write the run to {path}: {error}") from error
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """Open a run made before, with its configuration and catalog as they are now.
+
+        Raises
+        ------
+        ConfigError
+            If the folder is no run, or its configuration was edited into something invalid.
+        CatalogError
+            If its catalog is damaged.
+        """
+        found = _read_json(path / "run.json")
+        if found is None:
+            raise ConfigError(
+                f"{path} is no run: it has no run.json; make one with `flexroad run --out {path}`"
+            )
+        store = Path(found["store"]) if found["shared_store"] else path / "store"
+        config = load_config(path / "config.yaml").model_copy(update={"name": found["config"]})
+        catalog = Catalog.read(path / "catalog.parquet")
+        origin = (found["origin"][0], found["origin"][1])
+        return cls(path, config, catalog, store, origin, found["checksum"], found["versions"])
+
+    def graphs(self) -> Iterator[TileGraph]:
+        """Yield the graph of every tile, as configuration and sources are now."""
+        return tile_graphs(self.catalog, self.config, self.checksum)
+
+    def job(self, graph: TileGraph, anew: frozenset[str] = frozenset()) -> Job:
+        """Return what a worker needs to do one tile."""
+        return Job(graph, str(self.path.resolve()), str(self.store.resolve()), self.origin, anew)
+
+    def folder(self, tile_id: str) -> TileFolder:
+        """Return where a tile's products are."""
+        return TileFolder.of(self.path, tile_id)
+
+    def log(self, event: str, **what: Any) -> None:
+        """Append one event to log.jsonl."""
+        line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **what}
+        with (self.path / "log.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def _write(self) -> None:
+        write_atomic(self.path / "config.yaml", yaml.safe_dump(self.config.raw, sort_keys=False).encode())
+        self.catalog.write(self.path / "catalog.parquet")
+        found = {
+            "config": self.config.name,
+            "store": str(self.store.resolve()),
+            "shared_store": self.store.resolve() != (self.path / "store").resolve(),
+            "origin": list(self.origin),
+            "checksum": self.checksum,
+            "versions": self.versions,
+        }
+        write_atomic(self.path / "run.json", json.dumps(found, indent=1).encode())
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a run went, over all its tiles."""
+
+    tiles: int
+    done: int
+    """Tiles with results, those of earlier runs included."""
+    failed: int
+    cached: int
+    """Of those done, how many the last run found done already."""
+    pending: int
+    failures: tuple[Failure, ...]
+
+
+def execute(
+    run: Run,
+    executor: Executor,
+    only: Callable[[TileGraph], bool] = lambda graph: True,
+    anew: frozenset[str] = frozenset(),
+    watch: Callable[[TileResult], None] = lambda result: None,
+) -> list[TileResult]:
+    """Bring the run's tiles up to date and write the tables.
+
+    Parameters
+    ----------
+    only : callable
+        Which tiles; the tables are over all of them.
+    anew : frozenset of str
+        Stages to compute even if the store has them.
+    watch : callable
+        Told of every result as it comes.
+    """
+    start = time.perf_counter()
+    results: list[TileResult] = []
+    run.log("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
+    jobs = (run.job(graph, anew) for graph in run.graphs() if only(graph))
+    try:
+        for result in executor.map(do_tile, jobs, _lost):
+            results.append(result)
+            run.log("tile", **_event(result))
+            watch(result)
+    finally:
+        # Also after an interruption: what is done is in the tables.
+        write_tables(run.path, *outcome(run))
+        run.log("end", seconds=round(time.perf_counter() - start, 3))
+    return results
+
+
+def outcome(run: Run) -> tuple[list[dict[str, Any]], list[Failure]]:
+    """Return the rows and failures of all tiles that were tried, in the catalog's order."""
+    rows: list[dict[str, Any]] = []
+    failures: list[Failure] = []
+    for graph in run.graphs():
+        folder = run.folder(graph.tile.id)
+        item = folder.done(graph)
+        if item is not None:
+            rows += item["properties"]["flexroad:rows"]
+            continue
+        failure = folder.failed(graph)
+        if failure is not None:
+            rows += failure["rows"]
+            failures += [Failure(**fault) for fault in failure["failures"]]
+    return rows, failures
+
+
+def summary(run: Run) -> Summary:
+    """Return how the run stands now, by its markers."""
+    rows, failures = outcome(run)
+    failed = {failure.tile_id for failure in failures}
+    done = {row["tile_id"] for row in rows} - failed
+    total = len(run.catalog.tiles)
+    cached = _cached(run.path / "log.jsonl") & done
+    return Summary(
+        total, len(done), len(failed), len(cached), total - len(done) - len(failed), tuple(failures)
+    )
+
+
+def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[TileGraph], bool]:
+    """Return which tiles a rerun means: those named, those failed, both, or all.
+
+    Raises
+    ------
+    CatalogError
+        If a tile is not in the run's catalog.
+    """
+    named = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
+
+    def chosen(graph: TileGraph) -> bool:
+        if graph.tile.id in named or not (named or failed):
+            return True
+        return failed and run.folder(graph.tile.id).failed(graph) is not None
+
+    return chosen
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes, for the record."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def _lost(job: Job, why: str) -> TileResult:
+    """Make the failed result of a tile whose worker died."""
+    graph = job.graph
+    failure = Failure(graph.tile.id, "worker", "WorkerDied", f"{why}; too little memory is the usual cause")
+    rows = tuple(failed_row(graph, variant, failure.line) for variant in graph.variants)
+    give_up(job, rows, [failure])
+    return TileResult(graph.tile.id, "failed", rows, (failure,))
+
+
+def _event(result: TileResult) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "tile": result.tile_id,
+        "status": result.status,
+        "computed": result.computed,
+        "reused": result.reused,
+        "seconds": {stage: round(value, 4) for stage, value in result.seconds.items()},
+        "pid": result.pid,
+        "peak_mb": round(result.peak_mb, 1),
+    }
+    if result.notes:
+        found["notes"] = list(result.notes)
+    if result.failures:
+        found["failures"] = [asdict(failure) for failure in result.failures]
+    return found
+
+
+def _cached(log: Path) -> set[str]:
+    cached: set[str] = set()
+    if not log.exists():
+        return cached
+    with log.open() as lines:
+        for line in lines:
+            try:
+                event = json.loads(line)
+            except ValueError:
+                # The last line of a run that was killed may be cut off.
+                continue
+            if event["event"] == "run":
+                cached.clear()
+            elif event["event"] == "tile" and event["status"] == "cached":
+                cached.add(event["tile"])
+    return cached
+
+
+def _origin(catalog: Catalog) -> tuple[float, float]:
+    corners = [tile.grid.origin for tile in catalog.tiles]
+    return min(east for east, _ in corners), min(north for _, north in corners)
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return found

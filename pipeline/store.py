@@ -1,0 +1,160 @@
+"""The only writer of results: artefacts by fingerprint, and tiles whose marker is written last.
+
+Everything is written to a temporary name in the same folder and then renamed, so that a reader sees a whole
+file or none, whatever killed the writer. ::
+
+    STORE/<stage>/<ab>/<fingerprint>.npz
+    RUN/tiles/<tile>/<tile>_<variant>.glb ...   the products
+    RUN/tiles/<tile>/item.json                  STAC item with rows and checksums, last: the tile is done
+    RUN/tiles/<tile>/failed.json                instead, if a stage failed
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import uuid
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import codec
+from pipeline.graph import Node, TileGraph
+
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+@dataclass(frozen=True)
+class Store:
+    """Results of stages by fingerprint; may be shared by runs."""
+
+    root: Path
+
+    def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
+        """Return a result and what each stage up to it took, or None if it is not there or damaged."""
+        try:
+            return codec.decode(self._path(node).read_bytes())
+        except DAMAGED:
+            # What cannot be read is as good as absent: it is computed and written anew.
+            return None
+
+    def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> None:
+        """Keep a result and what each stage up to it took."""
+        write_atomic(self._path(node), codec.encode(value, seconds))
+
+    def has(self, node: Node) -> bool:
+        """Tell whether a result is there, unread."""
+        return self._path(node).exists()
+
+    def _path(self, node: Node) -> Path:
+        return self.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
+
+
+@dataclass(frozen=True)
+class TileFolder:
+    """The products of one tile in a run, and the marker that says they are whole."""
+
+    path: Path
+
+    @classmethod
+    def of(cls, run: Path, tile_id: str) -> TileFolder:
+        """Return the tile's folder in a run; tile ids that are no plain names are made so."""
+        safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
+        if safe != tile_id:
+            safe += "-" + hashlib.sha256(tile_id.encode()).hexdigest()[:8]
+        return cls(run / "tiles" / safe)
+
+    def done(self, graph: TileGraph) -> dict[str, Any] | None:
+        """Return the tile's item if it is done as the graph asks and its products are there."""
+        item = self._read("item.json")
+        if item is None or item.get("properties", {}).get("flexroad:fingerprint") != graph.fingerprint:
+            return None
+        try:
+            whole = all(
+                (self.path / asset["href"]).stat().st_size == asset["file:size"]
+                for asset in item["assets"].values()
+            )
+        except OSError:
+            return None
+        return item if whole else None
+
+    def failed(self, graph: TileGraph) -> dict[str, Any] | None:
+        """Return what is known of the tile's last failure, if it was of this graph."""
+        failure = self._read("failed.json")
+        return failure if failure and failure.get("fingerprint") == graph.fingerprint else None
+
+    def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
+        """Write the products, then the item that says so."""
+        for name, data in products.items():
+            write_atomic(self.path / name, data)
+        write_atomic(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
+        (self.path / "failed.json").unlink(missing_ok=True)
+
+    def fail(self, failure: dict[str, Any]) -> None:
+        """Write down a failure; the tile no longer counts as done."""
+        (self.path / "item.json").unlink(missing_ok=True)
+        write_atomic(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
+
+    def reopen(self) -> None:
+        """Take the marker away: the tile is looked at again."""
+        (self.path / "item.json").unlink(missing_ok=True)
+
+    def _read(self, name: str) -> dict[str, Any] | None:
+        try:
+            found = json.loads((self.path / name).read_bytes())
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) else None
+
+
+def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
+    """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension wants)."""
+    return {
+        "href": name,
+        "type": media_type,
+        "file:size": len(data),
+        "file:checksum": "1220" + hashlib.sha256(data).hexdigest(),
+    }
+
+
+def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row with null for what JSON has no number for."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
+def check_writable(folder: Path) -> None:
+    """Fail early if nothing can be written below ``folder``.
+
+    Raises
+    ------
+    OSError
+        With the reason and the path.
+    """
+    probe = folder / f".probe-{os.getpid()}"
+    write_atomic(probe, b"")
+    probe.unlink()
