@@ -14,7 +14,6 @@ import typer
 
 from catalog.errors import CatalogError
 from pipeline.errors import ConfigError
-from pipeline.execute import ONE_THREAD
 
 if TYPE_CHECKING:
     from pipeline.execute import Executor
@@ -42,9 +41,6 @@ FOLDER_FIRST = ("rerun", "rasters")
 
 def main() -> None:
     """Run the command line; what the user did wrong becomes one line and exit code 2."""
-    # Before numpy is imported anywhere, here and in the workers that inherit it.
-    for name, value in ONE_THREAD.items():
-        os.environ.setdefault(name, value)
     try:
         app(spread(sys.argv[1:]), standalone_mode=True)
     except (CatalogError, ConfigError) as error:
@@ -146,12 +142,13 @@ def catalog_rasters(
 def catalog_synthetic(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     tiles: Annotated[int, typer.Option(min=1, help="Number of tiles.")] = 4,
-    seed: Annotated[int, typer.Option(help="The same seed makes the same scenes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same scenes.")] = 0,
+    tile_size: Annotated[int, typer.Option(min=10, help="Size of a tile in m.")] = 250,
 ) -> None:
     """Make scenes with known truth: rasters, truth and a catalog."""
     from pipeline.synthesis import write_scenes
 
-    path = write_scenes(output, tiles, seed)
+    path = write_scenes(output, tiles, seed, tile_size)
     _say(f"{tiles} tiles in {path}")
     _say(f"next: flexroad run --config paper --catalog {path} --out RUN")
 

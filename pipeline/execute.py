@@ -14,23 +14,11 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, Protocol, TypeVar
 
+from pipeline import ONE_THREAD
 from pipeline.errors import ConfigError
 
 J = TypeVar("J")
 R = TypeVar("R")
-
-ONE_THREAD = dict.fromkeys(
-    (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "NUMBA_NUM_THREADS",
-        "GDAL_NUM_THREADS",
-    ),
-    "1",
-)
-"""Set before numpy is imported: at these sizes two BLAS threads are up to 400 times slower than one."""
 
 
 class Executor(Protocol):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tasks.nurbs import NurbsSurface
-
 from pipeline.graph import TileGraph
+from tasks.nurbs import NurbsSurface
 
 MEDIA = {
     "glb": "model/gltf-binary",

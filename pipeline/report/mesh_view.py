@@ -1,0 +1,105 @@
+"""Draw meshes from a folder: ``python mesh_view.py FOLDER`` makes a ``.png`` beside each ``.npz`` there.
+
+A program of its own, imported by nothing: VTK ends the process it runs in where OpenGL is missing.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+
+SIZE_PX = (480, 340)
+OVERSAMPLING = 3
+"""Lines of a third of a pixel stay thin and even."""
+EXAGGERATION = 1.5
+"""Of heights: roads are flat, and a true view shows that alone."""
+
+ROAD, TERRAIN, EDGE, SKY = "#3b3f46", "#ddd6c4", "#6f6753", "#ffffff"
+DENSE_PX = 5.0
+"""Triangles smaller than this are drawn with fainter edges, or the terrain would turn black."""
+
+
+def main(folder: Path) -> None:
+    """Draw every mesh of the folder."""
+    for file in sorted(folder.glob("*.npz")):
+        with np.load(file) as arrays:
+            picture = draw(arrays["vertices"], arrays["faces"], arrays["road"])
+        temporary = file.with_suffix(".part")
+        picture.save(temporary, format="png")
+        temporary.rename(file.with_suffix(".png"))
+
+
+def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[np.bool_]) -> Any:
+    """Return one mesh, seen obliquely from the south-south-west, as a PIL image.
+
+    Parameters
+    ----------
+    vertices : ndarray
+        ``(V, 3)``: east, north, up (m).
+    faces : ndarray
+        ``(F, 3)``, counter-clockwise from above.
+    road : ndarray
+        ``(F,)``, True on faces of road.
+    """
+    from PIL import Image
+
+    whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
+    # Normals of the whole mesh, so that the classes meet without a seam.
+    whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
+    scale = OVERSAMPLING
+    plotter = pv.Plotter(off_screen=True, window_size=[n * scale for n in SIZE_PX], lighting="none")
+    plotter.set_background(SKY)
+    if not road.all():
+        plotter.add_mesh(
+            whole.extract_cells(~road),
+            color=TERRAIN,
+            smooth_shading=True,
+            show_edges=True,
+            edge_color=EDGE,
+            edge_opacity=_edge_opacity(vertices, faces[~road]),
+            line_width=1,
+            ambient=0.25,
+            diffuse=0.8,
+        )
+    if road.any():
+        plotter.add_mesh(whole.extract_cells(road), color=ROAD, smooth_shading=True, ambient=0.3, diffuse=0.8)
+    _look(plotter, whole.bounds)
+    picture = Image.fromarray(plotter.screenshot(return_img=True))
+    plotter.close()
+    return picture.resize(SIZE_PX, Image.Resampling.LANCZOS)
+
+
+def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
+    """Return how strongly edges are drawn: fully where triangles are large on the screen."""
+    sides = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    width = np.ptp(vertices[:, 0]) or 1.0
+    side_px = float(np.median(np.linalg.norm(sides, axis=2))) / width * SIZE_PX[0] * 0.8
+    return float(np.clip(side_px / DENSE_PX, 0.1, 1.0)) * 0.7
+
+
+def _look(plotter: Any, bounds: tuple[float, ...]) -> None:
+    """Place sun and camera: sun in the north-west as on the maps, eye in the south-south-west."""
+    west, east, south, north, low, high = bounds
+    middle = np.array([(west + east) / 2, (south + north) / 2, (low + high) / 2])
+    size = float(np.hypot(east - west, north - south))
+    plotter.add_light(pv.Light(position=tuple(middle + size * np.array([-1, 1, 1.2])), intensity=1.0))
+    plotter.add_light(pv.Light(position=tuple(middle + size * np.array([0.5, -1, 1])), intensity=0.45))
+    plotter.camera_position = [tuple(middle + size * np.array([-0.35, -1.0, 0.8])), tuple(middle), (0, 0, 1)]
+    plotter.camera.view_angle = 30
+    plotter.reset_camera(bounds=bounds)
+    plotter.camera.zoom(1.3)
+    plotter.add_text(
+        f"seen from the south-south-west, heights x {EXAGGERATION:g}",
+        position="lower_left",
+        font_size=5 * OVERSAMPLING,
+        color="#555555",
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

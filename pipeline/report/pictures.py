@@ -1,0 +1,72 @@
+"""Which pictures a report shows of which tiles."""
+
+from __future__ import annotations
+
+from pipeline.graph import TileGraph
+from pipeline.report.content import Content
+from pipeline.report.pages import TilePictures
+from pipeline.report.render import error_map, filter_picture, hillshade, render_meshes
+from pipeline.run import Run
+from pipeline.store import Store
+from pipeline.work import Pull, StageError
+from tasks.evaluate import drape
+from tasks.types import Mesh, RoadClusters, RoadMask, TileData
+
+MOST = 24
+"""Tiles shown; of larger runs the worst."""
+NO_MESH = "No 3D view: no OpenGL library could be used here (on Debian: apt-get install libegl1)."
+
+
+def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
+    """Draw the exported variant of every tile, or of the worst where there are many."""
+    variant = run.config.export.variants[0]
+    shown = _shown(content)
+    graphs = [graph for graph in run.graphs() if graph.tile.id in shown]
+    graphs.sort(key=lambda graph: shown.index(graph.tile.id))
+    maps: dict[str, TilePictures] = {}
+    meshes: dict[str, Mesh] = {}
+    for graph in graphs:
+        pull = Pull(graph, Store(run.store))
+        try:
+            meshes[graph.tile.id] = pull(graph.variants[variant]["sample"])
+            maps[graph.tile.id] = _maps(graph, variant, pull)
+        except StageError as error:
+            # The sources may be gone since; the tables stand all the same.
+            maps[graph.tile.id] = TilePictures(graph.tile.id, (), (f"No pictures: {error}",))
+    views = render_meshes(meshes)
+    return [_with_view(found, views.get(tile_id)) for tile_id, found in maps.items()]
+
+
+def _shown(content: Content) -> list[str]:
+    if len(content.tiles) <= MOST:
+        return list(content.tiles)
+    return list(content.worst["tile"])
+
+
+def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
+    made = graph.variants[variant]
+    data: TileData = pull(made["load"])
+    road: RoadMask = pull(made["segment"])
+    clusters: RoadClusters = pull(made["ecsrc"])
+    mesh: Mesh = pull(made["sample"])
+    core, window = data.core, data.grid.window(data.core)
+    dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
+    truth = (data.dtm if data.reference is None else data.reference)[window]
+    against = "DTM" if data.reference is None else "reference"
+    return TilePictures(
+        graph.tile.id,
+        (
+            ("DSM", hillshade(dsm, core)),
+            ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
+            (f"{variant} minus {against}", error_map(drape(mesh, core) - truth, core, road=raw)),
+        ),
+        data.notes,
+    )
+
+
+def _with_view(found: TilePictures, view: bytes | None) -> TilePictures:
+    if not found.pictures:
+        return found
+    if view is None:
+        return TilePictures(found.tile_id, found.pictures, (*found.notes, NO_MESH))
+    return TilePictures(found.tile_id, (*found.pictures, ("Mesh, from the south", view)), found.notes)

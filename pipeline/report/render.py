@@ -1,0 +1,301 @@
+"""Pictures of one tile for the report: maps with north up and metres on the axes, and meshes in space.
+
+Everything here turns arrays into PNG bytes. Meshes are drawn by a child process: VTK takes the whole process
+with it where there is no OpenGL library, and a report must survive that.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from PIL import Image
+
+from catalog import Grid
+from tasks.types import Bools, Floats, Mesh
+
+log = logging.getLogger(__name__)
+
+DPI = 100
+WIDTH_PX, MAP_PX = 480, 340
+"""Widths of a picture and of the map in it."""
+TRUE_COLOUR_BYTES = 100_000
+LEFT_PX, BELOW_PX, ABOVE_PX, GAP_PX = 46, 42, 24, 10
+
+RELIEF = LinearSegmentedColormap.from_list(
+    "relief", ["#8fae9a", "#b9c7a0", "#e6dcb4", "#d9bd90", "#c4a183", "#e9e2da"]
+)
+ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
+UNKNOWN = "#f2f2f2"
+"""Cells without a value."""
+
+SUN_AZIMUTH_DEG, SUN_ALTITUDE_DEG = 315.0, 45.0
+
+CHILD_START_S, CHILD_MESH_S = 60.0, 15.0
+"""Time a child gets to start and for each mesh, before it is given up."""
+
+
+def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = None) -> bytes:
+    """Draw heights as a shaded relief with a colour bar.
+
+    Parameters
+    ----------
+    height : Floats
+        Heights (m), ``(H, W)``; NaN stays empty.
+    grid : Grid
+        Where the cells lie.
+    title : str
+        What is drawn, above the map.
+    road : Bools, optional
+        Cells laid over the relief as road.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide.
+    """
+    low, high = _limits(height)
+    norm = Normalize(low, high)
+    rgb = _shaded(RELIEF(norm(height))[..., :3], height, grid.cell)
+    if road is not None:
+        rgb = _laid_over(rgb, road, ROAD, 0.55)
+    figure, axes = _map(rgb, grid, title)
+    _colour_bar(figure, axes, RELIEF, norm, "height (m)")
+    return _png(figure)
+
+
+def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: str = "") -> bytes:
+    """Draw what the filter kept of a road mask and what it dropped, over the relief.
+
+    Parameters
+    ----------
+    height : Floats
+        The surface the filter saw, the DSM (m), ``(H, W)``.
+    raw, kept : Bools
+        Road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
+    grid : Grid
+        Where the cells lie.
+    title : str
+        What is drawn, above the map.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide; the legend gives both areas.
+    """
+    paper = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
+    rgb = _shaded(paper, height, grid.cell)
+    parts = (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED))
+    for _, mask, colour in parts:
+        rgb = _laid_over(rgb, mask, colour, 0.72)
+    figure, axes = _map(rgb, grid, title)
+    entries = [
+        Patch(color=colour, label=f"{name}\n{mask.sum() * grid.cell**2:,.0f} m²")
+        for name, mask, colour in parts
+    ]
+    legend = _beside(figure, axes, WIDTH_PX - LEFT_PX - MAP_PX - GAP_PX)
+    legend.set_axis_off()
+    legend.legend(
+        handles=entries,
+        loc="upper left",
+        frameon=False,
+        fontsize=8,
+        handlelength=1,
+        handletextpad=0.5,
+        borderaxespad=0,
+    )
+    return _png(figure)
+
+
+def error_map(
+    error: Floats, grid: Grid, title: str = "", road: Bools | None = None, limit_m: float | None = None
+) -> bytes:
+    """Draw signed vertical errors: red lies too high, blue too low.
+
+    Parameters
+    ----------
+    error : Floats
+        Mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
+    grid : Grid
+        Where the cells lie.
+    title : str
+        What is drawn, above the map.
+    road : Bools, optional
+        Cells whose outline is drawn.
+    limit_m : float, optional
+        End of the colour bar on both sides (m). By default the 98th percentile of the absolute error,
+        rounded up to 1, 2 or 5 times a power of ten; give one where pictures are compared.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide; the colour bar has arrows where errors go beyond it.
+    """
+    limit = limit_m if limit_m is not None else _round_limit(error)
+    figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
+    if road is not None and road.any() and not road.all():
+        axes.contour(
+            grid.eastings - grid.west,
+            grid.northings - grid.south,
+            road,
+            levels=[0.5],
+            colors="#222222",
+            linewidths=0.6,
+        )
+    beyond = bool(np.nanmax(np.abs(error), initial=0.0) > limit)
+    label = "too low  ←  error (m)  →  too high"
+    _colour_bar(figure, axes, "RdBu_r", Normalize(-limit, limit), label, "both" if beyond else "neither")
+    return _png(figure)
+
+
+def render_meshes(meshes: Mapping[str, Mesh]) -> dict[str, bytes | None]:
+    """Draw meshes seen obliquely from the south, all in one child process.
+
+    Parameters
+    ----------
+    meshes : Mapping of str to Mesh
+        By any name.
+
+    Returns
+    -------
+    dict
+        The same names with a PNG each, or None where none could be drawn; the reason is logged as a warning.
+        Heights are drawn larger than they are, by the factor the picture states.
+    """
+    if not meshes:
+        return {}
+    with tempfile.TemporaryDirectory(prefix="flexroad-") as name:
+        folder = Path(name)
+        for i, mesh in enumerate(meshes.values()):
+            np.savez(folder / f"{i}.npz", vertices=mesh.vertices, faces=mesh.faces, road=mesh.road)
+        reason = _draw_in_child(folder, CHILD_START_S + CHILD_MESH_S * len(meshes))
+        files = [folder / f"{i}.png" for i in range(len(meshes))]
+        pictures = [_small(Image.open(file)) if file.exists() else None for file in files]
+    drawn = dict(zip(meshes, pictures, strict=True))
+    lost = [name for name, picture in drawn.items() if picture is None]
+    if lost:
+        log.warning("no mesh pictures of %s: %s", ", ".join(lost), reason)
+    return drawn
+
+
+def _draw_in_child(folder: Path, seconds: float) -> str:
+    """Run the child and return why it failed, or nothing."""
+    # By file, not by module: the child then imports nothing of ours and starts in half the time. -P keeps
+    # this folder's names (steps, pages) from hiding others.
+    command = [sys.executable, "-P", str(Path(__file__).with_name("mesh_view.py")), str(folder)]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return f"no picture after {seconds:.0f} s"
+    if child.returncode < 0:
+        return (
+            f"VTK died of signal {-child.returncode}; is an OpenGL library (libegl1 or libosmesa6) installed?"
+        )
+    lines = child.stderr.strip().splitlines()
+    return lines[-1] if child.returncode and lines else ""
+
+
+def _limits(height: Floats) -> tuple[float, float]:
+    """Return the 1st and 99th percentile, so that one crane does not bleach the map."""
+    known = height[np.isfinite(height)]
+    if known.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(known, [1, 99])
+    return float(low), float(max(high, low + 0.5))
+
+
+def _round_limit(error: Floats) -> float:
+    known = np.abs(error[np.isfinite(error)])
+    robust = max(float(np.percentile(known, 98)) if known.size else 0.0, 0.01)
+    power = 10.0 ** math.floor(math.log10(robust))
+    return next(step * power for step in (1, 2, 5, 10) if step * power >= robust * (1 - 1e-9))
+
+
+def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
+    """Light colours by Lambert's law with the sun in the north-west; level ground keeps its colour."""
+    south, east = np.gradient(height, cell)
+    # Beside a gap there is no slope: shown as level.
+    south, east = np.nan_to_num(south), np.nan_to_num(east)
+    azimuth, altitude = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ALTITUDE_DEG)
+    sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
+    facing = (math.sin(altitude) - sun_east * east + sun_north * south) / np.sqrt(1 + east**2 + south**2)
+    light = np.clip(0.5 * facing / math.sin(altitude), 0, 1)[..., None]
+    lit: Floats = 2 * light * rgb + (1 - 2 * light) * rgb**2
+    return np.where(np.isfinite(height)[..., None], lit, to_rgb(UNKNOWN))
+
+
+def _laid_over(rgb: Floats, mask: Bools, colour: str, opacity: float) -> Floats:
+    """Lay a colour over the cells of a mask."""
+    return np.where(mask[..., None], (1 - opacity) * rgb + opacity * np.array(to_rgb(colour)), rgb)
+
+
+def _map(
+    values: Floats, grid: Grid, title: str, colours: str | None = None, norm: Normalize | None = None
+) -> tuple[Figure, Axes]:
+    """Return a figure with values, colours or numbers, in place: metres from the tile's south-west corner."""
+    scale = min(MAP_PX / grid.width, 2 * MAP_PX / grid.height)
+    width, height = max(scale * grid.width, 60), max(scale * grid.height, 60)
+    size = WIDTH_PX, BELOW_PX + height + ABOVE_PX
+    figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI)
+    axes = figure.add_axes((LEFT_PX / size[0], BELOW_PX / size[1], width / size[0], height / size[1]))
+    axes.set_facecolor(UNKNOWN)
+    extent = (0.0, grid.width * grid.cell, 0.0, grid.height * grid.cell)
+    axes.imshow(np.ma.masked_invalid(values), cmap=colours, norm=norm, extent=extent, origin="upper")
+    axes.set_xlabel(f"m east of {grid.west:,.10g}", fontsize=8)
+    axes.set_ylabel(f"m north of {grid.south:,.10g}", fontsize=8)
+    axes.tick_params(labelsize=7, length=2)
+    axes.set_title(title, fontsize=9)
+    return figure, axes
+
+
+def _beside(figure: Figure, axes: Axes, width_px: float) -> Axes:
+    """Return axes to the right of the map and as high."""
+    place = axes.get_position()
+    return figure.add_axes((place.x1 + GAP_PX / WIDTH_PX, place.y0, width_px / WIDTH_PX, place.height))
+
+
+def _colour_bar(
+    figure: Figure, axes: Axes, colours: Colormap | str, norm: Normalize, label: str, extend: str = "neither"
+) -> None:
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=_beside(figure, axes, 12), extend=extend)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7, length=2)
+    bar.outline.set_visible(False)
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    buffer.seek(0)
+    return _small(Image.open(buffer))
+
+
+def _small(picture: Image.Image) -> bytes:
+    """Return the picture as a PNG: in true colours if that is small, else in 256, a third of the bytes.
+
+    Smooth pictures are the small ones, and the only ones where few colours would show.
+    """
+    true = picture.convert("RGB")
+    full = _encoded(true)
+    if len(full) <= TRUE_COLOUR_BYTES:
+        return full
+    # MAXCOVERAGE also serves rare colours: the ends of a colour bar are as exact as the map.
+    return _encoded(true.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
+
+
+def _encoded(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format="png", optimize=True)
+    return buffer.getvalue()

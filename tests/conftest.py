@@ -1,0 +1,69 @@
+"""What the tests share: a small made survey, a quick configuration, and both executors."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline import ONE_THREAD
+from pipeline.execute import DaskExecutor, SerialExecutor
+
+QUICK = {
+    "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},
+    "variants": {
+        "plane": {"fit": "plane", "sample": "corners"},
+        "rgt": {"fit": "raster", "sample": "uniform"},
+        "flexroad": {},
+    },
+}
+"""The paper's three variants with a light fit: tests of the machinery want no accuracy."""
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    folder = os.environ.get("FLEXROAD_REAL_DATA")
+    if not folder:
+        pytest.skip("FLEXROAD_REAL_DATA is not set")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def made_survey(tmp_path_factory) -> Path:
+    """A folder of four neighbouring tiles of 60 m with known truth."""
+    from pipeline.synthesis import write_scenes
+
+    folder = tmp_path_factory.mktemp("survey")
+    write_scenes(folder, 4, seed=3, size_m=60)
+    return folder
+
+
+@pytest.fixture
+def survey(made_survey, tmp_path) -> Path:
+    """A catalog of one's own, to spoil."""
+    return shutil.copytree(made_survey, tmp_path / "survey") / "catalog.parquet"
+
+
+@pytest.fixture
+def quick_config(tmp_path) -> Path:
+    path = tmp_path / "quick.yaml"
+    path.write_text(yaml.safe_dump(QUICK, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="session")
+def cluster():
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, env=ONE_THREAD
+    ) as cluster:
+        yield cluster
+
+
+@pytest.fixture(params=["serial", "dask"])
+def executor(request):
+    if request.param == "serial":
+        return SerialExecutor()
+    return DaskExecutor(scheduler=request.getfixturevalue("cluster").scheduler_address)

@@ -1,0 +1,222 @@
+"""The command line as a user has it: a process, its output, its exit code."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from catalog import Catalog
+from pipeline.cli import spread
+
+
+def flexroad(*words, expect: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", "from pipeline.cli import main; main()", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    assert done.returncode == expect, done.stdout + done.stderr
+    return done.stdout if expect == 0 else done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def finished(made_survey, tmp_path_factory) -> Path:
+    """A run of the whole survey, made by the command line."""
+    folder = tmp_path_factory.mktemp("cli")
+    config = folder / "quick.yaml"
+    config.write_text(
+        "fit: {control_points: [12, 12], iterations: 30}\n"
+        "variants:\n"
+        "  plane: {fit: plane, sample: corners}\n"
+        "  rgt: {fit: raster, sample: uniform}\n"
+        "  flexroad: {}\n"
+    )
+    out = folder / "run"
+    said = flexroad(
+        "run", "--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, "--workers", 2
+    )
+    assert "4 tiles: 4 done (0 of them before), 0 failed, 0 pending" in said
+    return out
+
+
+def test_spread_repeats_the_option_for_each_value():
+    assert spread(["run", "--tile", "a", "b", "--out", "x"]) == [
+        "run", "--tile", "a", "--tile", "b", "--out", "x",
+    ]  # fmt: skip
+    rasters = ["catalog", "rasters", "root", "--road-value", "1", "-3", "-o", "c.json"]
+    assert spread(rasters)[3:7] == ["--road-value", "1", "--road-value", "-3"]
+    assert spread(["rerun", "--tile", "a", "RUN"]) == ["rerun", "--tile", "a", "RUN"]
+
+
+def test_status(finished):
+    found = json.loads(flexroad("status", finished, "--json"))
+    counts = {key: found[key] for key in ("tiles", "done", "failed", "cached", "pending")}
+    assert counts == {"tiles": 4, "done": 4, "failed": 0, "cached": 0, "pending": 0}
+    assert found["failures"] == []
+    assert "4 tiles: 4 done" in flexroad("status", finished)
+
+
+def test_rerun_says_that_nothing_changed(finished):
+    said = flexroad("rerun", finished, "--executor", "serial")
+    assert "4 done (4 of them before)" in said
+    assert "nothing had changed" in said
+
+
+def test_query(finished, made_survey, tmp_path):
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    grid = catalog.tiles[0].grid
+    points = tmp_path / "points.csv"
+    points.write_text(f"name,easting,northing\nin,{grid.west + 30.2},{grid.south + 20.7}\nout,0,0\n")
+    answers = tmp_path / "answers.csv"
+    answers.write_text(flexroad("query", finished, "--points", points))
+    table = pd.read_csv(answers)
+    assert list(table.columns) == [
+        "name", "easting", "northing", "height_m", "nx", "ny", "nz", "tile", "class",
+    ]  # fmt: skip
+    inside, outside = table.iloc[0], table.iloc[1]
+    assert inside.tile == catalog.tiles[0].id
+    assert inside["class"] in ("road", "terrain")
+    assert np.linalg.norm(inside[["nx", "ny", "nz"]].astype(float)) == pytest.approx(1)
+    assert inside.nz > 0.7
+    assert 0 < inside.height_m < 400
+    assert np.isnan(outside.height_m)
+    assert pd.isna(outside.tile)
+    assert "needs easting and northing" in flexroad(
+        "query", finished, "--points", _headless(tmp_path), expect=2
+    )
+    assert "has no variant 'x'" in flexroad("query", finished, "--points", points, "--variant", "x", expect=2)
+
+
+def _headless(folder: Path) -> Path:
+    path = folder / "headless.csv"
+    path.write_text("x,y\n1,2\n")
+    return path
+
+
+def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
+    import rasterio
+
+    from pipeline.query import Ground
+
+    tile = Catalog.read(made_survey / "catalog.parquet").tiles[1]
+    with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:
+        dsm = raster.read(1)
+    answer = Ground.open(finished, "rgt").at(tile.grid.eastings[[5, 40]], tile.grid.northings[[7, 50]])
+    assert answer.height == pytest.approx([dsm[7, 5], dsm[50, 40]], abs=1e-5)
+
+
+@pytest.mark.parametrize("form", ["md", "csv", "html"])
+def test_report(finished, form):
+    said = flexroad("report", finished, "--format", form)
+    text = (finished / f"report.{form}").read_text()
+    if form != "html":
+        assert said.strip() == text.strip()
+    assert "flexroad" in text
+    if form == "md":
+        assert "| method | tiles | L2 road (m) |" in text
+        assert "Height steps between neighbouring tiles" in text
+    if form == "html":
+        assert text.count("data:image/png;base64,") >= 12
+        assert "http" not in text.split("<body>")[1].split("Configuration")[0]
+
+
+def test_dry_run_shows_the_graph_and_writes_nothing(made_survey, tmp_path):
+    said = flexroad(
+        "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
+        "--dry-run",
+    )  # fmt: skip
+    assert not (tmp_path / "r").exists()
+    assert said.count("fit ") == 4 * 3 + 1
+    assert "12 to do" in said.splitlines()[-1]
+    assert "(plane, rgt, flexroad)" in said
+
+
+def test_only_the_tiles_asked_for(made_survey, tmp_path):
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    one, two = catalog.tiles[0], catalog.tiles[3]
+    said = flexroad(
+        "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
+        "--tile", one.id, two.id, "--executor", "serial", "--dry-run",
+    )  # fmt: skip
+    assert [line for line in said.splitlines() if line.endswith(": to do")] == [
+        f"{one.id}: to do",
+        f"{two.id}: to do",
+    ]
+    west, south, east, north = two.grid.bounds
+    said = flexroad(
+        "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
+        "--bbox", west + 1, south + 1, east - 1, north - 1, "--dry-run",
+    )  # fmt: skip
+    assert f"{two.id}: to do" in said
+    assert one.id not in said
+
+
+def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
+    catalog = Catalog.read(survey)
+    tile = catalog.tiles[2]
+    path = tile.paths(tile.layer("dtm"))[0]
+    path.unlink()
+    config = tmp_path / "c.yaml"
+    config.write_text("fit: {control_points: [12, 12], iterations: 5}\n")
+    words = ["--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
+    said = flexroad("run", *words, expect=1)
+    assert f"failed {tile.id}: load: TaskError: " in said
+    assert "3 done (0 of them before), 1 failed" in said
+    (failure,) = json.loads(flexroad("status", tmp_path / "run", "--json"))["failures"]
+    assert (failure["tile_id"], failure["stage"]) == (tile.id, "load")
+    assert failure["file"] == str(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "--config", "papr", "--catalog", "CAT", "--out", "OUT"], "did you mean paper?"),
+        (["run", "--config", "paper", "--catalog", "nowhere.parquet", "--out", "OUT"], "does not exist"),
+        (["run", "--config", "paper", "--catalog", "CAT", "--out", "FILE/x"], "cannot write the run"),
+        (["run", "--config", "paper", "--catalog", "CAT", "--out", "OUT", "--tile", "1_2"], "did you mean"),
+        (
+            ["run", "--config", "paper", "--catalog", "CAT", "--out", "OUT", "--executor", "x"],
+            "dask and serial",
+        ),
+        (
+            [*"run --config paper --catalog CAT --out OUT --scheduler tcp://127.0.0.1:9".split()],
+            "no Dask scheduler answers",
+        ),
+        (["run", "--config", "paper"], "Missing option"),
+        (["status", "FILE"], "is no run"),
+        (["rerun", "OUT", "--from", "fitt"], "no such stage"),
+        (["catalog", "show", "FILE"], "is not a FlexRoad catalog"),
+        (["config", "show", "nope"], "no configuration 'nope'"),
+    ],
+)
+def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_survey, tmp_path):
+    (tmp_path / "file").write_text("")
+    places = {
+        "CAT": made_survey / "catalog.parquet",
+        "OUT": tmp_path / "out",
+        "FILE": tmp_path / "file",
+        "FILE/x": tmp_path / "file" / "x",
+    }
+    said = flexroad(*[places.get(word, word) for word in words], expect=2)
+    assert message in said
+    assert "Traceback" not in said
+
+
+def test_config_commands():
+    assert "paper" in flexroad("config", "show")
+    assert "theta_z_m: 0.5" in flexroad("config", "show", "paper")
+    assert "theta_z_m: 0.5" in flexroad("config", "template")
+    assert "theta_z_m" in json.loads(flexroad("config", "schema"))["properties"]["ecsrc"]["properties"]
+
+
+def test_catalog_show(made_survey):
+    said = flexroad("catalog", "show", made_survey / "catalog.parquet")
+    assert said.splitlines()[-1] == "4 tiles, EPSG:25832"
+    assert "dsm(1) dtm(1) road_mask(1) reference(1) reference_road(1)" in said

@@ -1,0 +1,99 @@
+import json
+
+import pytest
+import yaml
+
+from pipeline.config import compose, load_config, schema, shipped, template
+from pipeline.errors import ConfigError
+
+
+def test_every_shipped_configuration_is_valid():
+    assert {"paper", "nightly"} <= set(shipped())
+    for name in shipped():
+        assert load_config(name).chains
+
+
+def test_paper_is_the_paper():
+    chains = load_config("paper").chains
+    assert list(chains) == ["plane", "rgt", "flexroad"]
+    full = chains["flexroad"]
+    assert (full["fit"].control_points, full["fit"].degree) == ((35, 35), 3)
+    assert (full["fit"].learning_rate, full["fit"].iterations) == (0.1, 200)
+    assert (full["ecsrc"].theta_xy_m, full["ecsrc"].theta_z_m) == (10, 0.5)
+    assert (full["sample"].road_m, full["sample"].terrain_m) == (1, 10)
+    assert chains["plane"]["fit"].method == "plane"
+    assert chains["plane"]["sample"].method == "corners"
+    assert chains["rgt"]["fit"].method == "raster"
+    assert chains["rgt"]["sample"].method == "uniform"
+
+
+def test_an_override_keeps_the_base_unless_the_method_changes():
+    raw = {
+        "fit": {"method": "nurbs", "degree": 5},
+        "variants": {"a": {"fit": {"iterations": 7}}, "b": {"fit": "plane"}, "c": None},
+    }
+    chains = compose(raw, "x").chains
+    assert (chains["a"]["fit"].degree, chains["a"]["fit"].iterations) == (5, 7)
+    assert chains["b"]["fit"].method == "plane"
+    assert chains["c"]["fit"].degree == 5
+
+
+def test_extends(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: paper\nfit: {degree: 2}\nvariants: {flexroad: {}}\n")
+    config = load_config(path)
+    assert list(config.chains) == ["flexroad"]
+    assert config.chains["flexroad"]["fit"].degree == 2
+    assert config.chains["flexroad"]["fit"].learning_rate == 0.1
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        ({"ecrsc": {}}, "x: ecrsc: unknown key; did you mean ecsrc?"),
+        ({"ecsrc": {"theta_z": 0.5}}, "x: ecsrc.theta_z: unknown key; did you mean theta_z_m?"),
+        ({"fit": {"degre": 2}}, "x: fit.degre: unknown key; did you mean degree?"),
+        ({"ecsrc": {"theta_z_m": -1}}, "x: ecsrc.theta_z_m: input should be greater than"),
+        ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),
+        ({"fit": "nurb"}, "x: fit: "),
+        ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),
+        ({"variants": {"a": {"fitt": {}}}}, "x: variants.a.fitt: unknown key; did you mean fit?"),
+        ({"variants": {"a": {"sample": {"road": 1}}}}, "x: variants.a.sample.road: unknown key"),
+        ({"variants": ["a"]}, "x: variants: expected a mapping"),
+        ({"export": {"variants": ["b"]}}, "x: export.variants: no variant 'b', only flexroad"),
+        ({"fit": {"degree": 5, "control_points": [4, 20]}}, "x: fit"),
+    ],
+)
+def test_what_is_wrong_is_named_in_one_line(raw, message):
+    with pytest.raises(ConfigError) as caught:
+        compose(raw, "x")
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(ConfigError, match="did you mean paper"):
+        load_config("papr")
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("fit: {degree: 3")
+    with pytest.raises(ConfigError, match=r"bad.yaml: not readable as YAML"):
+        load_config(bad)
+    bad.write_text("- a\n- b\n")
+    with pytest.raises(ConfigError, match="expected a mapping"):
+        load_config(bad)
+
+
+def test_template_is_the_default():
+    raw = yaml.safe_load(template())
+    filled, empty = compose(raw, "x"), compose({}, "x")
+    assert filled.chains == empty.chains
+    assert filled.export == empty.export
+
+
+def test_schema_knows_every_stage_and_option():
+    properties = schema()["properties"]
+    assert list(properties) == [
+        "extends", "load", "segment", "ecsrc", "fit", "sample", "evaluate", "export", "variants",
+    ]  # fmt: skip
+    assert "theta_z_m" in json.dumps(properties["ecsrc"])
+    assert "control_points" in json.dumps(properties["fit"])

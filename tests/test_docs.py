@@ -1,0 +1,35 @@
+"""The docs stay true: the commands of docs/cli.md run as they stand, links lead somewhere."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+
+
+def console_lines(page: Path) -> list[str]:
+    blocks = re.findall(r"```console\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    return [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
+
+
+def test_the_command_lines_of_the_docs_run(tmp_path):
+    (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")
+    lines = console_lines(ROOT / "docs" / "cli.md")
+    assert len(lines) > 12
+    for line in lines:
+        command, *words = shlex.split(line)
+        assert command == "flexroad"
+        call = [sys.executable, "-c", "from pipeline.cli import main; main()", *words]
+        done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}"
