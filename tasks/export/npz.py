@@ -1,0 +1,89 @@
+"""The fitted surface itself (the paper's parameters Theta) as NumPy archive, for use without the run.
+
+Any NumPy reads it; `decode` gives the `NurbsSurface` back, and `tasks.nurbs.exact` from it what CAD programs
+read.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from tasks.errors import TaskError
+from tasks.nurbs import NurbsSurface
+
+VERSION = 1
+NAME = "_surface.npz"
+MEDIA_TYPE = "application/zip"
+
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading a file that is cut, changed, or something else can raise."""
+
+
+def encode(surface: NurbsSurface) -> bytes:
+    """Return a surface as ``.npz``: one array per field of `NurbsSurface`, and ``version``.
+
+    ``z(u, v) = datum + A(u, v) / W(u, v)`` with u and v from 0 to 1 over ``bounds`` (west, south, east,
+    north; m); coefficients are (row, col) with row 0 in the south. No pickled objects; float64.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        version=np.int64(VERSION),
+        crs=np.array(surface.crs),
+        bounds=np.asarray(surface.bounds, np.float64),
+        degree=np.asarray(surface.degree, np.int64),
+        knots_u=surface.knots_u,
+        knots_v=surface.knots_v,
+        A=surface.A,
+        W=surface.W,
+        datum=np.float64(surface.datum),
+        origin=np.asarray(surface.origin, np.float64),
+    )
+    return buffer.getvalue()
+
+
+def decode(source: bytes | Path | str) -> NurbsSurface:
+    """Return the surface that `encode` wrote, from its bytes or its file.
+
+    Raises
+    ------
+    TaskError
+        If the file is missing, damaged, no surface, or of a later version.
+    """
+    name = "these bytes" if isinstance(source, bytes) else str(source)
+    try:
+        with np.load(io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False) as npz:
+            arrays = {key: npz[key] for key in npz.files}
+        version = int(arrays["version"])
+        if version > VERSION:
+            message = f"{name}: surface of version {version}, known up to {VERSION}; update FlexRoad"
+            raise TaskError(message, name)
+        return _surface(arrays)
+    except DAMAGED as error:
+        raise TaskError(f"{name}: not a FlexRoad surface ({error}); export it again", name) from error
+
+
+def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
+    west, south, east, north = map(float, arrays["bounds"])
+    p, q = map(int, arrays["degree"])
+    easting, northing = map(float, arrays["origin"])
+    knots_u, knots_v, a, w = (arrays[key] for key in ("knots_u", "knots_v", "A", "W"))
+    expected = len(knots_v) - q - 1, len(knots_u) - p - 1
+    if not a.shape == w.shape == expected:
+        raise ValueError(f"coefficients {a.shape} and weights {w.shape} do not fit knots for {expected}")
+    return NurbsSurface(
+        crs=str(arrays["crs"]),
+        bounds=(west, south, east, north),
+        degree=(p, q),
+        knots_u=knots_u,
+        knots_v=knots_v,
+        A=a,
+        W=w,
+        datum=float(arrays["datum"]),
+        origin=(easting, northing),
+    )
