@@ -1,0 +1,39 @@
+"""Which tiles a synthetic survey consists of."""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+
+from catalog.grid import Grid
+
+WEST_M, SOUTH_M = 500_000, 5_600_000
+"""Where every block starts: on the central meridian of EPSG:25832, and a multiple of common tile sizes."""
+
+
+def block(
+    tiles: int, size_m: int = 250, cell: float = 1.0, crs: str = "EPSG:25832"
+) -> list[tuple[str, Grid]]:
+    """Return the ids and grids of a near-square block of neighbouring tiles.
+
+    Parameters
+    ----------
+    tiles : int
+        How many; the last row may be short.
+    size_m : int
+        Side of a tile on the absolute grid (m).
+    cell : float
+        Cell size (m).
+    crs : str
+        Coordinate reference system in metres.
+
+    Raises
+    ------
+    CatalogError
+        If ``size_m`` is not a whole number of cells.
+    """
+    columns = math.ceil(math.sqrt(tiles))
+    rows = math.ceil(tiles / max(columns, 1))
+    west, south = WEST_M // size_m * size_m, SOUTH_M // size_m * size_m
+    bounds = (west, south, west + columns * size_m, south + rows * size_m)
+    return list(islice(Grid.covering(crs, bounds, cell).tiles(size_m), tiles)) if tiles > 0 else []

@@ -1,0 +1,51 @@
+"""Chance that depends on a seed and a place alone, and smooth fields made of it."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tasks.types import Floats
+
+KEY_OFFSET = 2**31
+"""Makes lattice indices non-negative, as seeds must be."""
+
+
+def generator(seed: int, purpose: str, *key: int) -> np.random.Generator:
+    """Return the random generator of one thing in the world, the same whichever tile asks for it."""
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *(k + KEY_OFFSET for k in key)])
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """A smooth field: plane waves of several lengths and directions, summed.
+
+    Defined everywhere, so that tiles evaluated one by one join without a step.
+    """
+
+    wavevectors: Floats
+    """``(K, 2)``, rad/m along x and y."""
+    phases: Floats
+    """``(K,)``, rad."""
+    amplitudes: Floats
+    """``(K,)``, m."""
+
+    def __call__(self, x: Floats, y: Floats) -> Floats:
+        """Return the field (m) at the points, in their broadcast shape."""
+        total = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+        for (kx, ky), phase, amplitude in zip(self.wavevectors, self.phases, self.amplitudes, strict=True):
+            total += amplitude * np.sin(kx * x + ky * y + phase)
+        return total
+
+
+def waves(rng: np.random.Generator, lengths_m: ArrayLike, amplitudes_m: ArrayLike) -> Waves:
+    """Return waves of the given lengths and amplitudes with random directions and phases."""
+    lengths, amplitudes = np.broadcast_arrays(
+        np.asarray(lengths_m, np.float64), np.asarray(amplitudes_m, np.float64)
+    )
+    heading = rng.uniform(0, 2 * np.pi, lengths.size)
+    wavevectors = (2 * np.pi / lengths)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+    return Waves(wavevectors, rng.uniform(0, 2 * np.pi, lengths.size), amplitudes)

@@ -1,0 +1,284 @@
+"""What stands, grows and drives along a street, and what a segmentation takes for road or misses.
+
+Each street has its own random generator, so an object that lies across a tile's border is the same
+object in both tiles. Lengths in metres, positions in the plan's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tasks.synthetic.network import Street
+from tasks.synthetic.noise import generator
+from tasks.synthetic.surfaces import Ground
+from tasks.types import Floats
+
+GroundAt = Callable[[Floats, Floats], Ground]
+"""The ground under points of the plan's frame."""
+
+CORNER_M = 8.0
+"""Kept free of parked cars and street trees at both ends of a street."""
+HIDING = 0.4
+"""Part of the crowns below which the segmentation sees no road."""
+SLOT_M = 6.2
+"""Length of a kerb-side parking slot."""
+GARDEN_M = 30.0
+"""How far from the centre line a street's garden trees and false patches lie."""
+
+
+@dataclass(frozen=True)
+class House:
+    """A box with a flat roof or a gable whose ridge follows the street."""
+
+    x: float
+    y: float
+    heading: float
+    half_length: float
+    half_depth: float
+    eaves: float
+    """Absolute height."""
+    rise: float
+    """Of the ridge over the eaves; 0 is a flat roof."""
+
+
+@dataclass(frozen=True)
+class Crown:
+    """A tree's crown, seen from above."""
+
+    x: float
+    y: float
+    radius: float
+    top: float
+    """Absolute height."""
+    height: float
+    """Of the top over the ground."""
+    hides: bool
+    """Whether the segmentation takes the road below it for terrain."""
+
+
+@dataclass(frozen=True)
+class Car:
+    """A vehicle, as a box with a lower bonnet."""
+
+    x: float
+    y: float
+    heading: float
+    half_length: float
+    half_width: float
+    height: float
+    moving: bool
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A round patch the segmentation is wrong about."""
+
+    x: float
+    y: float
+    radius: float
+    road: bool
+    """What it takes the patch for."""
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Everything that stands between a survey and the truth, near one tile."""
+
+    houses: tuple[House, ...]
+    crowns: tuple[Crown, ...]
+    cars: tuple[Car, ...]
+    spots: tuple[Spot, ...]
+
+
+def populate(
+    streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float, errors: float
+) -> Objects:
+    """Return the objects of some streets.
+
+    Parameters
+    ----------
+    streets : sequence of Street
+        Whose objects are wanted.
+    seed : int
+        The world.
+    ground_at : callable
+        The ground with all streets that are near.
+    density : float
+        Part of the houses, trees and cars that is there, 0 to 1.
+    errors : float
+        Number of the segmentation's patches, 1 as usual.
+    """
+    built = houses(streets, seed, ground_at, density)
+    return Objects(
+        built,
+        crowns(streets, seed, ground_at, built, density),
+        tuple(car for street in streets for car in cars(street, seed, density)),
+        tuple(spot for street in streets for spot in spots(street, seed, errors)),
+    )
+
+
+def houses(streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float) -> tuple[House, ...]:
+    """Return the houses along both sides of streets, none of them on a road or in a stream."""
+    planned = [
+        house
+        for street in streets
+        for side in (-1, 1)
+        for house in _row_of_houses(street, side, generator(seed, "houses", *street.key, side), density)
+    ]
+    if not planned:
+        return ()
+    # A little more than the corners, so that eaves do not hang over the kerb; the centre comes last.
+    spread = 1.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)])
+    xy = np.stack([_footprint(house, spread) for house in planned], axis=1)
+    under = ground_at(xy[..., 0], xy[..., 1])
+    free = ((under.edge > 0.5) & (under.trough == 0)).all(axis=0)
+    return tuple(
+        replace(house, eaves=float(base) + house.eaves)
+        for house, base, ok in zip(planned, under.bare[-1], free, strict=True)
+        if ok
+    )
+
+
+def _row_of_houses(street: Street, side: int, rng: np.random.Generator, density: float) -> list[House]:
+    stratum, row = street.stratum, []
+    along = street.start + rng.uniform(2, 6)
+    line = rng.uniform(*stratum.setback_m)  # the building line of this side
+    while along + (lot := rng.uniform(*stratum.lot_m)) < street.end:
+        front = lot - rng.uniform(*stratum.gap_m)
+        depth, setback = rng.uniform(*stratum.depth_m), line + rng.uniform(-0.4, 0.4)
+        eaves, pitch = rng.uniform(*stratum.eaves_m), rng.uniform(0.4, 0.9)
+        flat, built = rng.random() < stratum.flat_roofs, rng.random() < stratum.built * density
+        if built:
+            middle = along + lot / 2
+            x, y = street.point(middle, side * (street.half_width_m + setback + depth / 2))
+            rise = 0.0 if flat else pitch * depth / 2
+            heading = float(street.heading(middle))
+            row.append(House(float(x), float(y), heading, front / 2, depth / 2, eaves, rise))
+        along += lot
+    return row
+
+
+def _footprint(house: House, spread: Floats) -> Floats:
+    cos, sin = np.cos(house.heading), np.sin(house.heading)
+    u, v = (spread * (house.half_length, house.half_depth)).T
+    return np.column_stack([house.x + cos * u - sin * v, house.y + sin * u + cos * v])
+
+
+def crowns(
+    streets: Sequence[Street], seed: int, ground_at: GroundAt, built: Sequence[House], density: float
+) -> tuple[Crown, ...]:
+    """Return the trees at the kerbs, whose crowns hang over the road, and those in the gardens."""
+    planned = [_trees(street, generator(seed, "crowns", *street.key)) for street in streets]
+    if not planned:
+        return ()
+    x, y, radius, height, hides, chance = np.concatenate(planned, axis=1)
+    under = ground_at(x, y)
+    # No trunk in the carriageway or inside a house; a facade may still touch a crown.
+    free = (under.edge > 0.6) & (chance < density)
+    for house in built:
+        free &= np.hypot(x - house.x, y - house.y) > house.half_depth + 1.5
+    top = under.bare + height
+    return tuple(
+        Crown(float(x[i]), float(y[i]), float(radius[i]), float(top[i]), float(height[i]), bool(hides[i]))
+        for i in np.flatnonzero(free)
+    )
+
+
+def _trees(street: Street, rng: np.random.Generator) -> Floats:
+    """Return x, y, radius, height, whether it hides the road, and a thinning chance, one column a tree."""
+    along, lateral, radius = np.concatenate([_avenue(street, rng), _gardens(street, rng)], axis=1)
+    height = radius * rng.uniform(2.2, 3.2, radius.size) + 1.0
+    hides = rng.random(radius.size) < HIDING
+    return np.stack([*street.point(along, lateral), radius, height, hides, rng.random(radius.size)])
+
+
+def _avenue(street: Street, rng: np.random.Generator) -> Floats:
+    """Return place along, lateral place and radius of the trees at the kerb, ``(3, N)``."""
+    sides = np.array([-1.0, 1.0])[rng.random(2) < street.stratum.avenues]
+    along = np.arange(street.start + CORNER_M, street.end - CORNER_M, rng.uniform(9, 15))
+    offset = street.half_width_m + rng.uniform(1.0, 2.2)
+    lateral, along = (a.ravel() for a in np.meshgrid(sides * offset, along))
+    grown = rng.random(along.size) < 0.85
+    along, lateral = along[grown] + rng.uniform(-1, 1, grown.sum()), lateral[grown]
+    return np.stack([along, lateral, rng.uniform(2.0, 4.2, along.size)])
+
+
+def _gardens(street: Street, rng: np.random.Generator) -> Floats:
+    """Return the same of the trees away from the kerb."""
+    count = rng.poisson(street.stratum.garden_trees)
+    along = rng.uniform(street.start, street.end, count)
+    lateral = rng.choice((-1.0, 1.0), count) * (street.half_width_m + rng.uniform(2, GARDEN_M, count))
+    return np.stack([along, lateral, rng.uniform(1.5, 4.5, count)])
+
+
+def cars(street: Street, seed: int, density: float) -> list[Car]:
+    """Return the parked cars along both kerbs and those on the move."""
+    rng = generator(seed, "cars", *street.key)
+    return [*_parked(street, rng, density), *_moving(street, rng, density)]
+
+
+def _parked(street: Street, rng: np.random.Generator, density: float) -> list[Car]:
+    found = []
+    for side in (-1, 1):
+        # Kerbs are used to a different degree, and cars come in rows.
+        share = np.clip(street.stratum.parked * rng.uniform(0.2, 1.8), 0, 1) * density
+        slots = np.arange(street.start + CORNER_M, street.end - CORNER_M, SLOT_M)
+        for slot in slots[rng.random(slots.size) < share]:
+            van = rng.random() < 0.12
+            half_width = 1.0 if van else 0.9
+            lateral = side * (street.half_width_m - half_width - rng.uniform(0.1, 0.3))
+            length, height = (5.4, 2.2) if van else (rng.uniform(3.9, 4.7), rng.uniform(1.4, 1.65))
+            found.append(_car(street, slot, lateral, length, half_width, height, moving=False))
+    return found
+
+
+def _moving(street: Street, rng: np.random.Generator, density: float) -> list[Car]:
+    found = []
+    for _ in range(rng.poisson(street.stratum.moving * density)):
+        along, side = rng.uniform(street.start, street.end), rng.choice((-1, 1))
+        truck = rng.random() < 0.1
+        # A scan smears what moves: some come out long, some short and low.
+        length, height = (10.0, 3.4) if truck else (4.4 * rng.uniform(0.6, 1.8), rng.uniform(0.8, 1.6))
+        half_width = 1.25 if truck else 0.9
+        found.append(_car(street, along, side * street.half_width_m * 0.4, length, half_width, height, True))
+    return found
+
+
+def _car(
+    street: Street,
+    along: float,
+    lateral: float,
+    length: float,
+    half_width: float,
+    height: float,
+    moving: bool,
+) -> Car:
+    x, y = street.point(along, lateral)
+    heading = float(street.heading(along))
+    return Car(float(x), float(y), heading, length / 2, half_width, height, moving)
+
+
+def spots(street: Street, seed: int, density: float) -> list[Spot]:
+    """Return holes in the street and false patches beside it (drives, yards, parts of roofs)."""
+    rng = generator(seed, "spots", *street.key)
+    length = street.end - street.start
+    holes = rng.poisson(density * length / 90)
+    drives = rng.poisson(density * length / 60)
+    yards = rng.poisson(density * length / 120)
+    lateral = np.concatenate(
+        [
+            rng.uniform(-1, 1, holes) * street.half_width_m,
+            rng.choice((-1, 1), drives) * (street.half_width_m + rng.uniform(0, 3, drives)),
+            rng.choice((-1, 1), yards) * (street.half_width_m + rng.uniform(6, GARDEN_M, yards)),
+        ]
+    )
+    along = rng.uniform(street.start, street.end, lateral.size)
+    radius = rng.uniform(1.0, 3.2, lateral.size)
+    x, y = street.point(along, lateral)
+    return [
+        Spot(float(a), float(b), float(r), k >= holes)
+        for k, (a, b, r) in enumerate(zip(x, y, radius, strict=True))
+    ]

@@ -1,0 +1,173 @@
+"""A scene: the rasters a survey would deliver of one tile, and the truth behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import gaussian_filter
+
+from catalog.grid import Grid
+from tasks.errors import TaskError
+from tasks.options import Options
+from tasks.synthetic.network import Box, Plan
+from tasks.synthetic.noise import Waves, generator, waves
+from tasks.synthetic.objects import GroundAt, populate
+from tasks.synthetic.spoilers import Canvas, segmentation, surface_model
+from tasks.synthetic.strata import named
+from tasks.synthetic.surfaces import ground, relief
+from tasks.types import Bools, Floats
+
+OBJECT_REACH_M = 45.0
+"""No house, crown, car or patch lies farther than this from its street's centre line."""
+DTM_BLUR_M = 1.0
+"""Gaussian smoothing of a terrain model by its interpolation."""
+DTM_GRAIN_M = 3.0
+"""Correlation length of a terrain model's noise."""
+
+
+class SceneOptions(Options):
+    """How the made world looks."""
+
+    block_m: float = Field(100.0, ge=20, description="mean distance of parallel streets (m)")
+    slope: float = Field(0.05, ge=0, le=0.15, description="root mean square slope of the hills")
+    roughness_m: float = Field(0.6, ge=0, description="root mean square height of the terrain's humps (m)")
+    datum_m: float = Field(160.0, ge=-400, le=8000, description="mean height of the world (m)")
+    stream_share: float = Field(
+        0.12, ge=0, le=1, description="part of the gaps between streets with a stream"
+    )
+    density: float = Field(1.0, ge=0, le=1, description="part of houses, trees and cars that is there")
+    mask_errors: float = Field(1.0, ge=0, description="size of the road mask's errors; 0 is a perfect mask")
+    wobble_m: float = Field(0.5, ge=0, description="root mean square offset of the mask's edges (m)")
+    dsm_noise_m: tuple[float, float] = Field(
+        (0.03, 0.1), description="least and greatest noise (standard deviation) of a tile's DSM (m)"
+    )
+    dtm_noise_m: float = Field(0.04, ge=0, description="noise (standard deviation) of the DTM (m)")
+
+
+DEFAULTS = SceneOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One tile of a made world."""
+
+    grid: Grid
+    stratum: str
+    dsm: Floats
+    """Surface model with houses, crowns, cars and noise, ``(H, W)``, m."""
+    dtm: Floats
+    """Terrain model without bridges, smoothed and noisy, ``(H, W)``, m."""
+    road_mask: Bools
+    """Road as a segmentation would find it, with errors, ``(H, W)``."""
+    reference: Floats
+    """True height of road and terrain with bridges, ``(H, W)``, m."""
+    reference_road: Bools
+    """True road, ``(H, W)``."""
+    kind: NDArray[np.uint8]
+    """What the surface model shows, a `Kind` per cell, ``(H, W)``."""
+
+    @property
+    def layers(self) -> Mapping[str, NDArray[np.generic]]:
+        """The rasters by the catalog's layer names."""
+        return {
+            "dsm": self.dsm,
+            "dtm": self.dtm,
+            "road_mask": self.road_mask,
+            "reference": self.reference,
+            "reference_road": self.reference_road,
+        }
+
+
+def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: SceneOptions = DEFAULTS) -> Scene:
+    """Make one tile of the world of a seed.
+
+    Ground, streets, objects and the mask's errors are functions of seed and absolute coordinates: tiles
+    of one seed join. Noise of the heights is drawn per tile.
+
+    Parameters
+    ----------
+    grid : Grid
+        The tile's cells.
+    seed : int
+        The world; 0 or more.
+    stratum : str, optional
+        Make the whole world ``urban``, ``suburban`` or ``rural``; by default its districts are mixed.
+    options : SceneOptions
+        How the world looks.
+
+    Raises
+    ------
+    TaskError
+        If the seed is negative or the stratum unknown.
+    """
+    if seed < 0:
+        raise TaskError(f"a seed is 0 or more, not {seed}")
+    if stratum is not None:
+        named(stratum)
+    plan = Plan(seed, options.block_m, options.stream_share, stratum)
+    # The terrain model is smoothed; the margin keeps the tile's border from showing.
+    wide = grid.buffered(4 * DTM_BLUR_M)
+    canvas, inner = Canvas.of(wide, plan), wide.window(grid)
+    ground_at = _ground_near(canvas, options)
+    here = ground_at(canvas.x, canvas.y)
+    streets = plan.streets(_box(canvas, OBJECT_REACH_M))
+    objects = populate(streets, seed, ground_at, options.density, options.mask_errors)
+    rng = generator(seed, "survey", *map(int, grid.origin))
+    dsm, kind = surface_model(canvas, here.height, here.deck, objects, rng)
+    dsm += rng.uniform(*options.dsm_noise_m) * rng.standard_normal(dsm.shape)
+    wobble = _wobble(seed, options.wobble_m)
+    return Scene(
+        grid=grid,
+        stratum=plan.stratum_at(*_centre(canvas)).name,
+        dsm=dsm[inner],
+        dtm=_terrain_model(here.bare, wide.cell, options.dtm_noise_m, rng)[inner],
+        road_mask=segmentation(canvas, here.edge, objects, wobble, options.mask_errors)[inner],
+        reference=here.height[inner],
+        reference_road=here.road[inner],
+        kind=kind[inner],
+    )
+
+
+def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
+    """Return the ground as a function of points on and a little beyond the canvas."""
+    plan = canvas.plan
+    land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m)
+    # Objects may lie beyond the tile, and the streets that lift their ground farther still.
+    box = _box(canvas, 2 * OBJECT_REACH_M)
+    return partial(ground, land, plan.streets(box), tuple(plan.streams(box)))
+
+
+def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
+    """Return the bare ground as interpolation between ground points leaves it."""
+    grain = gaussian_filter(rng.standard_normal(bare.shape), DTM_GRAIN_M / cell)
+    # White noise keeps 1 / (2 sigma sqrt(pi)) of its deviation under a Gaussian of sigma cells.
+    gain = max(2 * np.sqrt(np.pi) * DTM_GRAIN_M / cell, 1.0)
+    smooth: Floats = gaussian_filter(bare, DTM_BLUR_M / cell, mode="nearest") + noise_m * gain * grain
+    return smooth
+
+
+def _wobble(seed: int, rms_m: float) -> Waves:
+    """Return the offset of the mask's edges: some metres long, as labels of image patches are."""
+    lengths = np.geomspace(5, 40, 12)
+    return waves(generator(seed, "wobble"), lengths, rms_m * np.sqrt(2 / lengths.size))
+
+
+def _box(canvas: Canvas, margin_m: float) -> Box:
+    """Return the plan's box around a canvas."""
+    x, y = canvas.x, canvas.y
+    return (
+        float(x.min()) - margin_m,
+        float(y.min()) - margin_m,
+        float(x.max()) + margin_m,
+        float(y.max()) + margin_m,
+    )
+
+
+def _centre(canvas: Canvas) -> tuple[float, float]:
+    west, south, east, north = canvas.grid.bounds
+    return canvas.plan.from_map((west + east) / 2, (south + north) / 2)

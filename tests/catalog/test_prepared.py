@@ -1,0 +1,172 @@
+from datetime import UTC, datetime, timedelta, timezone
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from catalog import Catalog, CatalogError, Grid
+from catalog.sources.prepared import index, write_tile
+
+GRID = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 25, 20)
+TAKEN = datetime(2024, 5, 1, 12, 30, tzinfo=timezone(timedelta(hours=2)))
+
+
+def heights(grid: Grid = GRID) -> np.ndarray:
+    z = np.random.default_rng(0).uniform(100, 400, grid.shape)
+    z[0, 0] = np.nan
+    return z
+
+
+def road(grid: Grid = GRID) -> np.ndarray:
+    return np.random.default_rng(1).random(grid.shape) < 0.3
+
+
+def test_round_trip(tmp_path):
+    write_tile(tmp_path, "b", GRID, {"dsm": heights(), "road_mask": road()}, "urban", TAKEN)
+    write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
+    first, second = index(tmp_path)
+    assert (first.id, second.id) == ("a", "b")
+    assert (second.grid, second.stratum) == (GRID, "urban")
+    assert second.datetime == TAKEN
+    assert not second.datetime_assumed
+    assert second.root == str(tmp_path)
+    dsm, mask = second.layers
+    assert (dsm.name, dsm.files) == ("dsm", ("dsm/b.tif",))
+    with rasterio.open(second.paths(dsm)[0]) as file:
+        assert np.array_equal(file.read(1), heights().astype(np.float32), equal_nan=True)
+        assert np.isnan(file.nodata)
+        assert file.crs.to_epsg() == 25832
+    for layer, tile in ((mask, second), (first.layers[0], first)):
+        with rasterio.open(tile.paths(layer)[0]) as file:
+            assert np.array_equal(file.read(1), road())
+            assert file.dtypes == ("uint8",)
+            assert file.nodata is None
+
+
+def test_heights_are_stored_to_a_tenth_of_a_millimetre(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dtm": heights()})
+    with rasterio.open(tmp_path / "dtm" / "a.tif") as file:
+        assert np.nanmax(np.abs(file.read(1) - heights())) < 1e-4
+
+
+def test_layers_come_in_the_catalog_s_order_and_the_catalog_can_be_written(tmp_path):
+    names = ("reference_road", "reference", "dtm", "road_mask", "dsm")
+    write_tile(tmp_path, "a", GRID, {n: road() if "road" in n else heights() for n in names}, "rural", TAKEN)
+    (tile,) = index(tmp_path)
+    assert [layer.name for layer in tile.layers] == [
+        "dsm",
+        "dtm",
+        "road_mask",
+        "reference",
+        "reference_road",
+    ]
+    Catalog((tile,)).write(tmp_path / "catalog.parquet")
+    assert Catalog.read(tmp_path / "catalog.parquet").tiles == (tile,)
+
+
+def test_without_a_date_the_file_s_time_stands_in(tmp_path):
+    before = datetime.now(UTC) - timedelta(seconds=5)
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    (tile,) = index(tmp_path)
+    assert tile.datetime_assumed
+    assert before < tile.datetime < datetime.now(UTC) + timedelta(seconds=5)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    cell=st.sampled_from([0.1, 0.2, 0.3, 1 / 3, 0.7, 2.5, 10.0]),
+    west=st.floats(0, 1e6, allow_subnormal=False),
+    north=st.floats(0, 1e7, allow_subnormal=False),
+)
+def test_odd_lattices_come_back_exactly(tmp_path, cell, west, north):
+    grid = Grid("EPSG:25832", west, north, cell, 7, 5)
+    write_tile(tmp_path, "a", grid, {"dsm": heights(grid)})
+    assert index(tmp_path)[0].grid == grid
+
+
+def test_the_id_is_in_the_file_not_in_its_name(tmp_path):
+    write_tile(tmp_path, "500000_5600000", GRID, {"dsm": heights()})
+    (tmp_path / "dsm" / "500000_5600000.tif").rename(tmp_path / "dsm" / "1_2.tif")
+    (tile,) = index(tmp_path)
+    assert tile.id == "500000_5600000"
+    assert tile.layers[0].files == ("dsm/1_2.tif",)
+
+
+def test_a_tile_written_again_replaces_the_old_one(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    write_tile(tmp_path, "a", GRID, {"dsm": heights() + 1})
+    with rasterio.open(tmp_path / "dsm" / "a.tif") as file:
+        assert file.read(1)[1, 1] == np.float32(heights()[1, 1] + 1)
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    was = (tmp_path / "dsm" / "a.tif").read_bytes()
+    nowhere = Grid("EPSG:999999", GRID.west, GRID.north, 1.0, 25, 20)
+    with pytest.raises(CatalogError, match="EPSG"):
+        write_tile(tmp_path, "a", nowhere, {"dsm": heights()})
+    assert [path.name for path in (tmp_path / "dsm").iterdir()] == ["a.tif"]
+    assert (tmp_path / "dsm" / "a.tif").read_bytes() == was
+
+
+@pytest.mark.parametrize(
+    ("tile_id", "layers", "line"),
+    [
+        ("a/b", {}, r"'a/b' makes no file name.*slashes"),
+        ("", {}, "'' makes no file name"),
+        ("a", {"dem": heights()}, "no layer 'dem'.*known are dsm, dtm"),
+        ("a", {"dsm": heights()[:-1]}, r"dsm of tile a is \(19, 25\), but its grid is \(20, 25\)"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_whole(tmp_path, tile_id, layers, line):
+    with pytest.raises(CatalogError, match=line):
+        write_tile(tmp_path, tile_id, GRID, {"dtm": heights(), **layers})
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_folder_is_named(tmp_path):
+    with pytest.raises(CatalogError, match=f"no LAYER/.*{tmp_path.name}.*dsm"):
+        index(tmp_path)
+
+
+def test_a_file_without_tags_is_named(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
+        file.update_tags(FLEXROAD_TILE="")
+    with pytest.raises(CatalogError, match=r"dsm/a.tif carries no FLEXROAD_TILE; .*catalog it as rasters"):
+        index(tmp_path)
+
+
+def test_a_broken_file_is_named(tmp_path):
+    (tmp_path / "dsm").mkdir()
+    (tmp_path / "dsm" / "a.tif").write_bytes(b"II*\0 nothing")
+    with pytest.raises(CatalogError, match=r"dsm/a.tif is no GeoTIFF"):
+        index(tmp_path)
+
+
+def test_a_date_that_is_none_is_named(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()}, date=TAKEN)
+    with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
+        file.update_tags(TIFFTAG_DATETIME="May 2024")
+    with pytest.raises(CatalogError, match=r"dsm/a.tif has TIFFTAG_DATETIME 'May 2024'"):
+        index(tmp_path)
+
+
+def test_files_of_a_tile_that_contradict_each_other_are_named(tmp_path):
+    moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()}, "urban")
+    write_tile(tmp_path, "a", moved, {"dtm": heights()}, "urban")
+    with pytest.raises(CatalogError, match=r"dsm/a.tif and .*dtm/a.tif of tile a differ in grid"):
+        index(tmp_path)
+    write_tile(tmp_path, "a", GRID, {"dtm": heights()}, "rural")
+    with pytest.raises(CatalogError, match="differ in stratum: urban and rural"):
+        index(tmp_path)
+
+
+def test_two_files_of_one_layer_are_named(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    (tmp_path / "dsm" / "b.tif").write_bytes((tmp_path / "dsm" / "a.tif").read_bytes())
+    with pytest.raises(CatalogError, match=r"a.tif and .*b.tif both say they are layer dsm of tile a"):
+        index(tmp_path)
