@@ -1,0 +1,194 @@
+"""Step A of the paper, geospatial data acquisition: the rasters R^DSM and R^DTM of one tile on one lattice.
+
+The door of the program: behind it heights are metres in float64, row 0 lies in the north, and what is
+unknown is NaN, whatever the files' cut, lattice, unit or nodata.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from rasterio.enums import Resampling
+
+from catalog import Grid, Layer, Tile
+from catalog.crs import Unit, height_unit
+from catalog.raster_files import quiet
+from tasks import options
+from tasks.errors import TaskError
+from tasks.patch import Patch, misfit, onto, read
+from tasks.types import Bools, Floats, TileData
+
+VERSION = 1
+
+HEIGHTS = ("dsm", "dtm", "reference")
+CLASSES = ("road_mask", "reference_road")
+
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights beyond these are nodata that nobody declared."""
+
+METRE: Unit = ("metre", 1.0)
+
+UNITS = {
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(("us-ft", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
+}
+"""Metres in the units that bands of heights declare, in lower case."""
+
+
+class Options(options.Options):
+    """What `load` reads."""
+
+    halo_m: float = Field(
+        0.0,
+        ge=0,
+        le=500,
+        description="ground read around the tile (m), so that neighbouring surfaces meet; 0 in the paper",
+    )
+    min_valid: float = Field(
+        0.25, ge=0, le=1, description="share of the tile's cells that need a DSM height, or the tile fails"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Mosaic:
+    """One layer on the tile's lattice."""
+
+    values: Floats
+    """``(H, W)``, heights in m or class values; NaN where no file has a value."""
+    patches: tuple[Patch, ...]
+    """What was read, in the order of the files."""
+    notes: tuple[str, ...]
+
+
+def load(tile: Tile, options: Options) -> TileData:
+    """Read a tile's DSM, DTM, masks and reference onto its lattice, grown by the halo.
+
+    Cells that coincide are copied; others are resampled (heights bilinearly, classes to the nearest),
+    with a note. Of files that overlap, the first with a value wins.
+
+    Raises
+    ------
+    TaskError
+        If a file is missing, broken or in another CRS, the layers differ in their unit of height, the
+        tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
+    """
+    for name in ("dsm", "dtm"):
+        if tile.layer(name) is None:
+            raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")
+    grid = tile.grid.buffered(options.halo_m)
+    with quiet():
+        found = {
+            layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in HEIGHTS + CLASSES
+        }
+    _check_units([patch for name in HEIGHTS if name in found for patch in found[name].patches])
+    core = grid.window(tile.grid)
+    _check_valid(found["dsm"], core, options.min_valid)
+    _check_valid(found["dtm"], core, 0.0)
+    return TileData(
+        tile_id=tile.id,
+        grid=grid,
+        core=tile.grid,
+        dsm=found["dsm"].values,
+        dtm=found["dtm"].values,
+        road_mask=_road(tile, "road_mask", found),
+        reference=found["reference"].values if "reference" in found else None,
+        reference_road=_road(tile, "reference_road", found),
+        notes=tuple(note for mosaic in found.values() for note in mosaic.notes),
+    )
+
+
+def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
+    values = np.full(grid.shape, np.nan)
+    resampling = Resampling.bilinear if layer.name in HEIGHTS else Resampling.nearest
+    patches: list[Patch] = []
+    cut = 0
+    for name, path in zip(layer.files, tile.paths(layer), strict=True):
+        patch = read(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
+        if patch is None:
+            continue
+        if layer.name in HEIGHTS:
+            patch, absurd = _metres(patch)
+            cut += absurd
+        patches.append(patch)
+        np.copyto(values, onto(patch, grid, resampling), where=np.isnan(values))
+        if not np.isnan(values).any():
+            break
+    if not patches:
+        bounds = " ".join(f"{edge:g}" for edge in grid.bounds)
+        raise TaskError(
+            f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
+            "build the catalog anew",
+            str(tile.paths(layer)[0]),
+        )
+    notes = [
+        f"{layer.name} resampled: {why}"
+        for why in dict.fromkeys(misfit(p.lattice, grid) for p in patches)
+        if why
+    ]
+    if cut:
+        notes.append(f"{layer.name}: {cut} cells outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
+    return _Mosaic(values, tuple(patches), tuple(notes))
+
+
+def _metres(patch: Patch) -> tuple[Patch, int]:
+    """Return the patch with heights in metres, and how many were no heights at all."""
+    values = patch.values * _unit(patch)[1]
+    absurd = (values < LOWEST_M) | (values > HIGHEST_M)
+    values[absurd] = np.nan
+    return replace(patch, values=values), int(np.count_nonzero(absurd))
+
+
+def _unit(patch: Patch) -> Unit:
+    """Return the unit of heights: as the band declares it, else the CRS, else metres."""
+    if not patch.unit:
+        return (height_unit(patch.crs) if patch.crs else None) or METRE
+    metres = UNITS.get(patch.unit.lower())
+    if metres is None:
+        raise TaskError(
+            f"{patch.name} counts in {patch.unit!r}, which is no unit of height known here; "
+            "convert it, or correct the unit with gdal_edit.py -units m",
+            patch.file,
+        )
+    return patch.unit, metres
+
+
+def _check_units(patches: Sequence[Patch]) -> None:
+    """Refuse heights in feet beside heights in metres: more likely a missing tag than a mixed survey."""
+    first = patches[0]
+    for patch in patches[1:]:
+        (a, a_metres), (b, b_metres) = _unit(first), _unit(patch)
+        if not math.isclose(a_metres, b_metres, rel_tol=1e-4):
+            raise TaskError(
+                f"{first.name} counts heights in {a}, {patch.name} in {b}; "
+                "convert one, or correct its unit with gdal_edit.py -units",
+                patch.file,
+            )
+
+
+def _check_valid(mosaic: _Mosaic, core: tuple[slice, slice], min_valid: float) -> None:
+    first = mosaic.patches[0]
+    share = 1 - np.isnan(mosaic.values[core]).mean()
+    if share == 0:
+        raise TaskError(f"{first.name} has only nodata on this tile; leave the tile out", first.file)
+    if share < min_valid:
+        raise TaskError(
+            f"{first.name} has {share:.1%} valid cells on this tile, below {min_valid:.0%}; "
+            "lower load.min_valid to keep such tiles",
+            first.file,
+        )
+
+
+def _road(tile: Tile, name: str, found: Mapping[str, _Mosaic]) -> Bools | None:
+    """Return the road cells of a mask, or None if the tile has no such layer."""
+    layer = tile.layer(name)
+    if layer is None:
+        return None
+    values = found[name].values
+    road: Bools = np.isin(values, layer.values) if layer.values else np.nan_to_num(values) != 0
+    return road

@@ -1,0 +1,226 @@
+"""The cells of one raster file that lie under a grid: cut out, then laid onto the grid's own cells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from affine import Affine
+from rasterio.enums import MaskFlags, Resampling
+from rasterio.errors import RasterioError
+from rasterio.warp import reproject, transform_bounds
+from rasterio.windows import Window
+
+from catalog.crs import same, short
+from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from tasks.errors import TaskError
+from tasks.types import Floats
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where a file's cells lie; like a `Grid`, but as the file has it."""
+
+    west: float
+    north: float
+    dx: float
+    dy: float
+    width: int
+    height: int
+    northward: bool = False
+    """True if the file's rows run northward, as in XYZ files sorted by northing."""
+
+    @classmethod
+    def of(cls, transform: Affine, width: int, height: int) -> Lattice:
+        """Return the lattice of an unrotated file."""
+        north = max(transform.f, transform.f + height * transform.e)
+        dx, dy = abs(transform.a), abs(transform.e)
+        return cls(transform.c, north, dx, dy, width, height, northward=transform.e > 0)
+
+    @property
+    def bounds(self) -> Bounds:
+        """West, south, east and north of the outer edges."""
+        return self.west, self.north - self.height * self.dy, self.west + self.width * self.dx, self.north
+
+    def offset(self, grid: Grid) -> tuple[float, float]:
+        """Return how far (m, east and north) this lattice is from the grid's, modulo its cells."""
+        east = math.remainder(self.west - grid.west, self.dx)
+        north = math.remainder(self.north - grid.north, self.dy)
+        return east, north
+
+    def fits(self, grid: Grid) -> bool:
+        """Return whether cells coincide to `LATTICE_TOLERANCE` all over the grid."""
+        west, north, east, south = self._in_cells(grid)
+        off = max(abs(edge - round(edge)) for edge in (west, north, east, south))
+        same_count = (round(east) - round(west), round(south) - round(north)) == (grid.width, grid.height)
+        return off < LATTICE_TOLERANCE and same_count
+
+    def under(self, grid: Grid) -> tuple[slice, slice] | None:
+        """Return the (row, col) slices of this lattice under the grid, rows from the north, or None."""
+        west, north, east, south = self._in_cells(grid)
+        if self.fits(grid):
+            west, north, east, south = round(west), round(north), round(east), round(south)
+        else:
+            # As many cells around as interpolation onto the grid's border cells looks at.
+            pad_x, pad_y = 1 + grid.cell / self.dx, 1 + grid.cell / self.dy
+            west, east, north, south = west - pad_x, east + pad_x, north - pad_y, south + pad_y
+        rows = slice(max(0, math.floor(north)), min(self.height, math.ceil(south)))
+        cols = slice(max(0, math.floor(west)), min(self.width, math.ceil(east)))
+        return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
+
+    def cut(self, rows: slice, cols: slice) -> Lattice:
+        """Return the lattice of a part; rows from the north."""
+        west, north = self.west + cols.start * self.dx, self.north - rows.start * self.dy
+        return Lattice(west, north, self.dx, self.dy, cols.stop - cols.start, rows.stop - rows.start)
+
+    def _in_cells(self, grid: Grid) -> tuple[float, float, float, float]:
+        west, south, east, north = grid.bounds
+        return (
+            (west - self.west) / self.dx,
+            (self.north - north) / self.dy,
+            (east - self.west) / self.dx,
+            (self.north - south) / self.dy,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The cells of one file under a grid."""
+
+    name: str
+    """How messages call the file: ``dsm a.tif``."""
+    file: str
+    values: Floats
+    """``(rows, cols)``, row 0 in the north; NaN where the file has nodata."""
+    lattice: Lattice
+    unit: str
+    """Unit of the values as the band declares it, or nothing."""
+    crs: str | None
+    """CRS of the file, else the one it was given."""
+
+
+def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patch | None:
+    """Read what a file has under a grid.
+
+    Parameters
+    ----------
+    path, name : Path, str
+        The file, and how messages call it: ``dsm a.tif``.
+    grid : Grid
+    core : Grid
+        Where a file that carries no georeference lies, if it has as many cells.
+    crs : str, optional
+        CRS of a file that carries none.
+
+    Returns
+    -------
+    Patch or None
+        None if no cell lies under the grid.
+
+    Raises
+    ------
+    TaskError
+        If the file is missing, broken, rotated or in another CRS than the grid.
+    """
+    try:
+        with rasterio.open(path) as src:
+            lattice = _lattice(src, path, name, grid, core, crs)
+            slices = lattice.under(grid) if lattice else None
+            if lattice is None or slices is None:
+                return None
+            values, unit = _values(src, lattice, *slices), src.units[0] or ""
+            crs = src.crs.to_wkt() if src.crs else crs
+    except (RasterioError, OSError) as error:
+        if not path.exists():
+            raise TaskError(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise TaskError(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
+    return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
+
+
+def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
+    """Return the patch on the grid's cells, ``(H, W)``; NaN where it has no value.
+
+    Cells that coincide are copied. Others are resampled; cells without a value have no weight.
+    """
+    values = np.full(grid.shape, np.nan)
+    lattice = patch.lattice
+    if lattice.fits(grid):
+        row, col = (
+            round((grid.north - lattice.north) / grid.cell),
+            round((lattice.west - grid.west) / grid.cell),
+        )
+        values[row : row + lattice.height, col : col + lattice.width] = patch.values
+        return values
+    reproject(
+        patch.values,
+        values,
+        src_transform=Affine(lattice.dx, 0, lattice.west, 0, -lattice.dy, lattice.north),
+        dst_transform=grid.transform,
+        src_crs=grid.crs,
+        dst_crs=grid.crs,
+        src_nodata=np.nan,
+        dst_nodata=np.nan,
+        resampling=resampling,
+    )
+    return values
+
+
+def misfit(lattice: Lattice, grid: Grid) -> str:
+    """Return in words why cells do not coincide, or nothing if they do."""
+    if lattice.fits(grid):
+        return ""
+    if not math.isclose(lattice.dx, grid.cell, rel_tol=1e-5) or not math.isclose(lattice.dy, lattice.dx):
+        cells = (
+            f"{lattice.dx:.6g} m" if lattice.dx == lattice.dy else f"{lattice.dx:.6g} x {lattice.dy:.6g} m"
+        )
+        return f"its cells are {cells}, the tile's {grid.cell:.6g} m"
+    east, north = lattice.offset(grid)
+    return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
+
+
+def _lattice(src: Any, path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
+    """Return where a file lies, or None if it is in another CRS and elsewhere."""
+    if src.transform.is_identity:
+        if src.shape == core.shape:
+            return Lattice(core.west, core.north, core.cell, core.cell, core.width, core.height)
+        raise TaskError(
+            f"{name} carries no georeference and has {src.width} x {src.height} cells, "
+            f"the tile {core.width} x {core.height}; give it a world file",
+            str(path),
+        )
+    if src.transform.b or src.transform.d:
+        raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
+    lattice = Lattice.of(src.transform, src.width, src.height)
+    theirs = src.crs.to_wkt() if src.crs else crs
+    if theirs is None:
+        raise TaskError(f"{name} carries no CRS; build the catalog anew with --crs", str(path))
+    if same(theirs, grid.crs):
+        return lattice
+    if not _meet(transform_bounds(theirs, grid.crs, *lattice.bounds), grid.bounds):
+        return None
+    raise TaskError(
+        f"{name} is in {short(theirs)}, the tile in {short(grid.crs)}; "
+        f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}",
+        str(path),
+    )
+
+
+def _meet(a: Bounds, b: Bounds) -> bool:
+    # Written so that bounds that cannot be transformed (inf, NaN) count as met: they are an error.
+    return not (a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1])
+
+
+def _values(src: Any, lattice: Lattice, rows: slice, cols: slice) -> Floats:
+    top = lattice.height - rows.stop if lattice.northward else rows.start
+    window = Window(cols.start, top, cols.stop - cols.start, rows.stop - rows.start)
+    values: Floats = src.read(1, window=window).astype(np.float64)
+    if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
+        values = values * src.scales[0] + src.offsets[0]
+    if MaskFlags.all_valid not in src.mask_flag_enums[0]:
+        values[src.read_masks(1, window=window) == 0] = np.nan
+    return values[::-1] if lattice.northward else values

@@ -1,0 +1,1 @@
+"""One file per method of finding the road: TileData -> RoadMask, the paper's M^r."""

@@ -1,0 +1,39 @@
+"""Step B of the paper, road extraction: M^r as an existing mask layer has it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from tasks import options
+from tasks.errors import TaskError
+from tasks.survey import outside
+from tasks.types import RoadMask, TileData
+
+VERSION = 1
+
+
+class Options(options.Options):
+    """Take the catalog's road mask; there is nothing to set."""
+
+    method: Literal["mask"] = "mask"
+
+
+def segment(data: TileData, options: Options) -> RoadMask:
+    """Return the road cells of the catalog's mask layer.
+
+    Raises
+    ------
+    TaskError
+        If the tile has no road mask, or none of its cells is road.
+    """
+    if data.road_mask is None:
+        raise TaskError(
+            "no road mask layer in the catalog and none configured: "
+            "give --road-mask to `flexroad catalog rasters`"
+        )
+    if not data.road_mask[data.grid.window(data.core)].any():
+        raise TaskError(
+            "the road mask has no road cell on this tile: leave the tile out, or say with --road-values "
+            "of `flexroad catalog rasters` which values mean road"
+        )
+    return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=outside(data))
