@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
+from PIL import Image
 
 SIZE_PX = (480, 340)
 OVERSAMPLING = 3
@@ -24,18 +25,25 @@ DENSE_PX = 5.0
 """Triangles smaller than this are drawn with fainter edges, or the terrain would turn black."""
 
 
-def main(folder: Path) -> None:
-    """Draw every mesh of the folder."""
+def main(folder: Path) -> str:
+    """Draw every mesh of the folder and return what went wrong, or nothing."""
+    wrong = []
     for file in sorted(folder.glob("*.npz")):
-        with np.load(file) as arrays:
-            picture = draw(arrays["vertices"], arrays["faces"], arrays["road"])
+        try:
+            with np.load(file) as arrays:
+                picture = draw(arrays["vertices"], arrays["faces"], arrays["road"])
+        except Exception as error:
+            # One odd mesh must not cost the others their pictures.
+            wrong.append(f"{file.name}: {error!r}")
+            continue
         temporary = file.with_suffix(".part")
         picture.save(temporary, format="png")
         temporary.rename(file.with_suffix(".png"))
+    return "; ".join(wrong)
 
 
-def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[np.bool_]) -> Any:
-    """Return one mesh, seen obliquely from the south-south-west, as a PIL image.
+def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[np.bool_]) -> Image.Image:
+    """Return one mesh, seen obliquely from the south-south-west.
 
     Parameters
     ----------
@@ -46,8 +54,6 @@ def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[
     road : ndarray
         ``(F,)``, True on faces of road.
     """
-    from PIL import Image
-
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
     # Normals of the whole mesh, so that the classes meet without a seam.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
@@ -102,4 +108,4 @@ def _look(plotter: Any, bounds: tuple[float, ...]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    sys.exit(main(Path(sys.argv[1])))

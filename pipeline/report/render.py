@@ -32,12 +32,14 @@ DPI = 100
 WIDTH_PX, MAP_PX = 480, 340
 """Widths of a picture and of the map in it."""
 TRUE_COLOUR_BYTES = 100_000
-LEFT_PX, BELOW_PX, ABOVE_PX, GAP_PX = 46, 42, 24, 10
+LEFT_PX, BELOW_PX, GAP_PX = 46, 42, 10
 
 RELIEF = LinearSegmentedColormap.from_list(
     "relief", ["#8fae9a", "#b9c7a0", "#e6dcb4", "#d9bd90", "#c4a183", "#e9e2da"]
 )
 ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
+OVERLAY = 0.72
+"""Opacity of a mask over the relief."""
 UNKNOWN = "#f2f2f2"
 """Cells without a value."""
 
@@ -99,10 +101,10 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: s
     rgb = _shaded(paper, height, grid.cell)
     parts = (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED))
     for _, mask, colour in parts:
-        rgb = _laid_over(rgb, mask, colour, 0.72)
+        rgb = _laid_over(rgb, mask, colour, OVERLAY)
     figure, axes = _map(rgb, grid, title)
     entries = [
-        Patch(color=colour, label=f"{name}\n{mask.sum() * grid.cell**2:,.0f} m²")
+        Patch(color=colour, alpha=OVERLAY, label=f"{name}\n{mask.sum() * grid.cell**2:,.0f} m²")
         for name, mask, colour in parts
     ]
     legend = _beside(figure, axes, WIDTH_PX - LEFT_PX - MAP_PX - GAP_PX)
@@ -247,7 +249,7 @@ def _map(
     """Return a figure with values, colours or numbers, in place: metres from the tile's south-west corner."""
     scale = min(MAP_PX / grid.width, 2 * MAP_PX / grid.height)
     width, height = max(scale * grid.width, 60), max(scale * grid.height, 60)
-    size = WIDTH_PX, BELOW_PX + height + ABOVE_PX
+    size = WIDTH_PX, BELOW_PX + height + (24 if title else 8)
     figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI)
     axes = figure.add_axes((LEFT_PX / size[0], BELOW_PX / size[1], width / size[0], height / size[1]))
     axes.set_facecolor(UNKNOWN)
