@@ -209,7 +209,7 @@ def _covered(
     kept = {tile_id: grid for tile_id, grid in grids.items() if cover[tile_id] >= max(min_cover, 1e-9)}
     thin = [tile_id for tile_id in grids if 0 < cover[tile_id] < min_cover]
     note = (
-        f"left out {len(thin)} tiles covered less than {min_cover:.0%} by the DSM "
+        f"left out {_count(thin)} covered less than {min_cover:.0%} by the DSM "
         f"(--min-cover 0 keeps them): {some(thin)}"
     )
     if not kept:
@@ -236,5 +236,11 @@ def _taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, 
 
 
 def _assumed(tiles: Sequence[Tile]) -> list[str]:
-    n = sum(tile.datetime_assumed for tile in tiles)
-    return [f"no date in the dsm files of {n} tiles: the files' times stand in (--date sets it)"] if n else []
+    assumed = [tile.id for tile in tiles if tile.datetime_assumed]
+    if not assumed:
+        return []
+    return [f"no date in the dsm of {_count(assumed)}: the files' times stand in (--date sets it)"]
+
+
+def _count(ids: Sequence[str]) -> str:
+    return f"{len(ids)} tile" + "s" * (len(ids) != 1)

@@ -1,0 +1,55 @@
+"""Small raster files for the tests, in the ways surveys deliver them."""
+
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from affine import Affine
+from rasterio.transform import from_origin
+
+UTM = "EPSG:25832"
+
+
+def write(
+    path: Path,
+    values,
+    west: float = 295500.0,
+    north: float = 5629500.0,
+    *,
+    cell: float = 1.0,
+    crs: str | None = UTM,
+    transform: Affine | None = None,
+    driver: str = "GTiff",
+    unit: str | None = None,
+    scale: tuple[float, float] = (1.0, 0.0),
+    tags: dict[str, str] | None = None,
+    **profile,
+) -> Path:
+    """Write one band with its north-west corner where told."""
+    values = np.asarray(values)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    form = {"driver": driver, "dtype": values.dtype, "count": 1, "crs": crs, **profile}
+    form |= {"width": values.shape[1], "height": values.shape[0]}
+    form["transform"] = transform or from_origin(west, north, cell, cell)
+    with rasterio.open(path, "w", **form) as dst:
+        dst.write(values, 1)
+        dst.update_tags(**(tags or {}))
+        if unit:
+            dst.units = (unit,)
+        if scale != (1.0, 0.0):
+            dst.scales, dst.offsets = (scale[0],), (scale[1],)
+    return path
+
+
+def write_xyz(path: Path, values, west: float, north: float, *, northward: bool = False) -> Path:
+    """Write a point a line, as state surveys do; ``northward`` starts in the south-west."""
+    values = np.asarray(values, dtype=float)
+    rows = range(values.shape[0])
+    lines = [
+        f"{west + col + 0.5:.1f} {north - row - 0.5:.1f} {values[row, col]:.2f}"
+        for row in (reversed(rows) if northward else rows)
+        for col in range(values.shape[1])
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+    return path
