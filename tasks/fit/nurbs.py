@@ -1,0 +1,183 @@
+"""Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
+
+Adam on the heights and weights of a fixed grid of control points, from the DTM; the loss is
+`tasks.objective`, the surface `tasks.nurbs`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+from catalog.grid import Grid
+from tasks import adam, autograd
+from tasks.errors import TaskError
+from tasks.nurbs import NurbsSurface, clamped_knots, greville
+from tasks.objective import Objective, objective
+from tasks.options import Options as BaseOptions
+from tasks.planes import least_squares_plane
+from tasks.types import Bools, Floats, RoadClusters, TileData
+
+VERSION = 1
+
+MAX_LOG_WEIGHT = math.log(10)
+"""Bound on abs(ln w): without it Adam reaches negative weights, that is poles, on real streets."""
+
+Space = tuple[Floats, Floats, tuple[int, int]]
+"""Knots along easting and northing, degrees along both."""
+
+
+class Options(BaseOptions):
+    """How the surface is fitted; the defaults are the paper's."""
+
+    method: Literal["nurbs"] = "nurbs"
+    degree: int = Field(3, ge=1, le=10, description="degree of the basis along easting and northing, p = q")
+    control_points: tuple[int, int] = Field(
+        (35, 35), description="number of control points along easting and along northing"
+    )
+    spacing_m: float | None = Field(
+        None, gt=0, description="distance of control points (m); if given, in place of control_points"
+    )
+    lambda_terrain: float = Field(1.0, ge=0, description="weight of the terrain term")
+    lambda_reg: float = Field(
+        0.01, ge=0, description="weight of the control points' height differences (1/m)"
+    )
+    terrain: bool = Field(
+        True,
+        description="false: no DTM support; the terrain term is off and the start a plane through the road",
+    )
+    weights: Literal["free", "unit"] = Field(
+        "free", description="free: weights are optimised between 1/10 and 10; unit: all are 1"
+    )
+    learning_rate: float = Field(0.1, gt=0, description="Adam's step, m for heights, 1 for ln w")
+    iterations: int = Field(200, ge=0, description="most Adam steps")
+    stop_tolerance: float = Field(1e-4, ge=0, description="stop when the loss changes by less than this part")
+    stop_window: int = Field(20, ge=1, description="steps over which that change is taken")
+    engine: Literal["numba", "torch"] = Field("numba", description="what computes the gradient")
+    device: str = Field(
+        "cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="cpu; with torch also cuda, cuda:1"
+    )
+
+    @model_validator(mode="after")
+    def _enough_control_points(self) -> Options:
+        if self.spacing_m is None and min(self.control_points) <= self.degree:
+            n, m = self.control_points
+            raise ValueError(f"degree {self.degree} needs more control points each way than {n} x {m}")
+        if self.engine == "numba" and self.device != "cpu":
+            raise ValueError(f"device {self.device} needs engine torch; numba runs on the cpu")
+        return self
+
+
+def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
+    """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere.
+
+    Raises
+    ------
+    TaskError
+        If there are fewer cells with a height than control points, if there is nothing to start from, or if
+        the device is not there.
+    """
+    space = spline_space(data.grid, options)
+    start, datum = start_heights(data, clusters.mask, space, options.terrain)
+    loss = objective_of(data, clusters.mask, space, datum, options)
+    variables = np.stack([start - datum, np.zeros_like(start)])
+    limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
+    schedule = adam.Schedule(
+        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
+    )
+    if options.engine == "torch":
+        (z, rho), _ = autograd.minimise(loss, variables, limit, schedule, options.device)
+    else:
+        (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
+    weights = np.exp(rho)
+    east, north = data.grid.origin
+    return NurbsSurface(
+        crs=data.grid.crs,
+        bounds=data.grid.hull,
+        degree=space[2],
+        knots_u=space[0],
+        knots_v=space[1],
+        A=weights * z,
+        W=weights,
+        datum=datum,
+        origin=(float(east), float(north)),
+    )
+
+
+def spline_space(grid: Grid, options: Options) -> Space:
+    """Return the knots and degrees of the surface over a grid's hull.
+
+    Raises
+    ------
+    TaskError
+        If the grid is a single row or column.
+    """
+    if min(grid.shape) < 2:
+        raise TaskError(f"a surface needs at least 2 x 2 cells, not {grid.width} x {grid.height}")
+    n, m = options.control_points
+    if options.spacing_m is not None:
+        west, south, east, north = grid.hull
+        n, m = (
+            max(options.degree + 1, round(span / options.spacing_m) + 1)
+            for span in (east - west, north - south)
+        )
+    p = options.degree
+    return clamped_knots(n, p), clamped_knots(m, p), (p, p)
+
+
+def objective_of(data: TileData, road: Bools, space: Space, datum: float, options: Options) -> Objective:
+    """Return the loss for this tile.
+
+    Raises
+    ------
+    TaskError
+        If fewer cells have a height than there are control points.
+    """
+    heights = np.where(road, data.dsm, data.dtm)
+    cells = np.count_nonzero(np.isfinite(heights))
+    n, m = (len(knots) - options.degree - 1 for knots in space[:2])
+    if cells < n * m:
+        raise TaskError(
+            f"{cells} cells with a height are fewer than {n} x {m} control points; "
+            "lower fit.control_points or raise fit.spacing_m"
+        )
+    terrain = options.lambda_terrain if options.terrain else 0.0
+    factor = np.where(road, 1.0, terrain)
+    return objective(heights - datum, factor, space, options.lambda_reg, options.weights == "free")
+
+
+def start_heights(data: TileData, road: Bools, space: Space, terrain: bool) -> tuple[Floats, float]:
+    """Return the control heights to start from, ``(m, n)`` with row 0 in the south, and their mean (m).
+
+    The DTM at the Greville abscissae; without DTM support the least-squares plane through the road, for the
+    DTM may not leak in through the start.
+
+    Raises
+    ------
+    TaskError
+        If there is no height to start from.
+    """
+    u, v = (greville(knots, degree) for knots, degree in zip(space[:2], space[2], strict=True))
+    cols, rows = u * (data.grid.width - 1), (1 - v) * (data.grid.height - 1)
+    if terrain and np.isfinite(data.dtm).any():
+        heights = map_coordinates(_nearest_filled(data.dtm), np.meshgrid(rows, cols, indexing="ij"), order=1)
+    else:
+        r, c = np.nonzero(road & np.isfinite(data.dsm))
+        if not len(r):
+            dtm = "empty too" if terrain else "not to be used (fit.terrain)"
+            raise TaskError(f"no filtered road cell has a DSM height to start from, and the DTM is {dtm}")
+        level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), data.dsm[r, c])
+        heights = level + by_col * cols[None, :] + by_row * rows[:, None]
+    return heights, float(heights.mean())
+
+
+def _nearest_filled(heights: Floats) -> Floats:
+    missing = ~np.isfinite(heights)
+    if not missing.any():
+        return heights
+    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    return np.asarray(heights[tuple(nearest)])

@@ -1,0 +1,18 @@
+"""The least-squares plane through points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tasks.types import Floats
+
+
+def least_squares_plane(easting: Floats, northing: Floats, height: Floats) -> tuple[float, float, float]:
+    """Return (c, a, b) of ``z = c + a * easting + b * northing`` with the least squared vertical error.
+
+    Points that do not span a plane (one point, points on a line) give the plane through them that is level
+    in the direction they leave open; coordinates should be local, so that c keeps its digits.
+    """
+    e, n, z = easting.mean(), northing.mean(), height.mean()
+    (a, b), *_ = np.linalg.lstsq(np.column_stack([easting - e, northing - n]), height - z, rcond=1e-9)
+    return float(z - a * e - b * n), float(a), float(b)
