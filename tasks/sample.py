@@ -1,0 +1,194 @@
+"""Sample the surface to a mesh: the paper's step D, "Dynamic Surface Sampling".
+
+dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined by Delaunay triangulation;
+uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
+
+The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
+the tile has no halo, else the core's bounds, so that neighbouring tiles meet.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import startinpy
+from numpy.typing import NDArray
+from pydantic import Field
+
+from catalog.grid import Bounds
+from tasks import options as base
+from tasks.errors import TaskError
+from tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
+
+VERSION = 1
+
+MICRO = 6
+"""Decimals of a metre that lattice offsets are rounded to: 3 * 0.1 m and 1 * 0.3 m are one place."""
+SNAP_M = 1e-3
+"""The last line of a lattice moves to the border when it ends closer to it than this (m)."""
+
+NUDGE = 1e-6
+"""Part of a cell that is more than the rounding error of its edge's coordinates."""
+
+
+class Options(base.Options):
+    """Where the surface is sampled."""
+
+    method: Literal["dynamic", "uniform", "corners"] = Field(
+        "dynamic",
+        description="dynamic: fine on roads, coarse elsewhere; uniform: road_m everywhere; corners: a plane",
+    )
+    road_m: float = Field(1.0, ge=0.05, description="spacing of samples on roads, the paper's s^r (m)")
+    terrain_m: float = Field(10.0, ge=0.05, description="spacing of samples elsewhere, the paper's s^t (m)")
+    mask: Literal["raw", "filtered"] = Field(
+        "raw", description="where road is: raw: as segmented, M^r; filtered: what ECSRC kept, M^{r+}"
+    )
+
+
+def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Options) -> Mesh:
+    """Sample the surface over the tile's core and join the samples to triangles.
+
+    Parameters
+    ----------
+    surface : Surface
+        The fitted ground.
+    road : RoadMask
+        Gives the grids, the raw mask and the cells beyond the survey, where the mesh ends.
+    clusters : RoadClusters
+        Gives the filtered mask.
+    options : Options
+        Spacings in metres.
+
+    Returns
+    -------
+    Mesh
+        Counter-clockwise from above, covering the domain but for cells beyond the survey (kept all the
+        same with ``corners``) and where the surface has no height. Equal inputs give equal meshes.
+
+    Raises
+    ------
+    TaskError
+        If the core is a single row or column of cells without halo, or no face is left.
+    """
+    mask = road.mask if options.mask == "raw" else clusters.mask
+    origin = road.core.origin
+    west, south, east, north = _domain(road)
+    local = west - origin[0], south - origin[1], east - origin[0], north - origin[1]
+    if options.method == "dynamic":
+        points = _dynamic(surface, road, mask, local, options)
+        faces = _delaunay(points)
+    else:
+        step = options.road_m if options.method == "uniform" else np.inf
+        points, faces = _regular(surface, origin, local, step)
+    return _mesh(points, faces, road, mask, keep_outside=options.method == "corners")
+
+
+def _domain(road: RoadMask) -> Bounds:
+    """Return west, south, east and north of what the mesh spans (m)."""
+    if road.core != road.grid:
+        return road.core.bounds
+    if min(road.core.shape) < 2:
+        raise TaskError(
+            f"the centres of {road.core.width} x {road.core.height} cells span no area; "
+            "use larger tiles, or load.halo_m above 0"
+        )
+    return road.core.hull
+
+
+def _axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
+    """Return ``start``, ``start + step``, ... up to ``stop``; ``to_end`` adds a ``stop`` the step misses."""
+    count = int(np.floor((stop - start + SNAP_M) / step))
+    axis = start + np.round(np.arange(1, count + 1) * step, MICRO)
+    axis = np.concatenate([[start], axis])
+    if stop - axis[-1] <= SNAP_M:
+        axis[-1] = stop
+    elif to_end:
+        axis = np.append(axis, stop)
+    return axis
+
+
+def _regular(
+    surface: Surface, origin: tuple[float, float], local: Bounds, step: float
+) -> tuple[Floats, NDArray[np.int32]]:
+    """Return points of a full lattice and two faces per quad, split from south-west to north-east."""
+    west, south, east, north = local
+    x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
+    z = surface.lattice(x + origin[0], y + origin[1])
+    points = np.stack([*np.broadcast_arrays(x, y[:, None]), z], axis=-1).reshape(-1, 3)
+    index = np.arange(len(points), dtype=np.int32).reshape(len(y), len(x))
+    sw, se, nw, ne = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    return points, np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
+
+
+def _dynamic(surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options) -> Floats:
+    """Return road, terrain and border points by northing, then easting; each place once, ``(V, 3)``."""
+    parts = [
+        _lattice(surface, road, mask, local, options.road_m),
+        _lattice(surface, road, ~mask, local, options.terrain_m),
+        _border(surface, road.core.origin, local, options.terrain_m),
+    ]
+    points = np.concatenate(parts)
+    points = points[np.lexsort((points[:, 0], points[:, 1]))]
+    first = np.ones(len(points), bool)
+    first[1:] = (points[1:, :2] != points[:-1, :2]).any(axis=1)
+    return points[first]
+
+
+def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step: float) -> Floats:
+    """Return the points of a lattice whose nearest cell is in ``where``, ``(n, 3)``."""
+    west, south, east, north = local
+    x, y = _axis(west, east, step, to_end=False), _axis(south, north, step, to_end=False)
+    eastings, northings = x + road.core.origin[0], y + road.core.origin[1]
+    z = surface.lattice(eastings, northings)
+    # A point on the line between two cells belongs to the eastern or southern one, whatever the rounding.
+    nudge = NUDGE * road.grid.cell
+    row, col = road.grid.cells(eastings + nudge, northings - nudge)
+    i, j = np.nonzero(where[np.ix_(row, col)])
+    return np.stack([x[j], y[i], z[i, j]], axis=1)
+
+
+def _border(surface: Surface, origin: tuple[float, float], local: Bounds, step: float) -> Floats:
+    """Return points along the four edges of the domain, corners included, ``(n, 3)``."""
+    west, south, east, north = local
+    x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
+    sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (south, north)]
+    sides += [np.stack(np.broadcast_arrays(edge, y), axis=1) for edge in (west, east)]
+    plan = np.concatenate(sides)
+    z = surface.height(plan[:, 0] + origin[0], plan[:, 1] + origin[1])
+    return np.column_stack([plan, z])
+
+
+def _delaunay(points: Floats) -> NDArray[np.int32]:
+    """Return the faces of the Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
+
+    A lattice is full of cocircular points; the order of insertion (corners of the bounding box, then by
+    northing and easting) decides these ties.
+    """
+    plan = points.copy()
+    plan[:, 2] = 0.0
+    triangulation = startinpy.DT()
+    triangulation.snap_tolerance = 10.0 ** -(MICRO + 3)
+    triangulation.insert(plan, insertionstrategy="BBox")
+    # Vertex 0 of startinpy is at infinity; the points follow in their order.
+    faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32) - 1
+    return faces
+
+
+def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools, keep_outside: bool) -> Mesh:
+    """Drop faces without height or beyond the survey, then the vertices no face needs."""
+    east, north = road.core.origin
+    x, y, z = points.T
+    cells = road.grid.cells(x[faces].mean(axis=1) + east, y[faces].mean(axis=1) + north)
+    kept = np.isfinite(z)[faces].all(axis=1)
+    if not keep_outside:
+        kept &= ~road.outside[cells]
+    if not kept.any():
+        raise TaskError("the surface has no height where the tile has data; check the layers of the tile")
+    used = np.zeros(len(points), bool)
+    used[faces[kept]] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    vertices = points[used]
+    datum = float(np.floor(vertices[:, 2].min()))
+    vertices[:, 2] -= datum
+    return Mesh(road.core.crs, (east, north, datum), vertices, number[faces[kept]], mask[cells][kept])
