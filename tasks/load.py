@@ -120,7 +120,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         if not np.isnan(values).any():
             break
     if not patches:
-        bounds = " ".join(f"{edge:g}" for edge in grid.bounds)
+        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         raise TaskError(
             f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
             "build the catalog anew",
@@ -132,7 +132,8 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         if why
     ]
     if cut:
-        notes.append(f"{layer.name}: {cut} cells outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
+        cells = "1 cell" if cut == 1 else f"{cut} cells"
+        notes.append(f"{layer.name}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
     return _Mosaic(values, tuple(patches), tuple(notes))
 
 

@@ -145,7 +145,8 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
 def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
     """Return the patch on the grid's cells, ``(H, W)``; NaN where it has no value.
 
-    Cells that coincide are copied. Others are resampled; cells without a value have no weight.
+    Cells that coincide are copied. Others are resampled: source cells without a value have no weight, and
+    a cell whose centre lies in one gets no value, so that voids keep their size.
     """
     values = np.full(grid.shape, np.nan)
     lattice = patch.lattice

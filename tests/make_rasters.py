@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from affine import Affine
-from rasterio.transform import from_origin
 
 UTM = "EPSG:25832"
 
@@ -30,7 +29,7 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     form = {"driver": driver, "dtype": values.dtype, "count": 1, "crs": crs, **profile}
     form |= {"width": values.shape[1], "height": values.shape[0]}
-    form["transform"] = transform or from_origin(west, north, cell, cell)
+    form["transform"] = transform or Affine(cell, 0, west, 0, -cell, north)
     with rasterio.open(path, "w", **form) as dst:
         dst.write(values, 1)
         dst.update_tags(**(tags or {}))

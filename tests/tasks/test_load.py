@@ -1,0 +1,398 @@
+import pickle
+import warnings
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from affine import Affine
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from catalog import Grid, Layer, Tile
+from tasks import TaskError
+from tasks.load import Options, load
+from tests.make_rasters import UTM, write, write_xyz
+
+GRID = Grid(UTM, 295500.0, 5629480.0, 1.0, 20, 20)
+"""A tile of 20 m; its upper left corner is where `write` puts files."""
+NORTH = {"west": GRID.west, "north": GRID.north}
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    """Nothing may warn: a run of 10,000 tiles would drown in it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # affine's, raised inside rasterio
+        yield
+
+
+def tile(root, *, values=(), crs=None, grid=GRID, **files):
+    files = {"dsm": "dsm.tif", "dtm": "dtm.tif"} | files
+    layers = tuple(
+        Layer(name, (names,) if isinstance(names, str) else tuple(names), values, crs)
+        for name, names in files.items()
+        if names
+    )
+    return Tile("295500_5629460", grid, layers, str(root), datetime(2020, 5, 1, tzinfo=UTC))
+
+
+def relief(height=20, width=20, seed=0):
+    return np.random.default_rng(seed).uniform(100, 130, (height, width))
+
+
+def plane(grid, a=0.3, b=-0.2):
+    e, n = np.meshgrid(grid.eastings, grid.northings)
+    return 100 + a * (e - GRID.west) + b * (n - GRID.north)
+
+
+def fails(made, options=None):
+    """Return the one line and the file of the error that loading gives."""
+    with pytest.raises(TaskError) as caught:
+        load(made, options or Options())
+    assert "\n" not in str(caught.value)
+    return str(caught.value), caught.value.file
+
+
+@pytest.fixture
+def dtm(tmp_path):
+    return write(tmp_path / "dtm.tif", relief(seed=9), **NORTH)
+
+
+# --- what coincides is copied -----------------------------------------------------------------------------
+
+
+def test_coinciding_cells_are_copied_bit_by_bit(tmp_path):
+    dsm, dtm = relief(30, 40), relief(30, 40, seed=1)
+    write(tmp_path / "dsm.tif", dsm, GRID.west - 5, GRID.north + 3)
+    write(tmp_path / "dtm.tif", dtm.astype(np.float32), GRID.west - 5, GRID.north + 3)
+    data = load(tile(tmp_path), Options())
+    assert data.dsm.dtype == data.dtm.dtype == np.float64
+    np.testing.assert_array_equal(data.dsm, dsm[3:23, 5:25])
+    np.testing.assert_array_equal(data.dtm, dtm.astype(np.float32)[3:23, 5:25])
+    assert (data.tile_id, data.grid, data.core, data.notes) == ("295500_5629460", GRID, GRID, ())
+    assert data.road_mask is data.reference is data.reference_road is None
+
+
+def test_a_corner_that_is_off_by_less_than_a_hundredth_is_copied(tmp_path, dtm):
+    dsm = relief()
+    write(tmp_path / "dsm.tif", dsm, GRID.west + 0.009, GRID.north - 0.009, cell=1.00000001)
+    data = load(tile(tmp_path), Options())
+    np.testing.assert_array_equal(data.dsm, dsm)
+    assert data.notes == ()
+
+
+@settings(max_examples=30, deadline=None)
+@given(row=st.integers(-25, 25), col=st.integers(-25, 25), size=st.tuples(*2 * [st.integers(1, 45)]))
+def test_every_cell_lands_where_it_lies(tmp_path_factory, row, col, size):
+    root = tmp_path_factory.mktemp("window")
+    write(root / "dtm.tif", relief(seed=1), **NORTH)
+    dsm = relief(*size)
+    write(root / "dsm.tif", dsm, GRID.west + col, GRID.north - row)
+    want = np.full((100, 100), np.nan)
+    want[25 + row : 25 + row + size[0], 25 + col : 25 + col + size[1]] = dsm
+    want = want[25:45, 25:45]
+    if np.isnan(want).all():
+        assert "no dsm file overlaps the tile" in fails(tile(root), Options(min_valid=0))[0]
+    else:
+        np.testing.assert_array_equal(load(tile(root), Options(min_valid=0)).dsm, want)
+
+
+def test_files_are_put_together_and_the_first_with_a_value_wins(tmp_path, dtm):
+    left, right = relief(20, 12), relief(20, 12, seed=1)
+    left[4, 9] = np.nan
+    write(tmp_path / "a.tif", left, **NORTH)
+    write(tmp_path / "b.tif", right, GRID.west + 8, GRID.north)
+    data = load(tile(tmp_path, dsm=("a.tif", "b.tif")), Options())
+    want = np.hstack([left, right[:, 4:]])
+    want[4, 9] = right[4, 1]
+    np.testing.assert_array_equal(data.dsm, want)
+
+
+def test_a_halo_is_read_from_neighbouring_files(tmp_path):
+    whole = relief(40, 40)
+    for name, cols in {"a": slice(0, 20), "b": slice(20, 40)}.items():
+        write(tmp_path / f"{name}.tif", whole[:, cols], GRID.west + cols.start, GRID.north)
+    made = tile(tmp_path, dsm=("a.tif", "b.tif"), dtm=("a.tif", "b.tif"))
+    data = load(made, Options(halo_m=7))
+    assert (data.grid, data.core) == (GRID.buffered(7), GRID)
+    np.testing.assert_array_equal(data.dsm[data.grid.window(data.core)], whole[:20, :20])
+    np.testing.assert_array_equal(data.dsm[7:, 7:], whole[:27, :27])
+    assert np.isnan(data.dsm[:7]).all()
+    assert np.isnan(data.dsm[:, :7]).all()
+
+
+def test_other_formats_give_the_same(tmp_path, dtm):
+    dsm = relief().round(2)
+    write_xyz(tmp_path / "down.xyz", dsm, **NORTH)
+    write_xyz(tmp_path / "up.xyz", dsm, **NORTH, northward=True)
+    write(tmp_path / "a.asc", dsm, **NORTH, driver="AAIGrid", crs=None)
+    write(tmp_path / "a.tif", dsm, **NORTH)
+    (tmp_path / "a.vrt").write_text(
+        f'<VRTDataset rasterXSize="20" rasterYSize="20"><SRS>{UTM}</SRS>'
+        f"<GeoTransform>{GRID.west},1,0,{GRID.north},0,-1</GeoTransform>"
+        '<VRTRasterBand dataType="Float64" band="1"><SimpleSource>'
+        '<SourceFilename relativeToVRT="1">a.tif</SourceFilename><SourceBand>1</SourceBand>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    for name in ("down.xyz", "up.xyz", "a.asc", "a.vrt"):
+        data = load(tile(tmp_path, dsm=name, crs=UTM), Options())
+        # Point lists come as float32, the ASCII grid with as many digits as were written.
+        np.testing.assert_allclose(data.dsm, dsm, atol=1e-5, err_msg=name)
+        assert data.notes == (), name
+
+
+# --- what does not coincide is resampled ------------------------------------------------------------------
+
+
+def test_heights_on_another_lattice_are_interpolated_and_it_is_said(tmp_path, dtm):
+    off = Grid(UTM, GRID.west - 9.91, GRID.north + 10.31, 1.0, 45, 45)
+    write(tmp_path / "dsm.tif", plane(off), off.west, off.north)
+    data = load(tile(tmp_path), Options())
+    np.testing.assert_allclose(data.dsm, plane(GRID), atol=1e-6)
+    assert data.notes == ("dsm resampled: its lattice is off by (0.09, 0.31) m",)
+
+
+@pytest.mark.parametrize("cell", [0.25, 0.5, 2.0])
+def test_other_cell_sizes(tmp_path, dtm, cell):
+    n = round(60 / cell)
+    other = Grid(UTM, GRID.west - 20, GRID.north + 20, cell, n, n)
+    write(tmp_path / "dsm.tif", plane(other), other.west, other.north, cell=cell)
+    data = load(tile(tmp_path), Options())
+    np.testing.assert_allclose(data.dsm, plane(GRID), atol=1e-6)
+    assert data.notes == (f"dsm resampled: its cells are {cell:g} m, the tile's 1 m",)
+
+
+def test_cells_without_a_value_have_no_weight(tmp_path, dtm):
+    """By definition: bilinear weights, those of voids taken out, the rest summing to one; voids stay."""
+    source = relief(24, 24)
+    source[8:11, 9] = np.nan
+    source[15, 15] = 1e30
+    off = 0.25
+    write(tmp_path / "dsm.tif", source, GRID.west - 2 + off, GRID.north + 2)
+    data = load(tile(tmp_path), Options())
+    known = np.where(source < 1e4, source, np.nan)
+    left, right = known[2:22, 1:21], known[2:22, 2:22]
+    w = np.array([off, 1 - off])[:, None, None] * ~np.isnan([left, right])
+    want = np.nansum([w[0] * left, w[1] * right], axis=0) / w.sum(axis=0)
+    want[np.isnan(right)] = np.nan
+    np.testing.assert_allclose(data.dsm, want, atol=1e-6)
+    assert data.notes == (
+        "dsm resampled: its lattice is off by (0.25, 0.00) m",
+        "dsm: 1 cell outside -500..9000 m taken as nodata",
+    )
+
+
+def test_classes_are_never_mixed(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    fine = np.repeat(np.repeat(np.array([[1, 3], [2, 1]], np.uint8), 20, 0), 20, 1)
+    write(tmp_path / "mask.tif", fine, GRID.west + 0.1, GRID.north, cell=0.5)
+    data = load(tile(tmp_path, road_mask="mask.tif", values=(2,)), Options())
+    want = np.zeros((20, 20), bool)
+    want[10:, :10] = True
+    np.testing.assert_array_equal(data.road_mask, want)
+    assert data.notes == ("road_mask resampled: its cells are 0.5 m, the tile's 1 m",)
+
+
+# --- nodata, units, scales ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("nodata", [-9999.0, -3.4028234663852886e38, float("nan"), 0.0])
+def test_declared_nodata_is_nan_without_a_word(tmp_path, dtm, nodata):
+    dsm = relief().astype(np.float32)
+    dsm[3, 4] = nodata
+    write(tmp_path / "dsm.tif", dsm, **NORTH, nodata=nodata)
+    data = load(tile(tmp_path), Options())
+    assert np.argwhere(np.isnan(data.dsm)).tolist() == [[3, 4]]
+    assert data.notes == ()
+
+
+def test_what_is_no_height_is_cut_and_counted(tmp_path, dtm):
+    dsm = relief()
+    dsm[0, :6] = [np.inf, -np.inf, 1e30, -9999, 9001, np.nan]
+    dsm[1, :2] = [-499, 8999]
+    write(tmp_path / "dsm.tif", dsm, **NORTH)
+    data = load(tile(tmp_path), Options())
+    assert np.argwhere(np.isnan(data.dsm)).tolist() == [[0, i] for i in range(6)]
+    assert data.notes == ("dsm: 5 cells outside -500..9000 m taken as nodata",)
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("ft", 0.3048), ("US survey foot", 1200 / 3937), ("m", 1.0), ("cm", 0.01)]
+)
+def test_heights_come_in_metres(tmp_path, unit, metres):
+    dsm = relief()
+    write(tmp_path / "dsm.tif", dsm / metres, **NORTH, unit=unit)
+    write(tmp_path / "dtm.tif", dsm / metres - 1, **NORTH, unit=unit)
+    data = load(tile(tmp_path), Options())
+    np.testing.assert_allclose(data.dsm, dsm, rtol=1e-12)
+    np.testing.assert_allclose(data.dtm, dsm - metres, rtol=1e-12)
+
+
+def test_feet_by_the_vertical_axis_of_the_crs(tmp_path):
+    """A plan in metres with heights in feet (NAVD88, ftUS) over UTM 10N."""
+    crs = "EPSG:26910+6360"
+    grid = Grid("EPSG:26910", GRID.west, GRID.north, 1.0, 20, 20)
+    for name in ("dsm.tif", "dtm.tif"):
+        write(tmp_path / name, np.full((20, 20), 1000.0), **NORTH, crs=crs)
+    data = load(tile(tmp_path, grid=grid), Options())
+    np.testing.assert_allclose(data.dsm, 1000 * 1200 / 3937, rtol=1e-12)
+
+
+def test_whole_numbers_with_a_scale(tmp_path, dtm):
+    dsm = relief().round(2)
+    write(tmp_path / "dsm.tif", (dsm * 100 - 5000).round().astype(np.int16), **NORTH, scale=(0.01, 50.0))
+    np.testing.assert_allclose(load(tile(tmp_path), Options()).dsm, dsm, rtol=1e-12)
+
+
+def test_masks(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    classes = np.random.default_rng(3).integers(0, 4, (20, 20)).astype(np.uint8)
+    write(tmp_path / "mask.tif", classes, **NORTH, nodata=3)
+    named = load(tile(tmp_path, road_mask="mask.tif", reference_road="mask.tif", values=(1, 2)), Options())
+    np.testing.assert_array_equal(named.road_mask, np.isin(classes, (1, 2)))
+    np.testing.assert_array_equal(named.reference_road, np.isin(classes, (1, 2)))
+    nonzero = load(tile(tmp_path, road_mask="mask.tif"), Options(halo_m=2))
+    want = np.pad(np.isin(classes, (1, 2)), 2)
+    np.testing.assert_array_equal(nonzero.road_mask, want)
+    assert nonzero.road_mask.dtype == np.bool_
+
+
+def test_a_mask_without_georeference_must_have_the_tiles_size(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    mask = np.tri(20, dtype=np.uint8)
+    for name, values in {"same.tif": mask, "other.tif": mask[:19]}.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write(tmp_path / name, values, crs=None, transform=Affine.identity())
+    data = load(tile(tmp_path, road_mask="same.tif"), Options(halo_m=1))
+    np.testing.assert_array_equal(data.road_mask[1:-1, 1:-1], mask)
+    message, file = fails(tile(tmp_path, road_mask="other.tif"))
+    assert message.startswith(
+        "road_mask other.tif carries no georeference and has 20 x 19 cells, the tile 20 x 20"
+    )
+    assert file == str(tmp_path / "other.tif")
+
+
+def test_a_reference_is_read_too(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    truth = relief(seed=5)
+    write(tmp_path / "truth.tif", truth, **NORTH)
+    np.testing.assert_array_equal(load(tile(tmp_path, reference="truth.tif"), Options()).reference, truth)
+
+
+# --- what cannot be loaded ----------------------------------------------------------------------------------
+
+
+def test_a_missing_layer(tmp_path, dtm):
+    assert fails(tile(tmp_path, dsm=None))[0].startswith("the tile has no dsm; give its files")
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    assert "with --dtm" in fails(tile(tmp_path, dtm=None))[0]
+
+
+def test_a_missing_file(tmp_path, dtm):
+    message, file = fails(tile(tmp_path))
+    assert message.startswith("dsm dsm.tif is missing")
+    assert file == str(tmp_path / "dsm.tif")
+
+
+def test_files_that_are_broken(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(200, 200), **NORTH)
+    whole = (tmp_path / "dsm.tif").read_bytes()
+    (tmp_path / "dsm.tif").write_bytes(whole[: len(whole) // 20])
+    message, file = fails(tile(tmp_path))
+    assert message.startswith("dsm dsm.tif cannot be read: ")
+    assert file == str(tmp_path / "dsm.tif")
+    (tmp_path / "dsm.tif").write_bytes(b"")
+    assert "cannot be read" in fails(tile(tmp_path))[0]
+
+
+def test_an_error_survives_the_way_to_another_process(tmp_path, dtm):
+    with pytest.raises(TaskError) as caught:
+        load(tile(tmp_path), Options())
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (str(copy), copy.file) == (str(caught.value), caught.value.file)
+
+
+def test_files_elsewhere(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), GRID.west + 500, GRID.north)
+    message, file = fails(tile(tmp_path))
+    assert message.startswith("no dsm file overlaps the tile (295500 5629460 295520 5629480): dsm.tif")
+    assert file == str(tmp_path / "dsm.tif")
+
+
+def test_layers_in_two_crs(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    from rasterio.warp import transform
+
+    (east,), (north,) = transform(UTM, "EPSG:25833", [GRID.west - 10], [GRID.north + 10])
+    write(tmp_path / "dtm.tif", relief(40, 40), east, north, crs="EPSG:25833")
+    message, file = fails(tile(tmp_path))
+    assert message == (
+        "dtm dtm.tif is in EPSG:25833, the tile in EPSG:25832; reproject it, e.g. gdalwarp -t_srs EPSG:25832"
+    )
+    assert file == str(tmp_path / "dtm.tif")
+
+
+def test_a_file_in_another_crs_and_elsewhere_is_no_error(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    write(tmp_path / "far.tif", relief(), **NORTH, crs="EPSG:25833")
+    made = tile(tmp_path, dtm=("far.tif", "dtm.tif"))
+    np.testing.assert_array_equal(load(made, Options()).dtm, relief(seed=9))
+
+
+def test_a_file_without_crs(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH, crs=None)
+    assert "dsm dsm.tif carries no CRS; build the catalog anew with --crs" in fails(tile(tmp_path))[0]
+    np.testing.assert_array_equal(load(tile(tmp_path, crs=UTM), Options()).dsm, relief())
+
+
+def test_feet_beside_metres(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH, unit="ft")
+    message, file = fails(tile(tmp_path))
+    assert message.startswith("dsm dsm.tif counts heights in ft, dtm dtm.tif in metre; ")
+    assert file == str(tmp_path / "dtm.tif")
+
+
+def test_a_unit_of_something_else(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH, unit="decibel")
+    assert "counts in 'decibel'" in fails(tile(tmp_path))[0]
+
+
+def test_a_rotated_file(tmp_path, dtm):
+    turned = Affine.translation(GRID.west, GRID.north) @ Affine.rotation(10) @ Affine.scale(1, -1)
+    write(tmp_path / "dsm.tif", relief(), transform=turned)
+    assert "is rotated; turn it north up" in fails(tile(tmp_path))[0]
+
+
+def test_too_few_heights(tmp_path, dtm):
+    dsm = np.full((20, 20), np.nan)
+    write(tmp_path / "dsm.tif", dsm, **NORTH)
+    assert "dsm dsm.tif has only nodata on this tile" in fails(tile(tmp_path))[0]
+    dsm.flat[:49] = 100
+    write(tmp_path / "dsm.tif", dsm, **NORTH)
+    message, file = fails(tile(tmp_path))
+    assert "has 12.3% valid cells on this tile, below 25%; lower load.min_valid" in message
+    assert file == str(tmp_path / "dsm.tif")
+    assert np.isfinite(load(tile(tmp_path), Options(min_valid=0.1)).dsm).sum() == 49
+
+
+def test_a_halo_does_not_count_as_covered(tmp_path):
+    for name in ("dsm.tif", "dtm.tif"):
+        write(tmp_path / name, relief(40, 20), GRID.west - 20, GRID.north + 10)
+    assert "has only nodata" in fails(tile(tmp_path), Options(halo_m=10))[0]
+
+
+def test_a_terrain_model_of_nodata(tmp_path):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    write(tmp_path / "dtm.tif", np.full((20, 20), -9999.0), **NORTH, nodata=-9999)
+    message, file = fails(tile(tmp_path))
+    assert "dtm dtm.tif has only nodata on this tile" in message
+    assert file == str(tmp_path / "dtm.tif")
+
+
+def test_options_have_bounds():
+    for bad in ({"halo_m": -1}, {"halo_m": 501}, {"min_valid": 1.5}, {"halo": 3}):
+        with pytest.raises(ValidationError):
+            Options(**bad)

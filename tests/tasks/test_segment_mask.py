@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+
+from catalog import Grid
+from tasks import TaskError
+from tasks.segment.mask import Options, segment
+from tasks.survey import outside
+from tasks.types import TileData
+
+CORE = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 8, 6)
+
+
+def data(void=None, mask=None, halo=0, dtm_void=None) -> TileData:
+    grid = CORE.buffered(halo)
+    dsm, dtm = np.full(grid.shape, 5.0), np.full(grid.shape, 4.0)
+    if void is not None:
+        dsm[void] = np.nan
+        dtm[void if dtm_void is None else dtm_void] = np.nan
+    return TileData("a", grid, CORE, dsm, dtm, road_mask=mask)
+
+
+def test_the_mask_is_taken_as_it_is():
+    mask = np.eye(6, 8, dtype=bool)
+    road = segment(data(mask=mask), Options())
+    np.testing.assert_array_equal(road.mask, mask)
+    assert (road.grid, road.core, road.probability) == (CORE, CORE, None)
+    assert not road.outside.any()
+
+
+def test_no_mask_says_how_to_get_one():
+    with pytest.raises(TaskError, match="give --road-mask"):
+        segment(data(), Options())
+
+
+def test_road_in_the_halo_alone_is_none():
+    mask = np.zeros((10, 12), bool)
+    mask[0] = True
+    with pytest.raises(TaskError, match="no road cell on this tile: .* --road-value"):
+        segment(data(mask=mask, halo=2), Options())
+    mask[5, 5] = True
+    assert segment(data(mask=mask, halo=2), Options()).mask.sum() == 13
+
+
+def test_only_voids_that_reach_the_edge_are_outside():
+    void = np.array(
+        [
+            [1, 0, 0, 0, 0, 0, 1, 1],
+            [0, 1, 0, 0, 0, 0, 0, 1],
+            [0, 0, 0, 1, 1, 0, 0, 0],
+            [0, 0, 0, 1, 1, 0, 0, 0],
+            [0, 0, 0, 0, 0, 0, 0, 0],
+            [0, 0, 1, 0, 0, 0, 0, 0],
+        ],
+        bool,
+    )
+    want = void.copy()
+    want[1, 1] = False  # touches the corner's void by a corner only
+    want[2:4, 3:5] = False
+    np.testing.assert_array_equal(outside(data(void)), want)
+
+
+def test_a_cell_that_has_one_of_both_heights_is_inside():
+    void, other = np.zeros((6, 8), bool), np.zeros((6, 8), bool)
+    void[:3] = True
+    other[3:] = True
+    assert not outside(data(void, dtm_void=other)).any()
+    other[2] = True
+    np.testing.assert_array_equal(np.flatnonzero(outside(data(void, dtm_void=other)).all(axis=1)), [2])
+
+
+@given(arrays(bool, (6, 8)))
+def test_outside_is_what_water_from_the_edge_would_reach(void):
+    """Against a flood that spreads cell by cell."""
+    wet = np.zeros_like(void)
+    rim = np.ones_like(void)
+    rim[1:-1, 1:-1] = False
+    wet |= void & rim
+    for _ in range(void.size):
+        spread = np.pad(wet, 1)
+        wet |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
+    np.testing.assert_array_equal(outside(data(void)), wet)
