@@ -213,11 +213,10 @@ def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
 
 def _merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
     """Lay an override over a stage's options; another method starts from its own defaults."""
-    base = _tagged(base, tag, where)
-    override = _tagged(override, tag, where)
-    if tag in override and tag in base and override[tag] != base[tag]:
-        return override
-    return {**base, **override}
+    below, above = _tagged(base, tag, where), _tagged(override, tag, where)
+    if tag in above and tag in below and above[tag] != below[tag]:
+        return above
+    return below | above
 
 
 def _tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
@@ -227,7 +226,7 @@ def _tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
     if isinstance(options, str | bool) and tag:
         return {tag: options if isinstance(options, str) else ("on" if options else "off")}
     if isinstance(options, dict):
-        return options
+        return dict(options)
     raise ConfigError(f"{where}: expected a mapping of options, not {options!r}")
 
 

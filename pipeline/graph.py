@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
@@ -57,9 +57,9 @@ class Node:
     """Whether its result is worth keeping: not what was only read or copied, nor a mesh nobody asked for."""
 
     @property
-    def module(self) -> ModuleType:
-        """The file that does the work: where the options' model is defined."""
-        return sys.modules[type(self.options).__module__]
+    def function(self) -> Callable[..., Any]:
+        """What computes it."""
+        return stage_function(self.stage, self.options)
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,17 @@ class TileGraph:
     def chain(self, variant: str) -> list[Node]:
         """Return the variant's nodes in the paper's order."""
         return [self.nodes[self.variants[variant][stage]] for stage in STAGE_NAMES]
+
+
+def stage_module(options: Options) -> ModuleType:
+    """Return the file that does the work: where the options' model is defined, with its `VERSION`."""
+    return sys.modules[type(options).__module__]
+
+
+def stage_function(stage: str, options: Options) -> Callable[..., Any]:
+    """Return what computes a stage with such options: the function of that name beside their model."""
+    function: Callable[..., Any] = getattr(stage_module(options), stage)
+    return function
 
 
 def digest(value: Any) -> str:
@@ -127,7 +138,7 @@ def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
 def _node(
     stage: Stage, options: Options, inputs: tuple[str, ...], source: list[Any], keep_mesh: bool
 ) -> Node:
-    module = sys.modules[type(options).__module__]
+    module = stage_module(options)
     made_of = [
         stage.name,
         module.__name__,

@@ -6,51 +6,65 @@ from collections.abc import Callable
 from typing import Any
 
 from pipeline.graph import TileGraph
+from tasks.export import cog, glb, npz, ply
 from tasks.nurbs import NurbsSurface
 
-MEDIA = {
-    "glb": "model/gltf-binary",
-    "ply": "application/octet-stream",
-    "cog": "image/tiff; application=geotiff; profile=cloud-optimized",
-    "npz": "application/zip",
-}
+Product = tuple[bytes, str]
+"""Bytes and media type."""
 
 
-def products(
-    graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, float]
-) -> dict[str, tuple[bytes, str]]:
-    """Return every product asked for: file name -> (bytes, media type).
+def products(graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, float]) -> dict[str, Product]:
+    """Return every product asked for, by file name.
 
-    The surface itself is written for NURBS surfaces only; a plane and a raster are their own inputs.
+    Parameters
+    ----------
+    graph : TileGraph
+        The tile, and what is asked for.
+    pull : callable
+        Gives the result of a node by its fingerprint.
+    origin : tuple of float
+        Whole-metre (easting, northing) that the run's meshes are placed against.
     """
-    made: dict[str, tuple[bytes, str]] = {}
+    made: dict[str, Product] = {}
     for variant in graph.export.variants:
-        fingerprints = graph.variants[variant]
-        stem = f"{graph.tile.id}_{variant}"
         for kind in graph.export.formats:
-            for name, data in _one(kind, graph, fingerprints, pull, origin).items():
-                made[f"{stem}{name}"] = (data, MEDIA[kind])
+            found = _MAKERS[kind](graph, graph.variants[variant], pull, origin)
+            made |= {f"{graph.tile.id}_{variant}{suffix}": product for suffix, product in found.items()}
     return made
 
 
-def _one(
-    kind: str,
-    graph: TileGraph,
-    fingerprints: dict[str, str],
-    pull: Callable[[str], Any],
-    origin: tuple[float, float],
-) -> dict[str, bytes]:
-    from tasks.export import cog, glb, npz, ply
+def _glb(
+    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+) -> dict[str, Product]:
+    return {glb.NAME: (glb.encode(pull(made["sample"]), (*origin, 0.0)), glb.MEDIA_TYPE)}
 
-    if kind == "glb":
-        return {".glb": glb.encode(pull(fingerprints["sample"]), (*origin, 0.0))}
-    if kind == "ply":
-        return {".ply": ply.encode(pull(fingerprints["sample"]))}
-    surface = pull(fingerprints["fit"])
-    if kind == "npz":
-        return {"_surface.npz": npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
-    core = graph.tile.grid
-    road = pull(fingerprints["ecsrc"])
+
+def _ply(
+    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+) -> dict[str, Product]:
+    return {ply.NAME: (ply.encode(pull(made["sample"])), ply.MEDIA_TYPE)}
+
+
+def _cog(
+    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+) -> dict[str, Product]:
+    core, road, surface = graph.tile.grid, pull(made["segment"]), pull(made["fit"])
+    window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)
-    kept = road.mask[road.grid.window(core)]
-    return {"_height.tif": cog.encode_height(heights, core), "_road.tif": cog.encode_mask(kept, core)}
+    heights[road.outside[window]] = float("nan")
+    kept = pull(made["ecsrc"]).mask[window]
+    return {
+        cog.NAME_HEIGHT: (cog.encode_height(heights, core), cog.MEDIA_TYPE),
+        cog.NAME_ROAD: (cog.encode_mask(kept, core), cog.MEDIA_TYPE),
+    }
+
+
+def _npz(
+    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+) -> dict[str, Product]:
+    surface = pull(made["fit"])
+    # A plane and a raster are no NURBS, and no more than what they were made from.
+    return {npz.NAME: (npz.encode(surface), npz.MEDIA_TYPE)} if isinstance(surface, NurbsSurface) else {}
+
+
+_MAKERS = {"glb": _glb, "ply": _ply, "cog": _cog, "npz": _npz}

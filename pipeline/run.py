@@ -33,6 +33,7 @@ from pipeline.execute import Executor
 from pipeline.graph import TileGraph, tile_graphs
 from pipeline.store import TileFolder, check_writable, write_atomic
 from pipeline.tables import write_tables
+from pipeline.warm import warm
 from pipeline.work import Failure, Job, TileResult, do_tile, failed_row, give_up
 
 PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
@@ -164,6 +165,7 @@ def execute(
     start = time.perf_counter()
     results: list[TileResult] = []
     run.log("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
+    warm(run.config)
     jobs = (run.job(graph, anew) for graph in run.graphs() if only(graph))
     try:
         for result in executor.map(do_tile, jobs, _lost):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from catalog.index import item
-from pipeline.graph import STAGE_NAMES, Node, TileGraph
+from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_module
 from pipeline.products import products
 from pipeline.store import Store, TileFolder, file_entry, no_nan
 from tasks.errors import TaskError
@@ -125,7 +125,7 @@ class Pull:
         inputs = [self(fingerprint) for fingerprint in node.inputs] or [self.graph.tile]
         start = time.perf_counter()
         try:
-            result = getattr(node.module, node.stage)(*inputs, node.options)
+            result = node.function(*inputs, node.options)
         except Exception as error:
             failed = StageError(_failure(self.graph.tile.id, node.stage, error))
             self.faults[node.fingerprint] = failed
@@ -256,9 +256,14 @@ def _item(
         "flexroad:rows": rows,
         "flexroad:notes": list(notes),
         "flexroad:nodes": graph.variants,
-        "flexroad:versions": {n.module.__name__: n.module.VERSION for n in graph.nodes.values()},
+        "flexroad:versions": _versions(graph),
     }
     return found
+
+
+def _versions(graph: TileGraph) -> dict[str, int]:
+    modules = [stage_module(node.options) for node in graph.nodes.values()]
+    return {module.__name__: module.VERSION for module in modules}
 
 
 def _failure(tile_id: str, stage: str, error: BaseException) -> Failure:

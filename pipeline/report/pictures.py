@@ -9,7 +9,7 @@ from pipeline.report.render import error_map, filter_picture, hillshade, render_
 from pipeline.run import Run
 from pipeline.store import Store
 from pipeline.work import Pull, StageError
-from tasks.evaluate import drape
+from tasks.drape import drape
 from tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 MOST = 24
@@ -58,7 +58,10 @@ def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
         (
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
-            (f"{variant} minus {against}", error_map(drape(mesh, core) - truth, core, road=raw)),
+            (
+                f"{variant} minus {against}",
+                error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
+            ),
         ),
         data.notes,
     )
