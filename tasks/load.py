@@ -48,7 +48,8 @@ class Options(options.Options):
         0.0,
         ge=0,
         le=500,
-        description="ground read around the tile (m), so that neighbouring surfaces meet; 0 in the paper",
+        description="ground read around the tile (m), so that neighbouring surfaces meet; 0 in the paper; "
+        "a catalog of rasters names the files up to 100 m around",
     )
     min_valid: float = Field(
         0.25, ge=0, le=1, description="share of the tile's cells that need a DSM height, or the tile fails"

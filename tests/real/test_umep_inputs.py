@@ -1,0 +1,99 @@
+"""Indexing and loading real surveys: three UMEP cities (1 m, with and without land cover), a state's DSM."""
+
+import zipfile
+
+import numpy as np
+import pytest
+
+from catalog.sources.rasters import index
+from tasks import TaskError
+from tasks.load import Options, load
+from tasks.segment import mask
+
+pytestmark = pytest.mark.real
+
+
+@pytest.fixture
+def unpack(real_data, tmp_path):
+    def unpacked(name):
+        with zipfile.ZipFile(real_data / "umep" / f"{name}.zip") as archive:
+            archive.extractall(tmp_path)
+        return tmp_path / name if (tmp_path / name).is_dir() else tmp_path
+
+    return unpacked
+
+
+def test_barbican(unpack):
+    """651 x 601 m whose corner is 0.1 mm off the metre: copied, nine tiles, three slivers left out."""
+    folder = unpack("London_BNG")
+    layers = {"dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "road_mask": "landcover*.tif"}
+    found = index(folder, layers, road_values=(1,))
+    assert len(found.tiles) == 9
+    assert found.tiles[4].id == "532250_181500"
+    assert {t.grid.crs for t in found.tiles} == {"EPSG:27700"}
+    assert {t.grid.cell for t in found.tiles} == {1.0}
+    assert found.notes[0].startswith("left out 3 tiles covered less than 25%")
+    data = [load(t, Options()) for t in found.tiles]
+    assert all(d.notes == () for d in data)
+    full = data[4]
+    assert np.isfinite(full.dsm).all()
+    assert np.isfinite(full.dtm).all()
+    assert 4 < full.dtm.min() < full.dtm.max() < 26
+    assert 40 < full.dsm.max() < 146
+    roads = [mask.segment(d, mask.Options()) for d in data]
+    assert 0.40 < roads[4].mask.mean() < 0.50
+    assert not roads[4].outside.any()
+    # The survey ends 40 m short of the northern tiles' edge.
+    assert roads[5].outside.sum() == np.isnan(data[5].dsm).sum() == 40 * 250
+    unmatched = sum(np.count_nonzero(r.mask & np.isnan(d.dsm)) for r, d in zip(roads, data, strict=True))
+    assert unmatched == 0
+
+
+def test_gothenburg(unpack):
+    """A coordinate system of one city, land cover in float32 and unnamed values, less than one tile."""
+    folder = unpack("Goteborg_SWEREF99_1200")
+    layers = {"dsm": "DSM_KRbig.tif", "dtm": "DEM_KRbig.tif", "road_mask": "landcover.tif"}
+    found = index(folder, layers, road_values=(1,))
+    assert [t.id for t in found.tiles] == ["147750_6398500"]
+    assert found.tiles[0].grid.crs == "EPSG:3007"
+    data = load(found.tiles[0], Options())
+    # 147720..147954 and 6398557..6398780 overlap the tile by 204 x 193 m.
+    assert np.isfinite(data.dsm).sum() == 204 * 193
+    assert np.nanmin(np.nanmax(data.dsm) - np.nanmax(data.dtm)) > 0.9
+    road = mask.segment(data, mask.Options())
+    assert road.outside.sum() == 250 * 250 - 204 * 193
+    assert 0.2 < road.mask.mean() < 0.25
+
+
+def test_covent_garden(unpack):
+    """A lattice off the metre is resampled and said so; without land cover there is no mask."""
+    found = index(unpack("DataCoventGarden"), {"dsm": "DSM_CG.tif", "dtm": "DEM_CG.tif"})
+    assert len(found.tiles) == 5
+    tile = next(t for t in found.tiles if t.id == "283250_5711250")
+    data = load(tile, Options())
+    assert data.notes == (
+        "dsm resampled: its lattice is off by (0.09, 0.31) m",
+        "dtm resampled: its lattice is off by (0.09, 0.31) m",
+    )
+    assert np.isfinite(data.dsm).all()
+    assert 6.5 < data.dtm.min() < data.dtm.max() < 25.5
+    with pytest.raises(TaskError, match="no road mask layer"):
+        mask.segment(data, mask.Options())
+
+
+def test_a_bare_ascii_grid_needs_its_crs_said(unpack):
+    folder = unpack("Goteborg_SWEREF99_1200")
+    (tile,) = index(folder, {"dsm": "CDSM_KRbig.asc"}, crs="EPSG:3007").tiles
+    assert tile.layers[0].crs == "EPSG:3007"
+
+
+def test_half_a_kilometre_tile_of_a_state(real_data):
+    """The west half of a 1 km file gives eight tiles of the paper's size."""
+    found = index(real_data / "nrw", {"dsm": "dom1_*.tif", "dtm": "dom1_*.tif"})
+    assert [t.id for t in found.tiles] == [
+        f"{east}_{north}" for east in (356000, 356250) for north in (5699000, 5699250, 5699500, 5699750)
+    ]
+    heights = [load(tile, Options()).dsm for tile in found.tiles]
+    assert all(np.isfinite(h).all() for h in heights)
+    assert min(h.min() for h in heights) == pytest.approx(87.29, abs=0.01)
+    assert max(h.max() for h in heights) == pytest.approx(167.28, abs=0.01)
