@@ -137,7 +137,7 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
     except (RasterioError, OSError) as error:
         if not path.exists():
             raise TaskError(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
-        reason = str(error.__cause__ or error).splitlines()[0]
+        reason = str(error.__cause__ or error).partition("\n")[0]
         raise TaskError(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
     return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
 
@@ -151,10 +151,8 @@ def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
     values = np.full(grid.shape, np.nan)
     lattice = patch.lattice
     if lattice.fits(grid):
-        row, col = (
-            round((grid.north - lattice.north) / grid.cell),
-            round((lattice.west - grid.west) / grid.cell),
-        )
+        row = round((grid.north - lattice.north) / grid.cell)
+        col = round((lattice.west - grid.west) / grid.cell)
         values[row : row + lattice.height, col : col + lattice.width] = patch.values
         return values
     reproject(
