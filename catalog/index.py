@@ -57,13 +57,21 @@ class Catalog:
             raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`")
         try:
             items = _read_json(path) if path.suffix in JSON_SUFFIXES else _read_parquet(path)
-            root = str(path.resolve().parent)
-            return cls(tuple(_tile(item, root) for item in items))
+            folder = str(path.resolve().parent)
+            return cls(tuple(_tile(item, folder) for item in items))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CatalogError(f"{path} is not a FlexRoad catalog: {error!r}") from error
 
-    def write(self, path: Path | str) -> None:
-        """Write the catalog; file names below its folder become relative to it.
+    def write(self, path: Path | str, movable: bool = True) -> None:
+        """Write the catalog.
+
+        Parameters
+        ----------
+        path : Path
+            Its name ends in .parquet, .json or .geojson.
+        movable : bool
+            Name files relative to the catalog's folder where they lie below it, so that both can be moved
+            together; else keep the tiles' roots, so that a copy elsewhere names the same files alike.
 
         Raises
         ------
@@ -74,7 +82,8 @@ class Catalog:
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, unlike {path.name}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        items = [item(_rooted(tile, path.resolve().parent)) for tile in self.tiles]
+        folder = path.resolve().parent
+        items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             (_write_json if path.suffix in JSON_SUFFIXES else _write_parquet)(items, temporary)
@@ -129,8 +138,16 @@ def _to_wgs84(crs: str) -> Transformer:
         raise CatalogError(f"unknown CRS {crs[:60]!r}: {error}") from error
 
 
-def item(tile: Tile) -> Item:
-    """Return the tile as a STAC item; file names as they stand in its layers."""
+def item(tile: Tile, root: str = "") -> Item:
+    """Return the tile as a STAC item.
+
+    Parameters
+    ----------
+    tile : Tile
+        Its files are named as they stand in its layers.
+    root : str
+        Folder they are relative to; empty: that of the file the item is written to.
+    """
     grid = tile.grid
     west, south, east, north = grid.bounds
     to_wgs84 = _to_wgs84(grid.crs)
@@ -154,15 +171,16 @@ def item(tile: Tile) -> Item:
             "proj:transform": [grid.cell, 0.0, west, 0.0, -grid.cell, north],
             "flexroad:stratum": tile.stratum,
             "flexroad:datetime_assumed": tile.datetime_assumed,
+            "flexroad:root": root,
         },
-        "assets": {layer.name: _asset(layer) for layer in tile.layers},
+        "assets": {layer.name: _asset(layer, root) for layer in tile.layers},
         "links": [],
     }
 
 
-def _asset(layer: Layer) -> Item:
+def _asset(layer: Layer, root: str) -> Item:
     return {
-        "href": layer.files[0],
+        "href": str(Path(root) / layer.files[0]) if root else layer.files[0],
         "roles": ["data"],
         "flexroad:files": list(layer.files),
         "flexroad:values": list(layer.values),
@@ -170,7 +188,7 @@ def _asset(layer: Layer) -> Item:
     }
 
 
-def _tile(item: Item, root: str) -> Tile:
+def _tile(item: Item, folder: str) -> Tile:
     properties = item["properties"]
     cell, _, west, _, _, north = properties["proj:transform"][:6]
     height, width = properties["proj:shape"]
@@ -180,7 +198,7 @@ def _tile(item: Item, root: str) -> Tile:
         id=item["id"],
         grid=Grid(crs, west, north, cell, int(width), int(height)),
         layers=tuple(_layer(name, assets[name]) for name in LAYERS if assets.get(name)),
-        root=root,
+        root=properties["flexroad:root"] or folder,
         datetime=datetime.fromisoformat(properties["datetime"]),
         datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
         stratum=properties["flexroad:stratum"],

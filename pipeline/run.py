@@ -118,7 +118,7 @@ class Run:
 
     def _write(self) -> None:
         write_atomic(self.path / "config.yaml", yaml.safe_dump(self.config.raw, sort_keys=False).encode())
-        self.catalog.write(self.path / "catalog.parquet")
+        self.catalog.write(self.path / "catalog.parquet", movable=False)
         found = {
             "config": self.config.name,
             "store": str(self.store.resolve()),

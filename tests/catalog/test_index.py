@@ -59,6 +59,14 @@ def test_files_elsewhere_are_absolute(tmp_path):
     assert read.layers[0].files[0] == str(tmp_path / "data" / "dsm" / "a.tif")
 
 
+def test_a_copy_elsewhere_names_the_files_alike(tmp_path):
+    tiles = (tile(295500, tmp_path / "data"),)
+    Catalog(tiles).write(tmp_path / "run" / "c.json", movable=False)
+    assert Catalog.read(tmp_path / "run" / "c.json").tiles == tiles
+    (feature,) = json.loads((tmp_path / "run" / "c.json").read_text())["features"]
+    assert feature["assets"]["dsm"]["href"] == str(tmp_path / "data" / "dsm" / "a.tif")
+
+
 def test_it_is_stac_and_opens_as_a_map(tmp_path):
     Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
     Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.parquet")
