@@ -1,0 +1,61 @@
+"""Heights of a mesh at cell centres: what vertical distances are measured with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from catalog.grid import Grid
+from tasks.types import Floats, Mesh
+
+TOLERANCE_M = 1e-6
+"""A centre this far outside a triangle still counts as inside: borders and shared edges are never missed."""
+
+
+def drape(mesh: Mesh, grid: Grid) -> Floats:
+    """Return the mesh's height at every cell centre, ``(H, W)``, m above the mesh's origin.
+
+    NaN where no face lies above or below; where several do, the first one counts.
+    """
+    # Local coordinates, by column and row counted in metres from the north-western cell's centre.
+    east = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west - grid.cell / 2)
+    south = (grid.north - mesh.origin[1] - grid.cell / 2) - mesh.vertices[:, 1]
+    heights = np.full(grid.shape, np.nan)
+    _drape(np.column_stack([east, south, mesh.vertices[:, 2]]), mesh.faces, grid.cell, heights)
+    return heights
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _drape(points: Floats, faces: NDArray[np.int32], cell: float, heights: Floats) -> None:
+    rows, cols = heights.shape
+    for f in range(faces.shape[0]):
+        ax, ay, az = points[faces[f, 0]]
+        bx, by, bz = points[faces[f, 1]]
+        cx, cy, cz = points[faces[f, 2]]
+        # Twice the area; the axes look east and south, which makes it negative for faces that look up.
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area == 0.0:
+            continue
+        side = 1.0 if area > 0 else -1.0
+        # How far the doubled areas opposite to a, b and c may be negative: tolerance times edge.
+        slack_a = -TOLERANCE_M * math.hypot(cx - bx, cy - by)
+        slack_b = -TOLERANCE_M * math.hypot(cx - ax, cy - ay)
+        slack_c = -TOLERANCE_M * math.hypot(bx - ax, by - ay)
+        first_row = max(0, math.ceil((min(ay, by, cy) - TOLERANCE_M) / cell))
+        last_row = min(rows - 1, math.floor((max(ay, by, cy) + TOLERANCE_M) / cell))
+        first_col = max(0, math.ceil((min(ax, bx, cx) - TOLERANCE_M) / cell))
+        last_col = min(cols - 1, math.floor((max(ax, bx, cx) + TOLERANCE_M) / cell))
+        for r in range(first_row, last_row + 1):
+            y = r * cell
+            for c in range(first_col, last_col + 1):
+                if not math.isnan(heights[r, c]):
+                    continue
+                x = c * cell
+                of_a = side * ((bx - x) * (cy - y) - (by - y) * (cx - x))
+                of_b = side * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
+                of_c = side * ((ax - x) * (by - y) - (ay - y) * (bx - x))
+                if of_a >= slack_a and of_b >= slack_b and of_c >= slack_c:
+                    heights[r, c] = (of_a * az + of_b * bz + of_c * cz) / abs(area)

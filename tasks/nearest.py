@@ -1,0 +1,137 @@
+"""Distance in space from points to a mesh, exact: faces in square bins, searched outwards in rings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tasks.types import Floats
+
+Indices = NDArray[np.int32]
+
+FACES_PER_BIN = 4
+
+
+def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -> Floats:
+    """Return the distance from each point to the nearest place on the mesh, ``(N,)``, m.
+
+    Parameters
+    ----------
+    vertices : ndarray, (V, 3)
+    faces : ndarray of int, (F, 3)
+    points : ndarray, (N, 3)
+        In the coordinates of the vertices.
+    at_most : ndarray, (N,)
+        A known bound of each distance (m), as the vertical one is; infinity where none is known. The
+        search ends there.
+    """
+    plan = vertices[faces][:, :, :2]
+    low, high = plan.min(axis=1), plan.max(axis=1)
+    west, south = low.min(axis=0)
+    width, height = high.max(axis=0) - (west, south)
+    side = max(math.sqrt(FACES_PER_BIN * width * height / len(faces)), 1e-3)
+    shape = int(height / side) + 1, int(width / side) + 1
+    boxes = ((np.hstack([low, high]) - (west, south, west, south)) / side).astype(np.int32)
+    start, members = _bins(boxes, shape[0], shape[1])
+    local = points - (west, south, 0.0)
+    out = np.empty(len(points))
+    _search(vertices - (west, south, 0.0), faces, start, members, shape, side, local, at_most, out)
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _bins(boxes: Indices, rows: int, cols: int) -> tuple[Indices, Indices]:
+    """List the faces whose bounding box touches each bin.
+
+    Those of bin b are ``members[start[b] : start[b + 1]]``.
+    """
+    start = np.zeros(rows * cols + 1, np.int32)
+    for f in range(boxes.shape[0]):
+        for r in range(boxes[f, 1], boxes[f, 3] + 1):
+            for c in range(boxes[f, 0], boxes[f, 2] + 1):
+                start[r * cols + c + 1] += 1
+    start = np.cumsum(start).astype(np.int32)
+    fill = start[:-1].copy()
+    members = np.empty(start[-1], np.int32)
+    for f in range(boxes.shape[0]):
+        for r in range(boxes[f, 1], boxes[f, 3] + 1):
+            for c in range(boxes[f, 0], boxes[f, 2] + 1):
+                members[fill[r * cols + c]] = f
+                fill[r * cols + c] += 1
+    return start, members
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _search(
+    vertices: Floats,
+    faces: Indices,
+    start: Indices,
+    members: Indices,
+    shape: tuple[int, int],
+    side: float,
+    points: Floats,
+    at_most: Floats,
+    out: Floats,
+) -> None:
+    rows, cols = shape
+    for i in range(points.shape[0]):
+        x, y, z = points[i]
+        row = min(max(math.floor(y / side), 0), rows - 1)
+        col = min(max(math.floor(x / side), 0), cols - 1)
+        best = at_most[i] ** 2
+        for ring in range(max(rows, cols)):
+            # All faces of the rings so far are measured: those left are beyond the ring's inner edge.
+            inner = min(x - (col - ring + 1) * side, (col + ring) * side - x)
+            inner = max(min(inner, y - (row - ring + 1) * side, (row + ring) * side - y), 0.0)
+            if ring and inner**2 >= best:
+                break
+            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+                # A ring's inner rows have only its first and last column.
+                step = 1 if abs(r - row) == ring else max(2 * ring, 1)
+                for c in range(col - ring, col + ring + 1, step):
+                    if c < 0 or c >= cols:
+                        continue
+                    for k in range(start[r * cols + c], start[r * cols + c + 1]):
+                        best = min(best, _to_triangle(vertices, faces[members[k]], x, y, z, best))
+        out[i] = math.sqrt(best)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _to_triangle(vertices: Floats, face: Indices, x: float, y: float, z: float, best: float) -> float:
+    """Return the squared distance from a point to a triangle, or ``best`` if its bounding box is farther."""
+    ax, ay, az = vertices[face[0], 0] - x, vertices[face[0], 1] - y, vertices[face[0], 2] - z
+    bx, by, bz = vertices[face[1], 0] - x, vertices[face[1], 1] - y, vertices[face[1], 2] - z
+    cx, cy, cz = vertices[face[2], 0] - x, vertices[face[2], 1] - y, vertices[face[2], 2] - z
+    # The point is now the origin.
+    gap_x = max(min(ax, bx, cx), -max(ax, bx, cx), 0.0)
+    gap_y = max(min(ay, by, cy), -max(ay, by, cy), 0.0)
+    gap_z = max(min(az, bz, cz), -max(az, bz, cz), 0.0)
+    if gap_x**2 + gap_y**2 + gap_z**2 >= best:
+        return best
+    nx = (by - ay) * (cz - az) - (bz - az) * (cy - ay)
+    ny = (bz - az) * (cx - ax) - (bx - ax) * (cz - az)
+    nz = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    of_c = nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx)
+    of_a = nx * (by * cz - bz * cy) + ny * (bz * cx - bx * cz) + nz * (bx * cy - by * cx)
+    of_b = nx * (cy * az - cz * ay) + ny * (cz * ax - cx * az) + nz * (cx * ay - cy * ax)
+    length = nx * nx + ny * ny + nz * nz
+    if of_a >= 0 and of_b >= 0 and of_c >= 0 and length > 0:
+        square: float = (nx * ax + ny * ay + nz * az) ** 2 / length
+        return square
+    ab: float = _to_edge(ax, ay, az, bx, by, bz)
+    bc: float = _to_edge(bx, by, bz, cx, cy, cz)
+    ca: float = _to_edge(cx, cy, cz, ax, ay, az)
+    return min(ab, bc, ca)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _to_edge(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
+    """Return the squared distance from the origin to the segment a - b."""
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    length = ux * ux + uy * uy + uz * uz
+    along = -(ax * ux + ay * uy + az * uz) / length if length > 0 else 0.0
+    t = min(max(along, 0.0), 1.0)
+    return (ax + t * ux) ** 2 + (ay + t * uy) ** 2 + (az + t * uz) ** 2
