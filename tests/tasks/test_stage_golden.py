@@ -1,0 +1,97 @@
+"""What ecsrc, sample and evaluate give for one made tile, pinned with their versions.
+
+Whoever changes a stage's output on purpose counts its VERSION up and renews the figures here; results kept
+from before are then made again.
+"""
+
+import hashlib
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from catalog.grid import Grid
+from tasks import ecsrc, evaluate, sample
+from tasks.types import RoadClusters, RoadMask, TileData
+
+GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)
+
+
+class Hills:
+    bounds = GRID.hull
+
+    def height(self, easting, northing):
+        x, y = easting - GRID.west, northing - GRID.south
+        return 150 + 0.05 * x + 1.5 * np.sin(x / 13) * np.cos(y / 9)
+
+    def lattice(self, eastings, northings):
+        return self.height(eastings[None, :], northings[:, None])
+
+    def normal(self, easting, northing):
+        raise NotImplementedError
+
+
+@pytest.fixture(scope="module")
+def tile() -> tuple[TileData, RoadMask]:
+    """Two streets and a yard, with a roof over a street, a kerb and ripples in the DSM."""
+    x, y = np.meshgrid(GRID.eastings - GRID.west, GRID.northings - GRID.south)
+    mask = (np.abs(x - y) < 6) | (np.abs(y - 61) < 4) | (np.hypot(x - 75, y - 15) < 7)
+    dtm = Hills().height(GRID.eastings[None, :], GRID.northings[:, None])
+    dsm = dtm + 0.05 * np.sin(x * 2.1) * np.sin(y * 1.7)
+    dsm[20:30, 25:34] += 6.0
+    dsm[(y < 30) & (x - y > 3)] += 0.7
+    dsm[:3, :3] = np.nan
+    reference = dtm + 0.2 * np.sin(x / 5)
+    data = TileData("golden", GRID, GRID, dsm, dtm, reference=reference)
+    return data, RoadMask(GRID, GRID, mask, np.zeros(GRID.shape, bool))
+
+
+@pytest.fixture(scope="module")
+def clusters(tile) -> RoadClusters:
+    return ecsrc.ecsrc(*tile, ecsrc.Options(theta_xy_m=4.0))
+
+
+def digest(*arrays: np.ndarray) -> str:
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:16]
+
+
+def test_ecsrc(clusters):
+    sizes = np.bincount(clusters.labels.ravel())[1:].tolist()
+    assert (ecsrc.VERSION, sizes, digest(clusters.labels)) == (1, [1470, 156], "b4c78ef72d54f40e")
+
+
+@pytest.mark.parametrize(
+    ("method", "golden"),
+    [
+        ("dynamic", (1, 3378, (295500, 5629420, 149.0), "76897d34c3ba24f2")),
+        ("uniform", (1, 14062, (295500, 5629420, 149.0), "42a4d38a9f74eb42")),
+        ("corners", (1, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
+    ],
+)
+def test_sample(tile, clusters, method, golden):
+    mesh = sample.sample(Hills(), tile[1], clusters, sample.Options(method=method))
+    # Heights depend on the last digit of the machine's sine; the plan does not.
+    shape = digest(mesh.vertices[:, :2], mesh.faces, mesh.road)
+    assert (sample.VERSION, len(mesh.faces), mesh.origin, shape) == golden
+
+
+def test_evaluate(tile, clusters):
+    mesh = sample.sample(Hills(), tile[1], clusters, sample.Options())
+    found = asdict(evaluate.evaluate(mesh, *tile, evaluate.Options(nearest=True)))
+    golden = {
+        "l2_road_m": 0.128801681877,
+        "l2_terrain_m": 0.143542308943,
+        "rmse_road_m": 0.142802953274,
+        "rmse_terrain_m": 0.171329502728,
+        "nmad_road_m": 0.1850166303,
+        "p95_road_m": 0.199498997321,
+        "nearest_road_m": 0.128004406058,
+        "nearest_terrain_m": 0.142700094559,
+        "mad_road_deg": 0.509521750772,
+        "mad_terrain_deg": 1.63612316682,
+        "triangles": 3378,
+        "road_fraction": 0.229583333333,
+        "completeness": 1.0,
+    }
+    assert evaluate.VERSION == 1
+    assert found == pytest.approx(golden, rel=1e-9)
