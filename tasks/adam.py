@@ -29,18 +29,22 @@ class Schedule:
     window: int
     """... over so many steps."""
 
-    def has_settled(self, losses: Sequence[float]) -> bool:
-        """Tell whether the loss, one value per step so far, has stopped changing."""
-        if len(losses) <= self.window:
-            return False
-        before, now = losses[-1 - self.window], losses[-1]
+    def has_finished(self, losses: Sequence[float]) -> bool:
+        """Tell whether to stop, by the loss at the start and after each step so far."""
+        steps = len(losses) - 1
+        if steps >= self.iterations or steps < self.window:
+            return steps >= self.iterations
+        before, now = losses[steps - self.window], losses[steps]
         return abs(before - now) <= self.tolerance * before
 
 
 def minimise(
     objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, schedule: Schedule
 ) -> tuple[Floats, list[float]]:
-    """Take Adam steps from ``start``.
+    """Take Adam steps from ``start`` and return the best variables on the way.
+
+    A step is as long as the rate however small the gradient is, so the last one need not be the best: from a
+    start that fits exactly, each step leads away.
 
     Parameters
     ----------
@@ -55,21 +59,23 @@ def minimise(
     Returns
     -------
     variables : ndarray
-        Where the last step led.
+        Those of the lowest loss.
     losses : list of float
-        The loss before each step.
+        The loss at the start and after each step.
     """
-    variables = start.copy()
+    variables = best = start.copy()
     mean, variance = np.zeros_like(start), np.zeros_like(start)
     losses: list[float] = []
-    for step in range(1, schedule.iterations + 1):
+    while True:
         loss, gradient = objective(variables)
+        if not losses or loss < min(losses):
+            best = variables.copy()
         losses.append(loss)
-        if schedule.has_settled(losses):
-            break
+        if schedule.has_finished(losses):
+            return best, losses
+        step = len(losses)
         mean += (1 - BETA_1) * (gradient - mean)
         variance += (1 - BETA_2) * (gradient**2 - variance)
         spread = np.sqrt(variance / (1 - BETA_2**step)) + EPSILON
         variables -= schedule.rate / (1 - BETA_1**step) * mean / spread
         np.clip(variables, -limit, limit, out=variables)
-    return variables, losses

@@ -81,15 +81,17 @@ def minimise(
     variables = loss_at.tensor(start).requires_grad_()
     bound = loss_at.tensor(np.broadcast_to(limit, start.shape))
     adam: Any = torch.optim.Adam([variables], lr=schedule.rate, betas=(BETA_1, BETA_2), eps=EPSILON)
+    best = start
     losses: list[float] = []
-    for _ in range(schedule.iterations):
+    while True:
         adam.zero_grad()
         loss = loss_at(variables)
+        if not losses or loss.item() < min(losses):
+            best = variables.detach().cpu().numpy().copy()
         losses.append(loss.item())
-        if schedule.has_settled(losses):
-            break
+        if schedule.has_finished(losses):
+            return best, losses
         loss.backward()
         adam.step()
         with torch.no_grad():
             variables.clamp_(-bound, bound)
-    return np.asarray(variables.detach().cpu().numpy()), losses

@@ -17,6 +17,8 @@ from tasks.options import Options as BaseOptions
 from tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1
+STORED = False
+"""Heights that `load` reads anyway are not worth a copy in the store."""
 
 SNAP = 1e-6
 """Part of a cell: closer to a cell centre a point is on it, so that nodata beside does not reach it."""

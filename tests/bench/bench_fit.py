@@ -1,0 +1,188 @@
+"""The NURBS fit at the paper's settings, one thread, against two other ways to compute the same gradient.
+
+Point by point: plain Python, the basis computed anew at every cell in every iteration; two iterations are
+timed and scaled to 200. Dense: numpy, products with whole basis matrices into
+arrays that are kept, the gradient written by hand.
+"""
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from catalog.grid import Grid
+from tasks import adam
+from tasks.fit import nurbs
+from tasks.nurbs import basis_matrix
+from tasks.objective import NEIGHBOURS, Objective
+from tasks.types import RoadClusters, TileData
+
+SIZE, ITERATIONS, SAMPLED = 250, 200, 2
+OPTIONS = nurbs.Options(iterations=ITERATIONS, stop_tolerance=0)
+
+
+def case() -> tuple[TileData, RoadClusters]:
+    """Rolling ground with noise, a winding road and cars on it."""
+    grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, SIZE, SIZE)
+    e, n = np.meshgrid(grid.eastings - grid.west, grid.northings - grid.south)
+    rng = np.random.default_rng(0)
+    dtm = 160 + 0.02 * e + 3 * np.sin(e / 40) + 2 * np.cos(n / 55) + rng.normal(0, 0.05, e.shape)
+    road = np.abs(n - 125 - 20 * np.sin(e / 50)) < 6
+    dsm = dtm + np.where(rng.random(e.shape) < 0.05, 1.5, 0)
+    return TileData("bench", grid, grid, dsm, dtm), RoadClusters(grid, road.astype(np.int32))
+
+
+class Dense:
+    """The objective by products with whole basis matrices."""
+
+    def __init__(self, objective: Objective, space: nurbs.Space) -> None:
+        knots_u, knots_v, (p, q) = space
+        self.objective = objective
+        self.u, _ = basis_matrix(knots_u, p, np.linspace(0, 1, SIZE))
+        self.v, _ = basis_matrix(knots_v, q, np.linspace(1, 0, SIZE))
+        # A new array of this size costs more than a product; the yardstick shall not pay for that.
+        self.den, self.s, self.difference, self.pull = np.empty((4, SIZE, SIZE))
+
+    def __call__(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        z, w = variables[0], np.exp(variables[1])
+        a = w * z
+        den, s, difference, pull = self.den, self.s, self.difference, self.pull
+        np.matmul(self.v @ w, self.u.T, out=den)
+        np.matmul(self.v @ a, self.u.T, out=s)
+        np.divide(s, den, out=s)
+        np.subtract(s, self.objective.target, out=difference)
+        np.sign(difference, out=pull)
+        np.multiply(pull, self.objective.factor, out=pull)
+        loss = np.vdot(pull, difference)
+        np.divide(pull, den, out=pull)
+        by_a = self.v.T @ (pull @ self.u)
+        np.multiply(pull, s, out=pull)
+        by_w = -self.v.T @ (pull @ self.u)
+        reg, by_z = self.regulariser(z)
+        return loss + reg, np.stack([by_a * w + by_z, by_a * a + by_w * w])
+
+    def regulariser(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        m, n = z.shape
+        by_z, ends = np.zeros_like(z), []
+        rows, cols = np.indices(z.shape)
+        for sign in (1, -1):
+            padded = np.pad(sign * z, 1, constant_values=-np.inf)
+            around = np.stack([padded[1 + i : 1 + i + m, 1 + j : 1 + j + n] for i, j in NEIGHBOURS])
+            k = around.argmax(axis=0)
+            end = np.take_along_axis(around, k[None], axis=0)[0]
+            ends.append((sign, rows + NEIGHBOURS[k, 0], cols + NEIGHBOURS[k, 1], end))
+        span = ends[0][3] + ends[1][3]
+        factor = self.objective.lambda_reg / z.size
+        for sign, i, j, _ in ends:
+            np.add.at(by_z, (i, j), sign * 2 * factor * span)
+        return factor * (span**2).sum(), by_z
+
+
+class PointByPoint(Dense):
+    """The objective cell by cell, in Python, with the basis computed anew at each."""
+
+    def __init__(self, objective: Objective, space: nurbs.Space) -> None:
+        super().__init__(objective, space)
+        (self.knots_u, self.knots_v), self.degree = (k.tolist() for k in space[:2]), space[2][0]
+
+    def __call__(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
+        z, w = variables[0].tolist(), np.exp(variables[1]).tolist()
+        reg, by_z = self.regulariser(variables[0])
+        by_z, by_rho = by_z.tolist(), np.zeros_like(by_z).tolist()
+        target, factor = self.objective.target.tolist(), self.objective.factor.tolist()
+        loss = reg
+        for r in range(SIZE):
+            for c in range(SIZE):
+                terms = self.terms(r, c, w)
+                den = sum(b for _, _, b in terms)
+                s = sum(b * z[i][j] for i, j, b in terms) / den
+                difference = s - target[r][c]
+                loss += factor[r][c] * abs(difference)
+                pull = factor[r][c] * ((difference > 0) - (difference < 0)) / den
+                for i, j, b in terms:
+                    by_z[i][j] += pull * b
+                    by_rho[i][j] += pull * b * (z[i][j] - s)
+        return loss, np.array([by_z, by_rho])
+
+    def terms(self, row: int, col: int, w: list[list[float]]) -> list[tuple[int, int, float]]:
+        """Return (row, column, weighted basis) of the control points that count at a cell."""
+        first_u, along_u = self.basis(self.knots_u, col / (SIZE - 1))
+        first_v, along_v = self.basis(self.knots_v, 1 - row / (SIZE - 1))
+        return [
+            (first_v + i, first_u + j, bv * bu * w[first_v + i][first_u + j])
+            for i, bv in enumerate(along_v)
+            for j, bu in enumerate(along_u)
+        ]
+
+    def basis(self, knots: list[float], u: float) -> tuple[int, list[float]]:
+        """Return the first basis function that is not zero and the values from there on (Eq. cox_de_boor)."""
+        p = self.degree
+        span = p
+        while knots[span + 1] <= u and span < len(knots) - p - 2:
+            span += 1
+        values = [1.0]
+        for k in range(1, p + 1):
+            raised = [0.0] * (k + 1)
+            for j, value in enumerate(values):
+                left, right = knots[span - k + 1 + j], knots[span + 1 + j]
+                raised[j] += (right - u) / (right - left) * value
+                raised[j + 1] += (u - left) / (right - left) * value
+            values = raised
+        return span - p, values
+
+
+def best(function: Callable[[], object], repeats: int) -> float:
+    """Return the shortest of some runs (s)."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main() -> None:
+    """Print the table; an error if the three do not compute the same, or the fit is too slow."""
+    data, clusters = case()
+    space = nurbs.spline_space(data.grid, OPTIONS)
+    heights, datum = nurbs.start_heights(data, clusters.mask, space, True)
+    objective = nurbs.objective_of(data, clusters.mask, space, datum, OPTIONS)
+    start = np.stack([heights - datum, np.zeros_like(heights)])
+    limit = np.array([np.inf, nurbs.MAX_LOG_WEIGHT])[:, None, None]
+    dense, by_point = Dense(objective, space), PointByPoint(objective, space)
+    # Off the start, where the heights of neighbours are all different.
+    somewhere = start + np.random.default_rng(1).normal(0, 0.2, start.shape)
+    loss, gradient = objective(somewhere)
+    for other in (dense, by_point):
+        other_loss, other_gradient = other(somewhere)
+        np.testing.assert_allclose(other_loss, loss, rtol=1e-9)
+        np.testing.assert_allclose(other_gradient, gradient, rtol=1e-6, atol=1e-12)
+
+    def run(way: Callable[[np.ndarray], tuple[float, np.ndarray]], iterations: int) -> Callable[[], object]:
+        return lambda: adam.minimise(way, start, limit, adam.Schedule(0.1, iterations, 0, 20))
+
+    run(objective, 1)()
+    ours = best(lambda: nurbs.fit(data, clusters, OPTIONS), 7)
+    # n iterations are n + 1 evaluations, here as there.
+    slow = best(run(by_point, SAMPLED - 1), 1) / SAMPLED * (ITERATIONS + 1)
+    yardstick = best(run(dense, ITERATIONS), 3)
+    torch = best(lambda: nurbs.fit(data, clusters, OPTIONS.model_copy(update={"engine": "torch"})), 3)
+    print(f"{SIZE} x {SIZE} cells, 35 x 35 control points, {ITERATIONS} iterations, one thread")
+    print(f"{'way':<34}{'s':>10}{'ratio':>10}{'wanted':>10}")
+    for name, seconds, wanted in (
+        ("fit, whole stage", ours, ""),
+        ("dense numpy, gradient by hand", yardstick, ">= 1"),
+        ("torch, autograd, whole stage", torch, ""),
+        ("point by point in Python (scaled)", slow, ">= 50"),
+    ):
+        print(f"{name:<34}{seconds:>10.3f}{seconds / ours:>10.1f}{wanted:>10}")
+    if slow < 50 * ours or yardstick < ours:
+        raise SystemExit("the fit is slower than wanted")
+
+
+if __name__ == "__main__":
+    main()

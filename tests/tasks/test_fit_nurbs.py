@@ -1,0 +1,319 @@
+"""The fit against known ground, its gradient against autograd and finite differences."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from catalog.grid import Grid
+from tasks import adam, autograd
+from tasks.errors import TaskError
+from tasks.fit import nurbs
+from tasks.nurbs import clamped_knots
+from tasks.objective import objective
+from tasks.types import RoadClusters, TileData
+
+WEST, NORTH = 295500.0, 5629500.0
+
+
+def wave(e, n):
+    return 160 + 0.02 * (e - WEST) + 1.5 * np.sin((e - WEST) / 30) * np.cos((NORTH - n) / 35)
+
+
+def tile(ground=wave, size=100, noise=0.0, shape=None):
+    height, width = shape or (size, size)
+    grid = Grid("EPSG:25832", WEST, NORTH, 1.0, width, height)
+    truth = ground(*np.meshgrid(grid.eastings, grid.northings))
+    rng = np.random.default_rng(0)
+    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
+    road = np.zeros(truth.shape, dtype=np.int32)
+    road[height // 2 - 4 : height // 2 + 4] = 1
+    return TileData("t", grid, grid, dsm, dtm), RoadClusters(grid, road), truth
+
+
+def options(**changes):
+    return nurbs.Options(**{"control_points": (15, 15), **changes})
+
+
+def fitted(data, clusters, **changes):
+    return nurbs.fit(data, clusters, options(**changes))
+
+
+def on_cells(surface, data):
+    return surface.lattice(data.grid.eastings, data.grid.northings)
+
+
+def random_objective(degree=3, free=True, rows=40, cols=33):
+    rng = np.random.default_rng(degree)
+    heights = rng.normal(0, 2, (rows, cols))
+    heights[5:9, 3:20] = np.nan
+    factor = np.where(rng.random(heights.shape) < 0.3, 1.0, 0.7)
+    space = clamped_knots(degree + 5, degree), clamped_knots(degree + 7, degree), (degree, degree)
+    start = rng.normal(0, 1, (2, degree + 7, degree + 5))
+    return objective(heights, factor, space, 0.3, free), start
+
+
+def test_loss_is_the_papers():
+    """Eqs. loss_terrain and loss_ctrl, cell by cell and point by point, on the surface that comes out."""
+    data, clusters, _ = tile(noise=0.1)
+    data.dsm[50, 10:20] = np.nan
+    data.dtm[3, 4] = np.nan
+    opts = options(lambda_terrain=0.5, lambda_reg=0.2, iterations=7)
+    surface = nurbs.fit(data, clusters, opts)
+    z, s = surface.A / surface.W, on_cells(surface, data)
+    loss, count = 0.0, 0
+    for i, j in np.ndindex(s.shape):
+        road = clusters.labels[i, j] > 0
+        difference = abs((data.dsm if road else data.dtm)[i, j] - s[i, j])
+        if np.isfinite(difference):
+            loss, count = loss + (1.0 if road else 0.5) * difference, count + 1
+    reg = 0.0
+    for i, j in np.ndindex(z.shape):
+        around = [
+            z[a, b] for a in range(i - 1, i + 2) for b in range(j - 1, j + 2)
+            if (a, b) != (i, j) and 0 <= a < z.shape[0] and 0 <= b < z.shape[1]
+        ]  # fmt: skip
+        reg += (max(z[i, j] - p for p in around) - min(z[i, j] - p for p in around)) ** 2
+    space = nurbs.spline_space(data.grid, opts)
+    evaluate = nurbs.objective_of(data, clusters.mask, space, surface.datum, opts)
+    value, _ = evaluate(np.stack([z, np.log(surface.W)]))
+    assert value == pytest.approx(loss / count + 0.2 * reg / z.size, rel=1e-10)
+
+
+@pytest.mark.parametrize("free", [True, False])
+@pytest.mark.parametrize("degree", [1, 2, 3, 6, 10])
+def test_gradient_equals_autograd(degree, free):
+    written, at = random_objective(degree, free)
+    loss, gradient = written(at)
+    torch_objective = autograd.TorchObjective(written, at.shape[1:], "cpu")
+    variables = torch_objective.tensor(at).requires_grad_()
+    peer = torch_objective(variables)
+    peer.backward()
+    assert loss == pytest.approx(peer.item(), rel=1e-12)
+    np.testing.assert_allclose(gradient, variables.grad.numpy(), rtol=1e-9, atol=1e-14)
+    assert gradient[1].any() == free
+
+
+def test_gradient_equals_finite_differences():
+    written, at = random_objective()
+    _, gradient = written(at)
+    rng = np.random.default_rng(1)
+    h = 1e-7
+    for _ in range(10):
+        way = rng.normal(size=at.shape)
+        numeric = (written(at + h * way)[0] - written(at - h * way)[0]) / (2 * h)
+        assert numeric == pytest.approx((gradient * way).sum(), rel=1e-5)
+
+
+def test_engines_agree():
+    data, clusters, _ = tile(noise=0.05)
+    a, b = (fitted(data, clusters, engine=engine, iterations=100) for engine in ("numba", "torch"))
+    np.testing.assert_allclose(on_cells(a, data), on_cells(b, data), atol=1e-5)
+    np.testing.assert_allclose(a.W, b.W, rtol=1e-4)
+    assert not np.allclose(a.W, 1)
+
+
+def test_loss_decreases_and_ends_low():
+    data, clusters, _ = tile(noise=0.05)
+    opts = options()
+    space = nurbs.spline_space(data.grid, opts)
+    evaluate = nurbs.objective_of(data, clusters.mask, space, 160.0, opts)
+    z = np.zeros((15, 15))
+    limit = np.array([np.inf, 1.0])[:, None, None]
+    _, losses = adam.minimise(evaluate, np.stack([z, z]), limit, adam.Schedule(0.1, 200, 1e-4, 20))
+    assert losses[-1] < 0.15 < 1 < losses[0]
+
+
+def test_it_stops_when_the_loss_has_settled():
+    schedule = adam.Schedule(rate=0.1, iterations=50, tolerance=1e-4, window=5)
+    steps = []
+
+    def flat(x):
+        steps.append(1)
+        return 1.0, np.zeros_like(x)
+
+    adam.minimise(flat, np.zeros(3), np.full(3, np.inf), schedule)
+    assert len(steps) == 6
+    assert not schedule.has_finished([1.0, 1.0, 1.0, 1.0, 1.0, 0.99])
+    assert schedule.has_finished(list(np.linspace(1, 0, 51)))
+
+
+@pytest.mark.parametrize("engine", ["numba", "torch"])
+def test_the_best_of_the_way_is_returned(engine):
+    written, at = random_objective()
+    limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20)
+    if engine == "torch":
+        best, losses = autograd.minimise(written, at, limit, schedule, "cpu")
+    else:
+        best, losses = adam.minimise(written, at, limit, schedule)
+    assert len(losses) == 21
+    assert losses[-1] > min(losses)
+    assert written(best)[0] == pytest.approx(min(losses), rel=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["numba", "torch"])
+def test_weights_stay_within_bounds(engine):
+    data, clusters, _ = tile(noise=1.0)
+    surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60, stop_tolerance=0)
+    assert surface.W.max() == pytest.approx(10)
+    assert surface.W.min() == pytest.approx(0.1)
+
+
+def test_unit_weights_stay_one():
+    data, clusters, _ = tile(noise=0.1)
+    np.testing.assert_array_equal(fitted(data, clusters, weights="unit").W, 1.0)
+
+
+def test_ground_that_the_start_fits_is_kept():
+    for slope, reg in ((0, 0.01), (0.02, 0)):
+        data, clusters, truth = tile(
+            lambda e, n, slope=slope: 163 + slope * (e - WEST) - slope / 2 * (n - NORTH)
+        )
+        surface = fitted(data, clusters, lambda_reg=reg)
+        np.testing.assert_allclose(on_cells(surface, data), truth, atol=1e-8)
+        expected = np.array([-slope, slope / 2, 1]) / math.hypot(slope, slope / 2, 1)
+        np.testing.assert_allclose(surface.normal(WEST + 50, NORTH - 50), expected, atol=1e-9)
+
+
+def test_the_regulariser_takes_little_from_a_slope():
+    data, clusters, truth = tile(lambda e, n: 163 + 0.1 * (e - WEST))
+    assert abs(on_cells(fitted(data, clusters), data) - truth).mean() < 0.01
+
+
+@pytest.mark.parametrize("degree", range(1, 11))
+def test_a_wave_is_recovered_at_any_degree(degree):
+    data, clusters, truth = tile(noise=0.02)
+    surface = fitted(data, clusters, degree=degree, control_points=(20, 24), iterations=120)
+    assert surface.degree == (degree, degree)
+    assert surface.A.shape == (24, 20)
+    assert abs(on_cells(surface, data) - truth).mean() < 0.03
+
+
+def test_it_follows_the_road_where_road_and_terrain_differ():
+    """A bridge: the DTM runs 1.5 m below the road, which is wider than a few control points are apart."""
+    data, clusters, truth = tile(lambda e, n: 160 + 0 * e)
+    clusters.labels[35:65] = 1
+    data = replace(data, dsm=np.where(clusters.mask, truth + 1.5, truth + 8))
+    heights = on_cells(fitted(data, clusters, control_points=(35, 35)), data)
+    assert heights[45:55].mean() == pytest.approx(161.5, abs=0.05)
+    assert heights[:15].mean() == pytest.approx(160, abs=0.05)
+
+
+def test_outliers_on_the_road_count_little():
+    """The L1 norm: one car roof in twenty cells."""
+    data, clusters, truth = tile()
+    rng = np.random.default_rng(3)
+    data = replace(data, dsm=truth + np.where(rng.random(truth.shape) < 0.05, 1.5, 0))
+    assert abs(on_cells(fitted(data, clusters), data) - truth)[clusters.mask].mean() < 0.02
+
+
+def test_nodata_does_not_poison():
+    data, clusters, truth = tile(noise=0.02)
+    whole = on_cells(fitted(data, clusters), data)
+    data.dtm[:30, :40] = np.nan
+    data.dsm[48:50, 60:80] = np.nan
+    data.dtm[50:, 97:] = np.nan
+    holed = on_cells(fitted(data, clusters), data)
+    assert np.isfinite(holed).all()
+    known = np.ones(truth.shape, bool)
+    known[:40, :50] = False
+    known[45:, 90:] = False
+    assert abs(holed - whole)[known].max() < 0.05
+
+
+def test_heights_and_place_do_not_matter():
+    data, clusters, _ = tile(noise=0.05)
+    moved_grid = replace(data.grid, west=WEST + 320000, north=NORTH - 5e6)
+    moved = replace(data, grid=moved_grid, core=moved_grid, dsm=data.dsm + 2000, dtm=data.dtm + 2000)
+    a = on_cells(fitted(data, clusters, iterations=50), data)
+    b = on_cells(fitted(moved, replace(clusters, grid=moved_grid), iterations=50), moved)
+    np.testing.assert_allclose(b - 2000, a, atol=1e-6)
+
+
+def test_equal_inputs_give_equal_surfaces():
+    data, clusters, _ = tile(noise=0.05)
+    a, b = (fitted(data, clusters) for _ in range(2))
+    np.testing.assert_array_equal(a.A, b.A)
+    np.testing.assert_array_equal(a.W, b.W)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(10, 60), st.integers(10, 60), st.integers(1, 4), st.integers(5, 8), st.integers(5, 8))
+def test_any_shape_of_tile_and_grid(rows, cols, degree, n, m):
+    data, clusters, truth = tile(shape=(rows, cols))
+    surface = fitted(data, clusters, degree=degree, control_points=(n, m), iterations=30)
+    assert surface.A.shape == (m, n)
+    assert surface.bounds == data.grid.hull
+    assert abs(on_cells(surface, data) - truth).mean() < 0.5
+
+
+def test_terrain_alone_and_a_road_of_one_cell():
+    data, clusters, truth = tile(noise=0.02)
+    empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    one = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    one.labels[50, 50] = 1
+    for road in (empty, one):
+        assert abs(on_cells(fitted(data, road), data) - truth).mean() < 0.03
+
+
+def test_without_terrain_the_dtm_does_not_leak_in():
+    data, clusters, truth = tile(noise=0.02)
+    other = replace(data, dtm=data.dtm + 50 * np.random.default_rng(5).random(data.dtm.shape))
+    a, b = (fitted(d, clusters, terrain=False) for d in (data, other))
+    np.testing.assert_array_equal(a.A, b.A)
+    assert a.datum == b.datum
+    assert abs(on_cells(a, data) - truth)[clusters.mask].mean() < 0.05
+    one = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    one.labels[50, 50] = 1
+    np.testing.assert_allclose(on_cells(fitted(data, one, terrain=False), data), data.dsm[50, 50], atol=1e-9)
+
+
+def test_a_missing_dtm_starts_from_the_road():
+    data, clusters, truth = tile(noise=0.02)
+    data.dtm[:] = np.nan
+    surface = fitted(data, clusters)
+    assert abs(on_cells(surface, data) - truth)[clusters.mask].mean() < 0.05
+
+
+def test_control_points_by_spacing():
+    data, clusters, _ = tile(shape=(81, 41))
+    assert fitted(data, clusters, spacing_m=10, iterations=1).A.shape == (9, 5)
+    assert fitted(data, clusters, spacing_m=40, iterations=1).A.shape == (4, 4)
+
+
+def test_what_cannot_be_fitted_is_an_error_of_one_line():
+    data, clusters, _ = tile(size=10)
+    with pytest.raises(TaskError, match="100 cells with a height are fewer than 15 x 15 control points"):
+        fitted(data, clusters)
+    none = replace(data, dsm=np.full((10, 10), np.nan), dtm=np.full((10, 10), np.nan))
+    with pytest.raises(TaskError, match="no filtered road cell has a DSM height to start from.* empty too"):
+        fitted(none, clusters)
+    empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    with pytest.raises(TaskError, match=r"the DTM is not to be used \(fit.terrain\)"):
+        fitted(data, empty, terrain=False)
+    row, road, _ = tile(shape=(1, 400))
+    with pytest.raises(TaskError, match="at least 2 x 2 cells, not 400 x 1"):
+        fitted(row, road, control_points=(4, 4))
+
+
+def test_a_device_that_is_not_there_is_an_error_of_one_line():
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("this machine has the device")
+    data, clusters, _ = tile()
+    with pytest.raises(TaskError, match="no device 'cuda' on this machine; set fit.device to cpu"):
+        fitted(data, clusters, engine="torch", device="cuda")
+
+
+def test_options_that_cannot_be_are_refused():
+    with pytest.raises(ValidationError, match="degree 5 needs more control points each way than 5 x 35"):
+        nurbs.Options(degree=5, control_points=(5, 35))
+    with pytest.raises(ValidationError, match="device cuda needs engine torch"):
+        nurbs.Options(device="cuda")
+    for wrong in ({"degree": 0}, {"degree": 11}, {"spacing_m": 0}, {"weights": "some"}, {"degre": 3}):
+        with pytest.raises(ValidationError):
+            nurbs.Options(**wrong)
