@@ -58,11 +58,11 @@ class Watch:
         self.status[result.status] += 1
         self.stages.update(result.computed)
         for failure in result.failures:
-            self.console.print(f"failed {failure.tile_id}: {failure.line}", markup=False, highlight=False)
+            self._line(f"failed {failure.tile_id}: {failure.line}")
         self.progress.update(self.bar, advance=1, description=self.counts())
         if not self.console.is_terminal and time.monotonic() - self.said > PLAIN_EVERY_S:
             self.said = time.monotonic()
-            self.console.print(self.line(), markup=False, highlight=False)
+            self._line(self.line())
 
     def counts(self) -> str:
         """Return the counts by status, then what was computed by stage."""
@@ -76,3 +76,7 @@ class Watch:
         spent = time.monotonic() - self.start
         left = spent / tried * (self.total - tried) if tried else float("nan")
         return f"{tried}/{self.total} tiles, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
+
+    def _line(self, text: str) -> None:
+        # As it is: no markup in file names, no breaks that would cut a path in two.
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -75,8 +75,8 @@ def gather(run: Run) -> Content:
         columns=["tile", "stage", "error", "message", "file"],
     )
     return Content(
-        title=f"FlexRoad: {run.config.name} over {how.tiles} tiles",
-        state=f"{how.done} tiles done, {how.failed} failed, {how.pending} pending",
+        title=f"FlexRoad: {run.config.name} over {how.tiles} tile{'s' * (how.tiles != 1)}",
+        state=f"Tiles: {how.done} done, {how.failed} failed, {how.pending} pending",
         reference=_reference(run, set(done.tile_id)),
         main=_over_tiles(done, variants, FIGURES, "mean"),
         median=_over_tiles(done, variants, FIGURES, "median"),
@@ -117,6 +117,8 @@ def _worst(done: pd.DataFrame, variant: str) -> pd.DataFrame:
 
 def _reference(run: Run, done: set[str]) -> str:
     tiles = [tile for tile in run.catalog.tiles if tile.id in done]
+    if not tiles:
+        return "No tile is done: there is nothing to measure."
     truth = sum(tile.layer("reference") is not None for tile in tiles)
     roads = sum(tile.layer("reference_road") is not None for tile in tiles)
     heights = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
 
 import jinja2
@@ -67,9 +68,9 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame]]:
 def _cell(value: object, column: str) -> str:
     if pd.isna(value):  # type: ignore[call-overload]
         return "–"
-    if isinstance(value, float) and column != "T":
-        return f"{value:.3f}"
-    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+    if isinstance(value, Real):
+        return f"{value:,.0f}" if isinstance(value, Integral) or column == "T" else f"{value:.3f}"
+    return str(value)
 
 
 def _cells(table: pd.DataFrame) -> list[list[str]]:
@@ -87,15 +88,13 @@ def _markdown(table: pd.DataFrame) -> str:
 
 
 def _html(table: pd.DataFrame) -> Markup:
-    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes]
-    head = Markup("").join(Markup("<th>{}</th>").format(name) for name in table.columns)
-    body = Markup("").join(
-        Markup("<tr>{}</tr>").format(
-            Markup("").join(
-                Markup('<td class="{}">{}</td>').format("number" if number else "text", cell)
-                for number, cell in zip(numeric, row, strict=True)
-            )
+    kinds = ["number" if pd.api.types.is_numeric_dtype(kind) else "text" for kind in table.dtypes]
+
+    def line(tag: str, cells: Iterable[object]) -> Markup:
+        cell = Markup(f'<{tag} class="{{}}">{{}}</{tag}>')
+        return Markup("<tr>{}</tr>").format(
+            Markup("").join(cell.format(kind, value) for kind, value in zip(kinds, cells, strict=True))
         )
-        for row in _cells(table)
-    )
-    return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(head, body)
+
+    body = Markup("").join(line("td", row) for row in _cells(table))
+    return Markup("<table><thead>{}</thead><tbody>{}</tbody></table>").format(line("th", table.columns), body)
