@@ -47,9 +47,6 @@ def main() -> None:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)  # noqa: T201
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)  # noqa: T201
-        sys.exit(130)
     except BrokenPipeError:
         # `flexroad ... | head` closed the pipe: no fault of the run.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -262,8 +259,12 @@ def _carry_out(
     only = only or (lambda graph: True)
     total = sum(1 for graph in run.graphs() if only(graph))
     results: list[TileResult]
-    with Watch(total, Console(stderr=True)) as watch:
-        results = execute(run, executor, only, anew, watch)
+    try:
+        with Watch(total, Console(stderr=True)) as watch:
+            results = execute(run, executor, only, anew, watch)
+    except KeyboardInterrupt:
+        typer.echo("interrupted; the same command goes on from here", err=True)
+        raise typer.Exit(130) from None
     how = summary(run)
     _say(
         f"{how.tiles} tiles: {how.done} done ({how.cached} of them before), {how.failed} failed, "

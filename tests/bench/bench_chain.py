@@ -1,0 +1,77 @@
+"""The whole chain of a tile: where its time goes, what a worker holds, whether 2,000 tiles make it grow."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from catalog import Catalog
+from pipeline.config import Config, compose, load_config
+from pipeline.graph import STAGE_NAMES
+from pipeline.run import Run
+from pipeline.synthesis import write_scenes
+from pipeline.warm import warm
+from pipeline.work import do_tile
+
+TILES = 8
+MANY = 2000
+
+
+def main(many: int = MANY) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        catalog = Catalog.read(write_scenes(folder / "survey", TILES, seed=11))
+        paper = load_config("paper")
+        flexroad = compose({**paper.raw, "variants": {"flexroad": {}}}, "flexroad alone")
+        for config in (flexroad, paper):
+            table(config, catalog, folder / config.name)
+        growth(flexroad, catalog, folder / "growth", many)
+
+
+def table(config: Config, catalog: Catalog, folder: Path) -> None:
+    warm(config)
+    run = Run.create(folder, config, catalog)
+    totals, stages = [], []
+    for graph in run.graphs():
+        start = time.perf_counter()
+        stages.append(do_tile(run.job(graph)).seconds)
+        totals.append(time.perf_counter() - start)
+    names = [*STAGE_NAMES, "export"]
+    each = {name: statistics.median(seconds[name] for seconds in stages) for name in names}
+    total = statistics.median(totals)
+    print(f"\n{config.name}: {', '.join(config.chains)}; median over {TILES} urban to rural tiles, one core")
+    for name in names:
+        print(f"  {name:10}{1000 * each[name]:8.1f} ms{each[name] / total:7.0%}")
+    rest = total - sum(each.values())
+    print(f"  {'store':10}{1000 * rest:8.1f} ms{rest / total:7.0%}")
+    print(f"  {'tile':10}{1000 * total:8.1f} ms; the limit is 400 ms: {total / 0.4:.2f} of it")
+
+
+def growth(config: Config, catalog: Catalog, folder: Path, many: int) -> None:
+    """Do the same tiles over and over, each time all anew, and watch this process grow."""
+    run = Run.create(folder, config, catalog)
+    graphs = list(run.graphs())
+    print(f"\nmemory of one process over {many} tiles (resident, MB)")
+    every = max(1, many // 10)
+    for done in range(many):
+        if done % every == 0:
+            print(f"  {done:6} {resident_mb():8.0f}")
+        do_tile(run.job(graphs[done % len(graphs)], frozenset(STAGE_NAMES)))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"  {many:6} {resident_mb():8.0f}   peak {peak:.0f} MB; the limit is 700 MB: {peak / 700:.2f} of it"
+    )
+
+
+def resident_mb() -> float:
+    import psutil
+
+    return float(psutil.Process().memory_info().rss / 2**20)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else MANY)
