@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 export NUMBA_NUM_THREADS := 1
 
-TILES ?= 6
+TILES ?= 24
 SEED ?= 1
 CONFIG ?= paper
 OUT ?= runs/run
@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 
-reproduce: $(STAMP) ## The paper's main comparison on synthetic tiles with known truth (TILES=6 SEED=1)
+reproduce: $(STAMP) ## The paper's main comparison on synthetic tiles with known truth (TILES=24 SEED=1)
 	$(BIN)/flexroad catalog synthetic -o runs/synthetic-$(TILES)-$(SEED) --tiles $(TILES) --seed $(SEED)
 	$(BIN)/flexroad run --config paper --catalog runs/synthetic-$(TILES)-$(SEED)/catalog.parquet --out runs/reproduce-$(TILES)-$(SEED)
 	$(BIN)/flexroad report runs/reproduce-$(TILES)-$(SEED) --format html
