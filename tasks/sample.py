@@ -172,6 +172,9 @@ def _delaunay(points: Floats) -> NDArray[np.int32]:
     triangulation.insert(plan, insertionstrategy="BBox")
     # Vertex 0 of startinpy is at infinity; the points follow in their order.
     faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32) - 1
+    # It can only be dropped in the thread that made it, and a sampling profiler (Dask's is one) may keep
+    # this frame and all it holds alive in another.
+    del triangulation
     return faces
 
 
