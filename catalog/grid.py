@@ -143,8 +143,10 @@ class Grid:
         Raises
         ------
         CatalogError
-            If ``size_m`` is not a whole number of metres and of cells.
+            If ``size_m`` is not a whole number of metres and of cells, at least one.
         """
+        if not 0 < size_m < math.inf:
+            raise CatalogError(f"a tile needs a size above 0 m, not {size_m:g} m")
         n = round(size_m / self.cell)
         if size_m != int(size_m) or not math.isclose(n * self.cell, size_m, rel_tol=1e-9):
             raise CatalogError(

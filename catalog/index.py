@@ -7,6 +7,7 @@ opens both. Projection fields follow the STAC projection extension; fields of ou
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import os
@@ -55,12 +56,16 @@ class Catalog:
         path = Path(path)
         if not path.exists():
             raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`")
+        if path.is_dir():
+            raise CatalogError(f"catalog {path} is a folder; name its file, as in {path / 'catalog.parquet'}")
         try:
             items = _read_json(path) if path.suffix in JSON_SUFFIXES else _read_parquet(path)
             folder = str(path.resolve().parent)
             return cls(tuple(_tile(item, folder) for item in items))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CatalogError(f"{path} is not a FlexRoad catalog: {error!r}") from error
+            raise CatalogError(
+                f"{path} is not a FlexRoad catalog: {error!r}; make one with `flexroad catalog`"
+            ) from error
 
     def write(self, path: Path | str, movable: bool = True) -> None:
         """Write the catalog.
@@ -76,20 +81,23 @@ class Catalog:
         Raises
         ------
         CatalogError
-            If the name ends neither in .parquet nor in .json or .geojson.
+            If the name ends neither in .parquet nor in .json or .geojson, or the file cannot be written.
         """
         path = Path(path)
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, unlike {path.name}")
-        path.parent.mkdir(parents=True, exist_ok=True)
         folder = path.resolve().parent
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             (_write_json if path.suffix in JSON_SUFFIXES else _write_parquet)(items, temporary)
             temporary.replace(path)
+        except OSError as error:
+            raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
         finally:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
     def select(self, ids: Sequence[str] = (), bbox: Bounds | None = None) -> Catalog:
         """Return the tiles named (all if none is) that touch ``bbox`` (m, in the tiles' CRS).

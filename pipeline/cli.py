@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -51,6 +52,9 @@ def main() -> None:
         # `flexroad ... | head` closed the pipe: no fault of the run.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:
+        print(f"error: {error}; check the path and the disk, then repeat the command", file=sys.stderr)  # noqa: T201
+        sys.exit(2)
 
 
 def spread(words: Sequence[str]) -> list[str]:
@@ -132,7 +136,7 @@ def catalog_rasters(
     catalog = Catalog(found.tiles)
     catalog.write(output)
     _say(f"{len(catalog.tiles)} tiles in {output}")
-    _say(f"next: flexroad run --config paper --catalog {output} --out RUN")
+    _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(output))} --out RUN")
 
 
 @catalogs.command("synthetic")
@@ -147,7 +151,7 @@ def catalog_synthetic(
 
     path = write_scenes(output, tiles, seed, tile_size)
     _say(f"{tiles} tiles in {path}")
-    _say(f"next: flexroad run --config paper --catalog {path} --out RUN")
+    _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(path))} --out RUN")
 
 
 @catalogs.command("show")
@@ -258,6 +262,7 @@ def _carry_out(
 
     only = only or (lambda graph: True)
     total = sum(1 for graph in run.graphs() if only(graph))
+    folder = shlex.quote(str(run.path))
     results: list[TileResult]
     try:
         with Watch(total, Console(stderr=True)) as watch:
@@ -265,7 +270,10 @@ def _carry_out(
     except KeyboardInterrupt:
         typer.echo("interrupted; the same command goes on from here", err=True)
         raise typer.Exit(130) from None
-    how = summary(run)
+    except OSError as error:
+        typer.echo(f"error: {error}; make room, then `flexroad rerun {folder}` goes on from here", err=True)
+        raise typer.Exit(1) from None
+    how = summary(run, results)
     _say(
         f"{how.tiles} tiles: {how.done} done ({how.cached} of them before), {how.failed} failed, "
         f"{how.pending} pending; results in {run.path}"
@@ -273,9 +281,9 @@ def _carry_out(
     if results and all(result.status == "cached" for result in results):
         _say("nothing had changed; `flexroad rerun RUN --from load` computes all anew")
     if how.failed:
-        _say(f"next: flexroad status {run.path}, then flexroad rerun {run.path} --failed")
+        _say(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
         raise typer.Exit(1)
-    _say(f"next: flexroad report {run.path} --format html")
+    _say(f"next: flexroad report {folder} --format html")
 
 
 @app.command()
@@ -300,7 +308,7 @@ def status(
     counts = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
     _say(f"{how.tiles} tiles: {counts}")
     for failure in how.failures:
-        _say(f"  {failure.tile_id}  {failure.line}{f'  [{failure.file}]' if failure.file else ''}")
+        _say(f"  {failure.notice}")
 
 
 # --- results ------------------------------------------------------------------------------------------

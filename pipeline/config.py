@@ -34,7 +34,11 @@ Format = Literal["glb", "ply", "cog", "npz"]
 class Export(Options):
     """What is written for the user, beside the metrics."""
 
-    variants: tuple[str, ...] = Field(("flexroad",), description="variants whose meshes are kept")
+    variants: tuple[str, ...] = Field(
+        ("flexroad",),
+        min_length=1,
+        description="variants whose meshes are kept; query asks the first",
+    )
     formats: tuple[Format, ...] = Field(
         ("glb", "ply", "cog", "npz"),
         description="glb and ply: the mesh; cog: height and road mask; npz: the NURBS surface itself",
@@ -120,6 +124,8 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     chains = {}
     for variant, overrides in variants.items():
         where = f"variants.{variant}"
+        if not str(variant).replace("-", "").replace("_", "").isalnum():
+            raise ConfigError(f"{name}: {where}: its files bear the name; use letters, digits, - and _")
         overrides = _mapping(overrides or {}, name, where)
         _refuse_unknown(overrides, stages, name, where)
         chains[str(variant)] = {
@@ -185,20 +191,29 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _raw(name: str | Path) -> dict[str, Any]:
+def _raw(name: str | Path, heirs: tuple[Path, ...] = ()) -> dict[str, Any]:
     known = shipped()
     path = known.get(str(name), Path(name))
     if not path.is_file():
         near = difflib.get_close_matches(str(name), known, n=1)
         hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(known)}"
         raise ConfigError(f"no configuration {str(name)!r}: neither a file nor a shipped name{hint}")
+    if path.resolve() in heirs:
+        raise ConfigError(f"{path}: extends: leads back to itself; name another file or paper")
     try:
         raw = yaml.safe_load(path.read_text()) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from error
     raw = _mapping(raw, str(name), "the file")
     parent = raw.pop("extends", None)
-    return _extend(_raw(parent), raw) if parent else raw
+    if parent is None:
+        return raw
+    if not isinstance(parent, str):
+        raise ConfigError(f"{name}: extends: expected a file or a shipped name, not {parent!r}")
+    if parent not in known:
+        # A file names its parent as it sees it, wherever the command is given.
+        parent = path.parent / parent
+    return _extend(_raw(parent, (*heirs, path.resolve())), raw)
 
 
 def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
@@ -264,6 +279,9 @@ def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
     if fault["type"] == "extra_forbidden":
         return f"{key}: unknown key{_hint(path[-1], _keys(model))}"
     message = fault["msg"].removeprefix("Value error, ")
+    if isinstance(fault["input"], dict):
+        # A fault of several options together has told their values itself.
+        return f"{key}: {message[0].lower()}{message[1:]}"
     return f"{key}: {message[0].lower()}{message[1:]}, not {fault['input']!r}"
 
 

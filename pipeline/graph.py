@@ -72,6 +72,8 @@ class TileGraph:
     variants: dict[str, dict[str, str]]
     """Variant -> stage -> fingerprint."""
     export: Export
+    sources: list[Any]
+    """The source layers as they are named in fingerprints, or were."""
     fingerprint: str
     """Of everything asked for; the tile is done when its item carries it."""
 
@@ -103,15 +105,25 @@ def tile_graphs(catalog: Catalog, config: Config, checksum: bool = False) -> Ite
         yield tile_graph(tile, config, checksum)
 
 
-def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
+def tile_graph(
+    tile: Tile,
+    config: Config,
+    checksum: bool = False,
+    recorded: Callable[[], list[Any] | None] = lambda: None,
+) -> TileGraph:
     """Build one tile's graph.
 
     Parameters
     ----------
     checksum : bool
         Name sources by their bytes instead of size and time.
+    recorded : callable
+        Gives the `TileGraph.sources` of earlier, for files that are gone.
     """
-    source = _source(tile, checksum)
+    sources = [_layer(tile, layer, checksum) for layer in tile.layers]
+    if any(size is None for _, files, *_ in sources for _, size, *_ in files):
+        sources = _as_they_were(sources, recorded())
+    source = [asdict(tile.grid), sources]
     nodes: dict[str, Node] = {}
     variants: dict[str, dict[str, str]] = {}
     for variant, chain in config.chains.items():
@@ -128,7 +140,7 @@ def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
         variants[variant] = made
     exported = [variants[variant]["sample"] for variant in config.export.variants]
     asked = [tile.id, tile.stratum, _names(variants), exported, config.export.model_dump(mode="json")]
-    return TileGraph(tile, nodes, variants, config.export, digest(asked))
+    return TileGraph(tile, nodes, variants, config.export, sources, digest(asked))
 
 
 def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
@@ -150,8 +162,13 @@ def _node(
     return Node(digest(made_of), stage.name, options, inputs, stored)
 
 
-def _source(tile: Tile, checksum: bool) -> list[Any]:
-    return [asdict(tile.grid), [_layer(tile, layer, checksum) for layer in tile.layers]]
+def _as_they_were(sources: list[Any], recorded: list[Any] | None) -> list[Any]:
+    """Return the sources with what is on record of files that are gone."""
+    known = {(name, file[0]): file for name, files, *_ in recorded or () for file in files}
+    return [
+        [name, [file if file[1] is not None else known.get((name, file[0]), file) for file in files], *rest]
+        for name, files, *rest in sources
+    ]
 
 
 def _layer(tile: Tile, layer: Layer, checksum: bool) -> list[Any]:

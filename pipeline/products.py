@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pipeline.graph import TileGraph
+from pipeline.store import plain_name
 from tasks.export import cog, glb, npz, ply
 from tasks.nurbs import NurbsSurface
 
@@ -26,10 +27,11 @@ def products(graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, 
         Whole-metre (easting, northing) that the run's meshes are placed against.
     """
     made: dict[str, Product] = {}
+    tile = plain_name(graph.tile.id)
     for variant in graph.export.variants:
         for kind in graph.export.formats:
             found = _MAKERS[kind](graph, graph.variants[variant], pull, origin)
-            made |= {f"{graph.tile.id}_{variant}{suffix}": product for suffix, product in found.items()}
+            made |= {f"{tile}_{variant}{suffix}": product for suffix, product in found.items()}
     return made
 
 

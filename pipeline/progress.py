@@ -58,7 +58,7 @@ class Watch:
         self.status[result.status] += 1
         self.stages.update(result.computed)
         for failure in result.failures:
-            self._line(f"failed {failure.tile_id}: {failure.line}")
+            self._line(f"failed {failure.notice}")
         self.progress.update(self.bar, advance=1, description=self.counts())
         if not self.console.is_terminal and time.monotonic() - self.said > PLAIN_EVERY_S:
             self.said = time.monotonic()

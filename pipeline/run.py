@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import platform
@@ -30,7 +31,7 @@ from catalog import Catalog
 from pipeline.config import Config, load_config
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
-from pipeline.graph import TileGraph, tile_graphs
+from pipeline.graph import TileGraph, tile_graph, tile_graphs
 from pipeline.store import TileFolder, check_writable, write_atomic
 from pipeline.tables import write_tables
 from pipeline.warm import warm
@@ -63,7 +64,7 @@ class Run:
         ConfigError
             If the folder or the store cannot be written.
         """
-        old = _read_json(path / "run.json")
+        old = _record(path)
         origin = old["origin"] if old else _origin(catalog)
         store = store or (Path(old["store"]) if old and old["shared_store"] else path / "store")
         run = cls(path, config, catalog, store, (origin[0], origin[1]), checksum, versions())
@@ -73,7 +74,9 @@ class Run:
                 check_writable(folder)
             run._write()
         except OSError as error:
-            raise ConfigError(f"cannot write the run to {path}: {error}") from error
+            raise ConfigError(
+                f"cannot write the run to {path}: {error}; choose another --out or --store"
+            ) from error
         return run
 
     @classmethod
@@ -87,10 +90,10 @@ class Run:
         CatalogError
             If its catalog is damaged.
         """
-        found = _read_json(path / "run.json")
+        found = _record(path)
         if found is None:
             raise ConfigError(
-                f"{path} is no run: it has no run.json; make one with `flexroad run --out {path}`"
+                f"{path} is no run: it has no sound run.json; make one with `flexroad run --out {path}`"
             )
         store = Path(found["store"]) if found["shared_store"] else path / "store"
         config = load_config(path / "config.yaml").model_copy(update={"name": found["config"]})
@@ -99,8 +102,12 @@ class Run:
         return cls(path, config, catalog, store, origin, found["checksum"], found["versions"])
 
     def graphs(self) -> Iterator[TileGraph]:
-        """Yield the graph of every tile, as configuration and sources are now."""
-        return tile_graphs(self.catalog, self.config, self.checksum)
+        """Yield the graph of every tile, as configuration and sources are now.
+
+        Sources that are gone count as they were when the tile was done: what was made from them stands.
+        """
+        for tile in self.catalog.tiles:
+            yield tile_graph(tile, self.config, self.checksum, self.folder(tile.id).sources)
 
     def job(self, graph: TileGraph, anew: frozenset[str] = frozenset()) -> Job:
         """Return what a worker needs to do one tile."""
@@ -113,7 +120,8 @@ class Run:
     def log(self, event: str, **what: Any) -> None:
         """Append one event to log.jsonl."""
         line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **what}
-        with (self.path / "log.jsonl").open("a") as file:
+        # A disk too full for the log is no reason to stop the tiles.
+        with contextlib.suppress(OSError), (self.path / "log.jsonl").open("a") as file:
             file.write(json.dumps(line) + "\n")
 
     def _write(self) -> None:
@@ -161,12 +169,19 @@ def execute(
         Stages to compute even if the store has them.
     watch : callable
         Told of every result as it comes.
+
+    Raises
+    ------
+    OSError
+        If the tables cannot be written, as on a full disk.
     """
     start = time.perf_counter()
     results: list[TileResult] = []
     run.log("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
     warm(run.config)
-    jobs = (run.job(graph, anew) for graph in run.graphs() if only(graph))
+    # Unlike `Run.graphs`: who wants a tile done wants to know that its sources are gone.
+    graphs = tile_graphs(run.catalog, run.config, run.checksum)
+    jobs = (run.job(graph, anew) for graph in graphs if only(graph))
     try:
         for result in executor.map(do_tile, jobs, _lost):
             results.append(result)
@@ -174,13 +189,17 @@ def execute(
             watch(result)
     finally:
         # Also after an interruption: what is done is in the tables.
-        write_tables(run.path, *outcome(run))
+        write_tables(run.path, *outcome(run, results))
         run.log("end", seconds=round(time.perf_counter() - start, 3))
     return results
 
 
-def outcome(run: Run) -> tuple[list[dict[str, Any]], list[Failure]]:
-    """Return the rows and failures of all tiles that were tried, in the catalog's order."""
+def outcome(run: Run, results: Sequence[TileResult] = ()) -> tuple[list[dict[str, Any]], list[Failure]]:
+    """Return the rows and failures of all tiles that were tried, in the catalog's order.
+
+    Of tiles without a marker ``results`` tells: a full disk leaves none.
+    """
+    fresh = {result.tile_id: result for result in results}
     rows: list[dict[str, Any]] = []
     failures: list[Failure] = []
     for graph in run.graphs():
@@ -193,12 +212,15 @@ def outcome(run: Run) -> tuple[list[dict[str, Any]], list[Failure]]:
         if failure is not None:
             rows += failure["rows"]
             failures += [Failure(**fault) for fault in failure["failures"]]
+        elif graph.tile.id in fresh:
+            rows += fresh[graph.tile.id].rows
+            failures += fresh[graph.tile.id].failures
     return rows, failures
 
 
-def summary(run: Run) -> Summary:
-    """Return how the run stands now, by its markers."""
-    rows, failures = outcome(run)
+def summary(run: Run, results: Sequence[TileResult] = ()) -> Summary:
+    """Return how the run stands now, by its markers and, for tiles that could write none, by ``results``."""
+    rows, failures = outcome(run, results)
     failed = {failure.tile_id for failure in failures}
     done = {row["tile_id"] for row in rows} - failed
     total = len(run.catalog.tiles)
@@ -221,7 +243,8 @@ def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[TileGraph]
     def chosen(graph: TileGraph) -> bool:
         if graph.tile.id in named or not (named or failed):
             return True
-        return failed and run.folder(graph.tile.id).failed(graph) is not None
+        # Whatever it failed of: a file mended since is why it is tried again.
+        return failed and run.folder(graph.tile.id).gave_up()
 
     return chosen
 
@@ -274,10 +297,11 @@ def _cached(log: Path) -> set[str]:
             except ValueError:
                 # The last line of a run that was killed may be cut off.
                 continue
-            if event["event"] == "run":
-                cached.clear()
-            elif event["event"] == "tile" and event["status"] == "cached":
-                cached.add(event["tile"])
+            match event:
+                case {"event": "run"}:
+                    cached.clear()
+                case {"event": "tile", "status": "cached", "tile": tile}:
+                    cached.add(tile)
     return cached
 
 
@@ -286,9 +310,11 @@ def _origin(catalog: Catalog) -> tuple[float, float]:
     return min(east for east, _ in corners), min(north for _, north in corners)
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
+def _record(run: Path) -> dict[str, Any] | None:
+    """Return what run.json holds, or None if it is not there or damaged."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        found: dict[str, Any] = json.loads((run / "run.json").read_text())
     except (OSError, ValueError):
         return None
-    return found
+    known = {"config", "store", "shared_store", "origin", "checksum", "versions"}
+    return found if isinstance(found, dict) and known <= found.keys() else None

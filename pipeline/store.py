@@ -83,25 +83,34 @@ class TileFolder:
 
     @classmethod
     def of(cls, run: Path, tile_id: str) -> TileFolder:
-        """Return the tile's folder in a run; tile ids that are no plain names are made so."""
-        safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
-        if safe != tile_id:
-            safe += "-" + hashlib.sha256(tile_id.encode()).hexdigest()[:8]
-        return cls(run / "tiles" / safe)
+        """Return the tile's folder in a run."""
+        return cls(run / "tiles" / plain_name(tile_id))
 
     def done(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return the tile's item if it is done as the graph asks and its products are there."""
         item = self._read("item.json")
-        if item is None or item.get("properties", {}).get("flexroad:fingerprint") != graph.fingerprint:
-            return None
         try:
+            if item is None or item["properties"]["flexroad:fingerprint"] != graph.fingerprint:
+                return None
+            # A marker without its rows is damaged, whatever else it holds.
+            iter(item["properties"]["flexroad:rows"])
             whole = all(
                 (self.path / asset["href"]).stat().st_size == asset["file:size"]
                 for asset in item["assets"].values()
             )
-        except OSError:
+        except (OSError, KeyError, TypeError, AttributeError):
             return None
         return item if whole else None
+
+    def sources(self) -> list[Any] | None:
+        """Return the sources of the tile when it was last done, as `TileGraph.sources` names them."""
+        properties = (self._read("item.json") or {}).get("properties", {})
+        found: list[Any] | None = properties.get("flexroad:sources")
+        return found
+
+    def gave_up(self) -> bool:
+        """Tell whether the tile failed when it was last tried, with whatever files and options."""
+        return (self.path / "failed.json").exists()
 
     def failed(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return what is known of the tile's last failure, if it was of this graph."""
@@ -130,6 +139,12 @@ class TileFolder:
         except (OSError, ValueError):
             return None
         return found if isinstance(found, dict) else None
+
+
+def plain_name(tile_id: str) -> str:
+    """Return what folders and files of a tile are called: its id, or one like it that makes a file name."""
+    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
+    return safe if safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:

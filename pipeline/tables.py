@@ -61,9 +61,12 @@ def read_metrics(run: Path) -> pd.DataFrame:
     Raises
     ------
     ConfigError
-        If there are none yet.
+        If there are none yet, or the table is damaged.
     """
     path = run / "metrics.parquet"
     if not path.exists():
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
-    return pd.read_parquet(path)
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from catalog import Tile
 from catalog.index import item
 from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_module
 from pipeline.products import products
@@ -59,6 +60,11 @@ class Failure:
         """One line for tables."""
         return f"{self.stage}: {self.kind}: {self.message}"
 
+    @property
+    def notice(self) -> str:
+        """One line for people: tile, what is wrong, and the file at fault."""
+        return f"{self.tile_id}: {self.line}{f'  [{self.file}]' if self.file else ''}"
+
 
 @dataclass(frozen=True)
 class TileResult:
@@ -94,6 +100,8 @@ class Pull:
     graph: TileGraph
     store: Store
     anew: frozenset[str] = frozenset()
+    keep: bool = False
+    """Whether to put into the store what is computed; who only looks at a run leaves it as it is."""
     results: dict[str, Any] = field(default_factory=dict)
     chain_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
     computed: Counter[str] = field(default_factory=Counter)
@@ -127,7 +135,7 @@ class Pull:
         try:
             result = node.function(*inputs, node.options)
         except Exception as error:
-            failed = StageError(_failure(self.graph.tile.id, node.stage, error))
+            failed = StageError(_failure(self.graph.tile, node.stage, error))
             self.faults[node.fingerprint] = failed
             raise failed from error
         took = time.perf_counter() - start
@@ -136,14 +144,14 @@ class Pull:
         known = [self.chain_seconds[fingerprint] for fingerprint in node.inputs]
         spent = {stage: value for seconds in known for stage, value in seconds.items()} | {node.stage: took}
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, spent
-        if node.stored:
+        if node.stored and self.keep:
             self._keep(node, result, spent)
 
     def _keep(self, node: Node, result: Any, spent: Mapping[str, float]) -> None:
         try:
             self.store.put(node, result, spent)
         except OSError as error:
-            failed = StageError(_failure(self.graph.tile.id, "store", error))
+            failed = StageError(_failure(self.graph.tile, "store", error))
             self.faults[node.fingerprint] = failed
             raise failed from error
 
@@ -154,7 +162,7 @@ def do_tile(job: Job) -> TileResult:
     done = None if job.anew else folder.done(graph)
     if done is not None:
         return TileResult(graph.tile.id, "cached", tuple(done["properties"]["flexroad:rows"]))
-    pull = Pull(graph, Store(Path(job.store)), job.anew)
+    pull = Pull(graph, Store(Path(job.store)), job.anew, keep=True)
     rows, failures = [], []
     for variant in graph.variants:
         try:
@@ -170,7 +178,7 @@ def do_tile(job: Job) -> TileResult:
         except StageError as error:
             failures.append(error.failure)
         except Exception as error:
-            failures.append(_failure(graph.tile.id, "export", error))
+            failures.append(_failure(graph.tile, "export", error))
         if failures:
             rows = [failed_row(graph, row["variant"], failures[0].line) for row in rows]
     if failures:
@@ -256,6 +264,7 @@ def _item(
         "flexroad:rows": rows,
         "flexroad:notes": list(notes),
         "flexroad:nodes": graph.variants,
+        "flexroad:sources": graph.sources,
         "flexroad:versions": _versions(graph),
     }
     return found
@@ -266,9 +275,14 @@ def _versions(graph: TileGraph) -> dict[str, int]:
     return {module.__name__: module.VERSION for module in modules}
 
 
-def _failure(tile_id: str, stage: str, error: BaseException) -> Failure:
+def _failure(tile: Tile, stage: str, error: BaseException) -> Failure:
     message = " ".join(str(error).split()) or repr(error)
     expected = isinstance(error, TaskError | OSError)
-    file = error.file if isinstance(error, TaskError) else str(getattr(error, "filename", "") or "")
+    file = _file(tile, error) if isinstance(error, TaskError) else str(getattr(error, "filename", "") or "")
     trace = "" if expected else "".join(traceback.format_exception(error))
-    return Failure(tile_id, stage, type(error).__name__, message, file, trace)
+    return Failure(tile.id, stage, type(error).__name__, message, file, trace)
+
+
+def _file(tile: Tile, error: TaskError) -> str:
+    layer = tile.layer(error.layer)
+    return error.file or (str(tile.paths(layer)[0]) if layer else "")

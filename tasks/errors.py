@@ -12,11 +12,14 @@ class TaskError(Exception):
         One line.
     file : str, optional
         The source file at fault, for the table of failures.
+    layer : str, optional
+        The tile's layer at fault, where the stage knows no file: the runner names the layer's.
     """
 
-    def __init__(self, message: str, file: str = "") -> None:
+    def __init__(self, message: str, file: str = "", layer: str = "") -> None:
         super().__init__(message)
         self.file = file
+        self.layer = layer
 
-    def __reduce__(self) -> tuple[type[TaskError], tuple[str, str]]:
-        return type(self), (str(self), self.file)
+    def __reduce__(self) -> tuple[type[TaskError], tuple[str, str, str]]:
+        return type(self), (str(self), self.file, self.layer)

@@ -114,7 +114,7 @@ def spline_space(grid: Grid, options: Options) -> Space:
     Raises
     ------
     TaskError
-        If the grid is a single row or column.
+        If the grid is a single row or column, or has fewer cells than there would be control points.
     """
     if min(grid.shape) < 2:
         raise TaskError(f"a surface needs at least 2 x 2 cells, not {grid.width} x {grid.height}")
@@ -125,8 +125,15 @@ def spline_space(grid: Grid, options: Options) -> Space:
             max(options.degree + 1, round(span / options.spacing_m) + 1)
             for span in (east - west, north - south)
         )
+    # Before anything is allocated: a spacing in the wrong unit would ask for more than there is memory.
+    if n * m > grid.width * grid.height:
+        raise TaskError(_too_few(f"{grid.width} x {grid.height} cells", n, m))
     p = options.degree
     return clamped_knots(n, p), clamped_knots(m, p), (p, p)
+
+
+def _too_few(cells: str, n: int, m: int) -> str:
+    return f"{cells} are fewer than {n} x {m} control points; lower fit.control_points or raise fit.spacing_m"
 
 
 def objective_of(data: TileData, road: Bools, space: Space, datum: float, options: Options) -> Objective:
@@ -141,10 +148,7 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
     cells = np.count_nonzero(np.isfinite(heights))
     n, m = (len(knots) - options.degree - 1 for knots in space[:2])
     if cells < n * m:
-        raise TaskError(
-            f"{cells} cells with a height are fewer than {n} x {m} control points; "
-            "lower fit.control_points or raise fit.spacing_m"
-        )
+        raise TaskError(_too_few(f"{cells} cells with a height", n, m))
     terrain = options.lambda_terrain if options.terrain else 0.0
     factor = np.where(road, 1.0, terrain)
     return objective(heights - datum, factor, space, options.lambda_reg, options.weights == "free")

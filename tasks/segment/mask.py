@@ -34,6 +34,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     if not data.road_mask[data.grid.window(data.core)].any():
         raise TaskError(
             "the road mask has no road cell on this tile: leave the tile out, or say with --road-value "
-            "of `flexroad catalog rasters` which values mean road"
+            "of `flexroad catalog rasters` which values mean road",
+            layer="road_mask",
         )
     return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=outside(data))

@@ -287,14 +287,20 @@ def test_control_points_by_spacing():
 
 def test_what_cannot_be_fitted_is_an_error_of_one_line():
     data, clusters, _ = tile(size=10)
-    with pytest.raises(TaskError, match="100 cells with a height are fewer than 15 x 15 control points"):
+    with pytest.raises(TaskError, match="10 x 10 cells are fewer than 15 x 15 control points"):
         fitted(data, clusters)
+    with pytest.raises(TaskError, match="10 x 10 cells are fewer than 9000001 x 9000001 control points"):
+        fitted(data, clusters, spacing_m=1e-6)
+    few = replace(data, dsm=data.dsm.copy(), dtm=data.dtm.copy())
+    few.dsm[5:], few.dtm[5:] = np.nan, np.nan
+    with pytest.raises(TaskError, match="50 cells with a height are fewer than 8 x 8 control points"):
+        fitted(few, clusters, control_points=(8, 8))
     none = replace(data, dsm=np.full((10, 10), np.nan), dtm=np.full((10, 10), np.nan))
     with pytest.raises(TaskError, match="no filtered road cell has a DSM height to start from.* empty too"):
-        fitted(none, clusters)
+        fitted(none, clusters, control_points=(4, 4))
     empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
     with pytest.raises(TaskError, match=r"the DTM is not to be used \(fit.terrain\)"):
-        fitted(data, empty, terrain=False)
+        fitted(data, empty, terrain=False, control_points=(4, 4))
     row, road, _ = tile(shape=(1, 400))
     with pytest.raises(TaskError, match="at least 2 x 2 cells, not 400 x 1"):
         fitted(row, road, control_points=(4, 4))
