@@ -1,0 +1,31 @@
+import numpy as np
+import pytest
+
+from catalog import Catalog, CatalogError
+from pipeline.config import load_config
+from pipeline.dataset import open_tile
+from pipeline.errors import ConfigError
+from pipeline.execute import SerialExecutor
+from pipeline.query import Ground
+from pipeline.run import Run, execute
+
+
+def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):
+    run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
+    execute(run, SerialExecutor(), only=lambda graph: graph.tile == run.catalog.tiles[0])
+    tile = run.catalog.tiles[0]
+    found = open_tile(run.path, tile.id)
+    assert set(found.data_vars) == {
+        "dsm", "dtm", "reference", "reference_road", "road", "road_filtered", "surface",
+    }  # fmt: skip
+    assert found.rio.crs.to_epsg() == 25832
+    assert tuple(found.rio.bounds()) == tile.grid.bounds
+    assert not (found.road_filtered & ~found.road).any()
+    east, north = np.meshgrid(found.x, found.y)
+    height = Ground.open(run.path).at(east.ravel(), north.ravel()).height
+    assert np.allclose(found.surface.values.ravel(), height, atol=1e-9)
+    assert np.array_equal(open_tile(run.path, tile.id, "rgt").surface, found.dsm)
+    with pytest.raises(ConfigError, match="no variant 'x'"):
+        open_tile(run.path, tile.id, "x")
+    with pytest.raises(CatalogError, match="did you mean"):
+        open_tile(run.path, "1_1")
