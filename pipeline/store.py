@@ -144,7 +144,7 @@ class TileFolder:
 def plain_name(tile_id: str) -> str:
     """Return what folders and files of a tile are called: its id, or one like it that makes a file name."""
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
-    return safe if safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
+    return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:

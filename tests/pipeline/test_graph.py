@@ -1,0 +1,91 @@
+"""Fingerprints change with what makes a result, and with nothing else."""
+
+import os
+import shutil
+
+import pytest
+
+from catalog import Catalog
+from pipeline.config import compose
+from pipeline.graph import STAGE_NAMES, tile_graph
+from tasks import ecsrc
+
+PAPER = {
+    "variants": {
+        "plane": {"fit": "plane", "sample": "corners"},
+        "rgt": {"fit": "raster", "sample": "uniform"},
+        "flexroad": {},
+    }
+}
+
+
+def names(catalog, raw=PAPER, variant="flexroad", **how) -> dict[str, str]:
+    return tile_graph(Catalog.read(catalog).tiles[0], compose(raw, "x"), **how).variants[variant]
+
+
+def changed(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    return [stage for stage in STAGE_NAMES if before[stage] != after[stage]]
+
+
+def test_the_same_again_is_the_same(survey):
+    assert names(survey) == names(survey)
+
+
+@pytest.mark.parametrize(
+    ("override", "stages"),
+    [
+        ({"load": {"halo_m": 10}}, list(STAGE_NAMES)),
+        ({"ecsrc": {"theta_z_m": 0.1}}, ["ecsrc", "fit", "sample", "evaluate"]),
+        ({"fit": {"degree": 2}}, ["fit", "sample", "evaluate"]),
+        ({"sample": {"road_m": 2}}, ["sample", "evaluate"]),
+        ({"evaluate": {"nearest": True}}, ["evaluate"]),
+        ({"export": {"formats": ["glb"]}}, []),
+    ],
+)
+def test_an_option_changes_its_stage_and_what_follows(survey, override, stages):
+    assert changed(names(survey), names(survey, {**PAPER, **override})) == stages
+
+
+def test_an_option_at_its_default_changes_nothing(survey):
+    assert names(survey) == names(survey, {**PAPER, "fit": {"method": "nurbs", "degree": 3}})
+
+
+def test_a_version_changes_its_stage_and_what_follows(survey, monkeypatch):
+    before = names(survey)
+    monkeypatch.setattr(ecsrc, "VERSION", ecsrc.VERSION + 1)
+    assert changed(before, names(survey)) == ["ecsrc", "fit", "sample", "evaluate"]
+
+
+def test_variants_share_what_they_have_in_common(survey):
+    graph = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    assert len(graph.nodes) == 3 + 3 * 3
+    stages = [node.stage for node in graph.nodes.values()]
+    assert sorted(set(stages), key=stages.index) == list(STAGE_NAMES)
+    for node in graph.nodes.values():
+        assert all(i in graph.nodes for i in node.inputs)
+    assert [node.stage for node in graph.nodes.values() if not node.stored].count("load") == 1
+
+
+def test_tiles_and_moved_surveys(survey, tmp_path):
+    tiles = Catalog.read(survey).tiles
+    config = compose(PAPER, "x")
+    assert tile_graph(tiles[0], config).fingerprint != tile_graph(tiles[1], config).fingerprint
+    before = names(survey)
+    # copytree keeps times; relative names do the rest.
+    moved = shutil.copytree(survey.parent, tmp_path / "moved") / survey.name
+    assert names(moved) == before
+
+
+def test_sources_count_by_size_and_time_or_by_bytes(survey):
+    tile = Catalog.read(survey).tiles[0]
+    path = tile.paths(tile.layers[0])[0]
+    plain, summed = names(survey), names(survey, checksum=True)
+    assert changed(plain, summed) == list(STAGE_NAMES)
+    os.utime(path, (1, 1))
+    assert changed(plain, names(survey)) == list(STAGE_NAMES)
+    assert names(survey, checksum=True) == summed
+    path.write_bytes(path.read_bytes() + b"\0")
+    assert changed(summed, names(survey, checksum=True)) == list(STAGE_NAMES)
+    path.unlink()
+    missing = names(survey)
+    assert changed(plain, missing) == list(STAGE_NAMES)

@@ -1,0 +1,99 @@
+"""What is written comes back to the last bit, or counts as not there."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from catalog import Catalog
+from pipeline import codec
+from pipeline.config import compose
+from pipeline.graph import tile_graph
+from pipeline.store import Store, TileFolder, write_atomic
+from pipeline.work import Pull
+
+CONFIG = {
+    "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
+    "variants": {"plane": {"fit": "plane"}, "raster": {"fit": "raster"}, "flexroad": {}},
+}
+
+
+def same(a, b) -> bool:
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, float):
+        return type(b) is float and (a == b or (a != a and b != b))
+    return type(a) is type(b) and a == b
+
+
+@pytest.fixture
+def pull(survey, tmp_path):
+    graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
+    return Pull(graph, Store(tmp_path / "store"), keep=True)
+
+
+def test_every_result_comes_back_exactly(pull):
+    kinds = set()
+    for fingerprint, node in pull.graph.nodes.items():
+        if node.stage == "load":
+            continue
+        value = pull(fingerprint)
+        back, seconds = codec.decode(codec.encode(value, {"fit": 0.25}))
+        assert seconds == {"fit": 0.25}
+        assert type(back) is type(value)
+        for field in fields(value):
+            assert same(getattr(value, field.name), getattr(back, field.name)), (node.stage, field.name)
+        kinds.add(type(value).__name__)
+    assert kinds == {
+        "RoadMask", "RoadClusters", "PlaneSurface", "RasterSurface", "NurbsSurface", "Mesh", "Metrics",
+    }  # fmt: skip
+
+
+def test_damage_counts_as_absence(pull):
+    fingerprint = pull.graph.variants["flexroad"]["fit"]
+    node = pull.graph.nodes[fingerprint]
+    pull(fingerprint)
+    (path,) = (pull.store.root / "fit").rglob(f"{fingerprint}.npz")
+    whole = path.read_bytes()
+    assert pull.store.get(node) is not None
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    for damaged in (b"", whole[:100], whole[:-1], bytes(flipped)):
+        path.write_bytes(damaged)
+        assert pull.store.get(node) is None
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "a" / "b.json"
+    write_atomic(path, b"old")
+    with pytest.raises(TypeError):
+        write_atomic(path, "not bytes")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in path.parent.iterdir()] == ["b.json"]
+
+
+def test_a_marker_of_another_graph_or_with_a_product_missing_is_not_done(survey, tmp_path):
+    graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
+    folder = TileFolder.of(tmp_path, graph.tile.id)
+    item = {
+        "properties": {"flexroad:fingerprint": graph.fingerprint, "flexroad:rows": []},
+        "assets": {"mesh": {"href": "mesh.glb", "file:size": 3}},
+    }
+    folder.finish(item, {"mesh.glb": b"abc"})
+    assert folder.done(graph) == item
+    (folder.path / "mesh.glb").write_bytes(b"ab")
+    assert folder.done(graph) is None
+    (folder.path / "mesh.glb").write_bytes(b"abc")
+    other = tile_graph(graph.tile, compose({**CONFIG, "sample": {"road_m": 2}}, "x"))
+    assert folder.done(other) is None
+    (folder.path / "item.json").write_text("{")
+    assert folder.done(graph) is None
+
+
+def test_tile_ids_become_safe_folder_names(tmp_path):
+    for odd in ("../up", "a/b", "..", "", "ä b"):
+        folder = TileFolder.of(tmp_path, odd).path
+        assert folder.parent == tmp_path / "tiles"
+        assert folder.name
+    assert TileFolder.of(tmp_path, "a/b").path != TileFolder.of(tmp_path, "a-b").path
+    assert TileFolder.of(tmp_path, "295500_5629250").path.name == "295500_5629250"
