@@ -127,7 +127,7 @@ def catalog_rasters(
         {name: pattern for name, pattern in asked.items() if pattern is not None},
         road_values=tuple(road_value or ()),
         tile_size_m=tile_size,
-        date=date.astimezone(UTC) if date else None,
+        date=date.replace(tzinfo=UTC) if date else None,
         crs=crs,
         min_cover=min_cover,
     )
