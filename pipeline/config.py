@@ -195,7 +195,7 @@ def _raw(name: str | Path, heirs: tuple[Path, ...] = ()) -> dict[str, Any]:
     known = shipped()
     path = known.get(str(name), Path(name))
     if not path.is_file():
-        near = difflib.get_close_matches(str(name), known, n=1)
+        near = difflib.get_close_matches(Path(name).name, known, n=1)
         hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(known)}"
         raise ConfigError(f"no configuration {str(name)!r}: neither a file nor a shipped name{hint}")
     if path.resolve() in heirs:

@@ -1,0 +1,728 @@
+"""Bad input, bad disks, bad words: one clear line, and no more lost than the tile it is about."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from affine import Affine
+from rasterio.warp import transform_bounds
+
+from catalog import Catalog, Grid, Tile
+from catalog.sources import prepared
+from pipeline.cli import main
+from pipeline.tables import read_metrics
+from tests.make_rasters import write
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    @property
+    def errors(self) -> list[str]:
+        """The lines that tell of faults."""
+        return [line for line in self.err.splitlines() if line.startswith(("error: ", "failed "))]
+
+
+@pytest.fixture
+def flexroad(monkeypatch, capsys):
+    """The command line, in this process; no traceback ever."""
+
+    def call(*words) -> Said:
+        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = Said(int(end.value.code or 0), *capsys.readouterr())
+        assert "Traceback" not in said.err
+        return said
+
+    return call
+
+
+@pytest.fixture
+def run(flexroad, survey, quick_config, tmp_path):
+    """Run the survey, by default with the quick configuration into ``tmp_path/run``."""
+
+    def call(*more, config=quick_config, catalog=survey, out=tmp_path / "run") -> Said:
+        return flexroad(
+            "run", "--config", config, "--catalog", catalog, "--out", out, "--executor", "serial", *more
+        )
+
+    return call
+
+
+def layer(tile: Tile, name: str) -> Path:
+    found = tile.layer(name)
+    assert found is not None
+    return tile.paths(found)[0]
+
+
+def values(path: Path) -> np.ndarray:
+    with rasterio.open(path) as raster:
+        return raster.read(1)
+
+
+def rewrite(tile: Tile, name: str, array, **how) -> None:
+    path = layer(tile, name)
+    path.unlink()
+    how = {"west": tile.grid.west, "north": tile.grid.north, "crs": tile.grid.crs} | how
+    write(path, array, how.pop("west"), how.pop("north"), **how)
+
+
+# --- one tile's input ---------------------------------------------------------------------------------
+
+
+def _absent(tile: Tile) -> None:
+    layer(tile, "dsm").unlink()
+
+
+def _zero_bytes(tile: Tile) -> None:
+    layer(tile, "dtm").write_bytes(b"")
+
+
+def _truncated(tile: Tile) -> None:
+    path = layer(tile, "dsm")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _a_folder(tile: Tile) -> None:
+    layer(tile, "dsm").unlink()
+    layer(tile, "dsm").mkdir()
+
+
+def _a_text(tile: Tile) -> None:
+    layer(tile, "road_mask").write_text("<html>404 Not Found</html>")
+
+
+def _elsewhere(tile: Tile) -> None:
+    rewrite(tile, "dsm", values(layer(tile, "dsm")), west=tile.grid.west + 10_000)
+
+
+def _other_crs(tile: Tile) -> None:
+    west, _, _, north = transform_bounds(tile.grid.crs, "EPSG:25833", *tile.grid.bounds)
+    rewrite(tile, "dtm", values(layer(tile, "dtm")), west=west, north=north, crs="EPSG:25833")
+
+
+def _in_feet(tile: Tile) -> None:
+    rewrite(tile, "dtm", values(layer(tile, "dtm")) / 0.3048, unit="ft")
+
+
+def _in_fathoms(tile: Tile) -> None:
+    rewrite(tile, "dsm", values(layer(tile, "dsm")), unit="fathom")
+
+
+def _void(tile: Tile) -> None:
+    rewrite(tile, "dsm", np.full(tile.grid.shape, np.nan, np.float32), nodata=np.nan)
+
+
+def _thin(tile: Tile) -> None:
+    heights = values(layer(tile, "dsm"))
+    heights[6:] = np.nan
+    rewrite(tile, "dsm", heights, nodata=np.nan)
+
+
+def _absurd(tile: Tile) -> None:
+    heights = np.full(tile.grid.shape, 1e30, np.float32)
+    heights[::2], heights[:, ::3], heights[5] = -1e30, np.inf, -np.inf
+    rewrite(tile, "dsm", heights)
+
+
+def _bare_mask(tile: Tile) -> None:
+    rewrite(tile, "road_mask", np.ones((30, 30), np.uint8), crs=None, transform=Affine.identity())
+
+
+def _rotated(tile: Tile) -> None:
+    turned = Affine.translation(tile.grid.west, tile.grid.north) @ Affine.rotation(30) @ Affine.scale(1, -1)
+    rewrite(tile, "dsm", values(layer(tile, "dsm")), transform=turned)
+
+
+def _no_road(tile: Tile) -> None:
+    rewrite(tile, "road_mask", np.zeros(tile.grid.shape, np.uint8))
+
+
+@dataclass(frozen=True)
+class Fault:
+    spoil: object
+    name: str
+    """The layer whose file is at fault."""
+    message: str
+    stage: str = "load"
+
+
+FAULTS = (
+    Fault(_absent, "dsm", "is missing; restore it or build the catalog anew"),
+    Fault(_zero_bytes, "dtm", "cannot be read: .*; fetch it again"),
+    Fault(_truncated, "dsm", "cannot be read: .*; fetch it again"),
+    Fault(_a_folder, "dsm", "cannot be read: .*; fetch it again"),
+    Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
+    Fault(_elsewhere, "dsm", r"no dsm file overlaps the tile \(.*\): .*; build the catalog anew"),
+    Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),
+    Fault(_in_feet, "dtm", "counts heights in metre, dtm .* in ft; convert one, or correct its unit"),
+    Fault(_in_fathoms, "dsm", "counts in 'fathom', which is no unit of height known here; convert it"),
+    Fault(_void, "dsm", "has only nodata on this tile; leave the tile out"),
+    Fault(_thin, "dsm", r"has 10.0% valid cells on this tile, below 25%; lower load.min_valid"),
+    Fault(_absurd, "dsm", "has only nodata on this tile; leave the tile out"),
+    Fault(_bare_mask, "road_mask", "no georeference and has 30 x 30 cells, the tile 60 x 60; give it"),
+    Fault(_rotated, "dsm", "is rotated; turn it north up with gdalwarp"),
+    Fault(_no_road, "road_mask", "no road cell on this tile: leave the tile out", stage="segment"),
+)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.spoil.__name__.lstrip("_"))
+def test_a_bad_file_costs_its_tile_and_says_so_in_one_line(fault, run, flexroad, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[1]
+    fault.spoil(tile)
+    only_its_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", str(layer(tile, fault.name)))
+
+
+def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:
+    assert said.code == 1
+    (line,) = said.errors
+    assert line.startswith(f"failed {tile.id}: {fault.stage}: TaskError: ")
+    assert re.search(fault.message, line)
+    assert line.endswith(f"  [{file}]" if file else line[-1])
+    assert "3 done (0 of them before), 1 failed, 0 pending" in said.out
+
+    rows = read_metrics(out)
+    bad = rows[rows.tile_id == tile.id]
+    assert list(bad.status) == ["failed"] * 3
+    assert set(rows[rows.tile_id != tile.id].status) == {"done"}
+    assert bad.error.str.contains(fault.message).all()
+    assert bad.triangles.isna().all()
+    (row,) = pd.read_csv(out / "failures.csv", keep_default_na=False).to_dict("records")
+    assert (row["tile_id"], row["stage"], row["kind"], row["file"]) == (
+        tile.id, fault.stage, "TaskError", file,
+    )  # fmt: skip
+    found = json.loads(flexroad("status", out, "--json").out)
+    assert (found["done"], found["failed"]) == (3, 1)
+    assert [failure["message"] for failure in found["failures"]] == [row["message"]]
+    shown = flexroad("status", out)
+    assert shown.code == 0
+    assert line.removeprefix("failed ") in shown.out
+
+
+@pytest.mark.parametrize(
+    ("name", "stage", "message"),
+    [
+        ("road_mask", "segment", "no road mask layer in the catalog and none configured: give --road-mask"),
+        ("dsm", "load", "the tile has no dsm; give its files to `flexroad catalog` with --dsm"),
+        ("dtm", "load", "the tile has no dtm; give its files to `flexroad catalog` with --dtm"),
+    ],
+)
+def test_a_layer_the_catalog_lacks(name, stage, message, run, flexroad, survey, tmp_path):
+    tiles = list(Catalog.read(survey).tiles)
+    tiles[1] = replace(tiles[1], layers=tuple(found for found in tiles[1].layers if found.name != name))
+    Catalog(tuple(tiles)).write(survey)
+    fault = Fault(None, name, message, stage)
+    only_its_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
+
+
+def test_a_road_only_in_the_halo(run, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[1]
+    mask = np.zeros((100, 100), np.uint8)
+    mask[:, :15] = 1
+    rewrite(tile, "road_mask", mask, west=tile.grid.west - 20, north=tile.grid.north + 20)
+    config = tmp_path / "halo.yaml"
+    config.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
+    said = run(config=config)
+    assert said.code == 1
+    (line,) = said.errors
+    assert line.startswith(f"failed {tile.id}: segment: TaskError: the road mask has no road cell")
+    assert line.endswith(f"[{layer(tile, 'road_mask')}]")
+
+
+# --- odd, but no fault --------------------------------------------------------------------------------
+
+
+def _flat(tile: Tile) -> None:
+    rewrite(tile, "dsm", np.full(tile.grid.shape, 100, np.float32))
+
+
+def _all_road(tile: Tile) -> None:
+    rewrite(tile, "road_mask", np.ones(tile.grid.shape, np.uint8))
+
+
+def _one_cell(tile: Tile) -> None:
+    mask = np.zeros(tile.grid.shape, np.uint8)
+    mask[30, 30] = 1
+    rewrite(tile, "road_mask", mask)
+
+
+def _small_mask(tile: Tile) -> None:
+    rewrite(tile, "road_mask", np.ones((30, 20), np.uint8))
+
+
+def _coarse_mask(tile: Tile) -> None:
+    rewrite(tile, "road_mask", np.ones((6, 6), np.uint8), cell=10)
+
+
+def _specks(tile: Tile) -> None:
+    heights = values(layer(tile, "dsm"))
+    heights[:3, :4] = [1e30, -1e30, np.inf, -np.inf]
+    heights[5, 5] = np.nan
+    rewrite(tile, "dsm", heights)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "note"),
+    [
+        (_flat, None),
+        (_all_road, None),
+        (_one_cell, None),
+        (_small_mask, None),
+        (_coarse_mask, "road_mask resampled: its cells are 10 m, the tile's 1 m"),
+        (_specks, "dsm: 12 cells outside -500..9000 m taken as nodata"),
+    ],
+)
+def test_odd_input_is_done_with_finite_figures(spoil, note, run, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[1]
+    spoil(tile)
+    said = run("--tile", tile.id)
+    assert (said.code, said.errors) == (0, [])
+    rows = read_metrics(tmp_path / "run")
+    assert set(rows.status) == {"done"}
+    flexroad = rows[rows.variant == "flexroad"].iloc[0]
+    assert flexroad.l2_terrain_m < 1
+    assert flexroad.triangles > 50
+    item = json.loads((tmp_path / "run" / "tiles" / tile.id / "item.json").read_text())
+    assert item["properties"]["flexroad:notes"] == ([note] if note else [])
+
+
+@pytest.mark.parametrize("cell", [0.5, 2.0])
+def test_cells_of_another_size(cell, run, flexroad, tmp_path):
+    grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
+    tilted_ground(tmp_path / "folder", "a", grid)
+    catalog = cataloged(tmp_path / "folder")
+    said = run(catalog=catalog)
+    assert (said.code, said.errors) == (0, [])
+    rows = read_metrics(tmp_path / "run").set_index("variant")
+    assert rows.triangles["rgt"] == 2 * np.ceil(40 - cell) ** 2
+    assert (rows.l2_road_m < 0.05).all()
+    assert (rows.completeness > 0.99).all()
+    points = tmp_path / "points.csv"
+    points.write_text("easting,northing\n500020,5600020\n500010,5600030\n")
+    answer = flexroad("query", tmp_path / "run", "--points", points).out.splitlines()
+    for line in answer[1:]:
+        easting, northing, height, *_ = map(float, line.split(",")[:3])
+        assert height == pytest.approx(plane(easting, northing), abs=0.1)
+
+
+def plane(easting, northing):
+    return 100 + 0.05 * (easting - 500_000) - 0.02 * (northing - 5_600_000)
+
+
+def tilted_ground(folder: Path, tile_id: str, grid: Grid) -> None:
+    heights = plane(grid.eastings[None, :], grid.northings[:, None])
+    road = np.zeros(grid.shape, bool)
+    road[grid.height // 4 : grid.height // 2 + 1] = True
+    prepared.write_tile(folder, tile_id, grid, {"dsm": heights, "dtm": heights, "road_mask": road})
+
+
+def cataloged(folder: Path) -> Path:
+    Catalog(tuple(prepared.index(folder))).write(folder / "catalog.json")
+    return folder / "catalog.json"
+
+
+def test_a_tile_of_2_by_2_cells(run, tmp_path):
+    tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
+    catalog = cataloged(tmp_path / "tiny")
+    said = run(catalog=catalog, config="paper")
+    assert said.code == 1
+    (line,) = said.errors
+    assert line == (
+        "failed tiny: fit: TaskError: 2 x 2 cells are fewer than 35 x 35 control points; "
+        "lower fit.control_points or raise fit.spacing_m"
+    )
+    rows = read_metrics(tmp_path / "run").set_index("variant")
+    assert dict(rows.status) == {"plane": "done", "rgt": "done", "flexroad": "failed"}
+    config = tmp_path / "linear.yaml"
+    config.write_text("fit: {degree: 1, control_points: [2, 2]}\necsrc: {min_area_m2: 0}\n")
+    assert run(catalog=catalog, config=config, out=tmp_path / "linear").code == 0
+
+
+@pytest.mark.parametrize("tile_id", ["Köln 1/2", "../../escape", "...", "a\\b:c*?", "x" * 80])
+def test_a_tile_id_that_makes_no_file_name(tile_id, run, flexroad, survey, tmp_path):
+    first, *_ = Catalog.read(survey).tiles
+    Catalog((replace(first, id=tile_id),)).write(survey)
+    before = {path for path in tmp_path.rglob("*") if "run" not in path.parts}
+    said = run()
+    assert (said.code, said.errors) == (0, [])
+    assert {path for path in tmp_path.rglob("*") if tmp_path / "run" not in (path, *path.parents)} == before
+    (folder,) = (tmp_path / "run" / "tiles").iterdir()
+    assert len(list(folder.iterdir())) == 6
+    assert all(path.is_file() for path in folder.iterdir())
+    assert list(read_metrics(tmp_path / "run").tile_id.unique()) == [tile_id]
+    again = flexroad("rerun", tmp_path / "run", "--tile", tile_id, "--executor", "serial")
+    assert "nothing had changed" in again.out
+
+
+def test_a_tile_named_twice_is_done_once(run, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[2].id
+    said = run("--tile", tile, tile, "--tile", tile)
+    assert said.code == 0
+    assert len(read_metrics(tmp_path / "run")) == 3
+
+
+# --- configurations -----------------------------------------------------------------------------------
+
+DEEP = "{a: " * 2000 + "1" + "}" * 2000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fit: {degre: 3}", "fit.degre: unknown key; did you mean degree?"),
+        ("fitt: {degree: 3}", "fitt: unknown key; did you mean fit?"),
+        ("variants: {a: {smple: uniform}}", "variants.a.smple: unknown key; did you mean sample?"),
+        ("fit: {degree: 35, control_points: [35, 35]}", "fit.degree: input should be less than or equal"),
+        (
+            "fit: {degree: 5, control_points: [5, 9]}",
+            "degree 5 needs more control points each way than 5 x 9",
+        ),
+        ("fit: {learning_rate: .inf}", "fit.learning_rate: input should be a finite number, not inf"),
+        ("fit: bspline", "fit: input tag 'bspline'"),
+        ("fit:\n\tdegree: 3", "not readable as YAML: .*line 2"),
+        ("- a", "expected a mapping, not ['a']"),
+        ("variants: [a, b]", "variants: expected a mapping, not ['a', 'b']"),
+        ("load: 3", "load: expected a mapping of options, not 3"),
+        ("variants: {a/b: {}}", "variants.a/b: its files bear the name; use letters, digits, - and _"),
+        ("export: {variants: []}", "export.variants: tuple should have at least 1 item"),
+        ("export: {variants: [b]}\nvariants: {a: {}}", "export.variants: no variant 'b', only a"),
+        ("extends: bad.yaml", "extends: leads back to itself"),
+        ("extends: [a]", "extends: expected a file or a shipped name, not ['a']"),
+        ("extends: papr", "did you mean paper?"),
+        (DEEP, "not readable as YAML"),
+    ],
+    ids=lambda value: value[:30],
+)
+def test_a_bad_configuration_starts_nothing(text, message, run, tmp_path):
+    config = tmp_path / "bad.yaml"
+    config.write_text(text + "\n")
+    said = run(config=config)
+    assert said.code == 2
+    (line,) = said.errors
+    assert str(config) in line or "papr" in line
+    assert re.search(message if "*" in message else re.escape(message), line)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_empty_configuration_is_the_default(flexroad, tmp_path):
+    (tmp_path / "empty.yaml").write_text("")
+    said = flexroad("config", "show", tmp_path / "empty.yaml")
+    assert (said.code, said.errors) == (0, [])
+    assert "control_points" in said.out
+
+
+def test_a_parent_lies_beside_its_child(flexroad, tmp_path):
+    (tmp_path / "parent.yaml").write_text("fit: {degree: 4}\n")
+    (tmp_path / "child.yaml").write_text("extends: parent.yaml\n")
+    assert "degree: 4" in flexroad("config", "show", tmp_path / "child.yaml").out
+
+
+@pytest.mark.parametrize("fit", ["{control_points: [100000, 100000]}", "{spacing_m: 1.0e-9}"])
+def test_more_control_points_than_there_is_memory_for(fit, run, survey, tmp_path):
+    config = tmp_path / "huge.yaml"
+    config.write_text(f"fit: {fit}\n")
+    said = run(config=config)
+    assert said.code == 1
+    assert [line.split(": ")[0] for line in said.errors] == [
+        f"failed {tile.id}" for tile in Catalog.read(survey).tiles
+    ]
+    assert all("60 x 60 cells are fewer than" in line for line in said.errors)
+
+
+def test_two_configurations_in_one_folder(run, flexroad, quick_config, tmp_path):
+    other = tmp_path / "other.yaml"
+    other.write_text("fit: {control_points: [8, 8], iterations: 3}\nvariants: {smooth: {}}\n")
+    assert run().code == 0
+    assert run(config=other).code == 0
+    assert set(read_metrics(tmp_path / "run").variant) == {"smooth"}
+    assert "4 done" in flexroad("status", tmp_path / "run").out
+    back = run()
+    assert "4 tiles: 4 done" in back.out
+    assert set(read_metrics(tmp_path / "run").variant) == {"plane", "rgt", "flexroad"}
+
+
+# --- disks and folders --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mount(tmp_path):
+    """Mount a small file system of one's own; unmounted at the end."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def call(options: str) -> Path:
+        done = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", options, "tmpfs", place],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+        return place
+
+    yield call
+    subprocess.run(["umount", place], capture_output=True, check=False)
+
+
+@pytest.mark.parametrize("size", ["100k", "300k"])
+def test_a_full_disk(size, mount, run, flexroad, tmp_path):
+    out = mount(f"size={size}") / "run"
+    said = run(out=out)
+    assert said.code == 1
+    assert len({line.split(":")[0] for line in said.errors}) == len(said.errors) > 0
+    assert all("No space left on device" in line for line in said.errors)
+    assert not list(out.rglob("*.tmp"))
+    subprocess.run(["mount", "-o", "remount,size=20m", out.parent], check=True)
+    again = flexroad("rerun", out, "--executor", "serial")
+    assert again.code == 0
+    assert "4 tiles: 4 done" in again.out
+    assert set(read_metrics(out).status) == {"done"}
+
+
+def test_a_disk_that_may_only_be_read(mount, run, flexroad, survey, tmp_path):
+    disk = mount("size=20m")
+    assert run(out=disk / "run").code == 0
+    tile = Catalog.read(survey).tiles[0]
+    points = tmp_path / "points.csv"
+    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
+    for artefact in (disk / "run" / "store").rglob("*.npz"):
+        artefact.unlink()
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    for out in (disk / "run", disk / "other"):
+        said = run(out=out)
+        assert said.code == 2
+        (line,) = said.errors
+        assert f"cannot write the run to {out}" in line
+        assert "Read-only file system" in line
+    assert "4 done" in flexroad("status", disk / "run").out
+    assert tile.id in flexroad("query", disk / "run", "--points", points).out
+    said = flexroad("report", disk / "run")
+    assert said.code == 2
+    assert "Read-only file system" in said.errors[0]
+    said = flexroad("catalog", "synthetic", "-o", disk / "scenes", "--tiles", 1)
+    assert (said.code, len(said.errors)) == (2, 1)
+
+
+def test_an_output_that_is_a_file(run, flexroad, survey, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    folder = survey.parent
+    into = ["catalog", "rasters", folder, "--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", 60, "-o"]
+    for said in (
+        run(out=tmp_path / "file"),
+        run(out=tmp_path / "file" / "run"),
+        run("--store", tmp_path / "file"),
+        flexroad("catalog", "synthetic", "-o", tmp_path / "file"),
+        flexroad(*into, tmp_path / "file" / "c.json"),
+    ):
+        assert said.code == 2
+        (line,) = said.errors
+        assert str(tmp_path / "file") in line
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+# --- catalogs -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is a folder; name its file"),
+        (b"", "is not a FlexRoad catalog"),
+        (b"PAR1 and no more", "is not a FlexRoad catalog"),
+    ],
+)
+def test_a_catalog_that_cannot_be_read(content, message, run, survey):
+    survey.unlink()
+    survey.mkdir() if content is None else survey.write_bytes(content)
+    said = run()
+    assert said.code == 2
+    (line,) = said.errors
+    assert str(survey) in line
+    assert message in line
+
+
+@pytest.mark.parametrize("size", ["0", "-5", "nan", "inf", "33.3"])
+def test_a_tile_size_that_cannot_be(size, flexroad, survey, tmp_path):
+    words = ["--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", size, "-o", tmp_path / "c.json"]
+    said = flexroad("catalog", "rasters", survey.parent, *words)
+    assert said.code == 2
+    assert len(said.errors) == 1
+
+
+def test_a_catalog_of_files_that_moved(run, flexroad, survey, tmp_path):
+    (survey.parent / "dsm").rename(tmp_path / "elsewhere")
+    said = run()
+    assert said.code == 1
+    assert len(said.errors) == 4
+    assert all(re.search(r"load: TaskError: dsm dsm/\d+_\d+.tif is missing", line) for line in said.errors)
+    (tmp_path / "elsewhere").rename(survey.parent / "dsm")
+    mended = flexroad("rerun", tmp_path / "run", "--failed", "--executor", "serial")
+    assert mended.code == 0
+    assert "4 tiles: 4 done" in mended.out
+
+
+# --- the life of a run --------------------------------------------------------------------------------
+
+
+def test_sources_that_are_gone_take_nothing_from_what_is_done(run, flexroad, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[0]
+    points = tmp_path / "points.csv"
+    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
+    out = tmp_path / "run"
+    run()
+    whole = [flexroad("query", out, "--points", points).out, flexroad("report", out).out]
+    survey.rename(tmp_path / "kept.parquet")
+    shutil.rmtree(survey.parent)
+    assert [flexroad("query", out, "--points", points).out, flexroad("report", out).out] == whole
+    assert "4 tiles: 4 done" in flexroad("status", out).out
+    assert flexroad("report", out, "--format", "html").code == 0
+    lost = flexroad("query", out, "--points", points, "--variant", "rgt")
+    assert lost.code == 2
+    assert f"tile {tile.id}: load: TaskError: dsm dsm/{tile.id}.tif is missing" in lost.errors[0]
+    out.rename(tmp_path / "a moved run")
+    assert flexroad("query", tmp_path / "a moved run", "--points", points).out == whole[0]
+
+
+def test_the_store_may_go(run, flexroad, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[0]
+    points = tmp_path / "points.csv"
+    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
+    out = tmp_path / "run"
+    run()
+    whole = flexroad("query", out, "--points", points).out
+    shutil.rmtree(out / "store")
+    assert flexroad("query", out, "--points", points).out == whole
+    assert flexroad("report", out).code == 0
+    assert not (out / "store").exists()
+    assert "nothing had changed" in flexroad("rerun", out, "--executor", "serial").out
+    assert flexroad("rerun", out, "--from", "fit", "--executor", "serial").code == 0
+    assert flexroad("query", out, "--points", points).out == whole
+
+
+def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = ["--catalog", "survey/catalog.parquet", "--out", "my runs/1", "--store", "shared", "--executor"]
+    said = flexroad("run", "--config", "quick.yaml", *run, "serial")
+    assert said.code == 0
+    assert "next: flexroad report 'my runs/1' --format html" in said.out
+    (tmp_path / "away").mkdir()
+    monkeypatch.chdir(tmp_path / "away")
+    again = flexroad("rerun", "../my runs/1", "--from", "sample", "--executor", "serial")
+    assert "4 done (0 of them before)" in again.out
+    assert not list((tmp_path / "away").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "status", "message"),
+    [
+        ("run.json", "{}", 2, "is no run: it has no sound run.json"),
+        ("run.json", "[]", 2, "is no run: it has no sound run.json"),
+        ("config.yaml", "fit: {degre: 3}", 2, "fit.degre: unknown key"),
+        ("config.yaml", None, 2, "no configuration"),
+        ("catalog.parquet", "", 2, "is not a FlexRoad catalog"),
+        ("log.jsonl", 'null\n{"event": 3}\n{"ev', 0, "4 done"),
+        ("metrics.parquet", "", 0, "4 done"),
+        ("tiles/*/item.json", "{}", 0, "4 pending"),
+        ("tiles/*/item.json", "[", 0, "4 pending"),
+        ("tiles/*/*.glb", "", 0, "4 pending"),
+    ],
+)
+def test_a_damaged_run_is_said_and_mended(name, content, status, message, run, flexroad, tmp_path):
+    out = tmp_path / "run"
+    run()
+    for path in list(out.glob(name)):
+        path.unlink() if content is None else path.write_text(content)
+    said = flexroad("status", out)
+    assert said.code == status
+    assert message in said.out + said.err
+    report = flexroad("report", out)
+    assert report.code == (2 if name == "metrics.parquet" else status)
+    mended = run()
+    assert mended.code == 0
+    assert "4 tiles: 4 done" in mended.out
+    assert flexroad("report", out).code == 0
+
+
+def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
+    words = [
+        "--config",
+        quick_config,
+        "--catalog",
+        survey,
+        "--store",
+        tmp_path / "store",
+        "--executor",
+        "serial",
+    ]
+    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", *map(str, words), "--out"]
+    both = [
+        subprocess.Popen([*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        for name in "ab"
+    ]
+    assert [(process.communicate()[1], process.returncode) for process in both] == [(b"", 0)] * 2
+    tables = [read_metrics(tmp_path / name).drop(columns="seconds") for name in "ab"]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+# --- slips of the pen ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("stat RUN", "No such command 'stat'"),
+        ("status", "Missing argument 'RUN'"),
+        ("status nowhere", "nowhere is no run"),
+        ("status SURVEY", "is no run"),
+        ("query CSV --points RUN", "not readable as a table of points"),
+        ("query RUN --points nowhere.csv", "No such file"),
+        ("query RUN --points CSV", "no column 'easting'"),
+        ("report RUN --format pdf", "there are md, csv, html"),
+        ("rerun RUN --tile x", "no tile 'x' in the catalog; did you mean"),
+        ("rerun RUN --from evaluation", "no such stage"),
+        ("run --config paper --catalog SURVEY --out X", "is a folder; name its file"),
+        ("run --config paper --catalog CSV --out X", "is not a FlexRoad catalog"),
+        ("catalog rasters SURVEY --dsm dsm/*.tiff --dtm dtm/* -o X.json", "no file matches --dsm"),
+        ("catalog rasters SURVEY --dsm /etc/* --dtm dtm/* -o X.json", "is no pattern below"),
+        ("catalog rasters nowhere --dsm dsm/* --dtm dtm/* -o X.json", "does not exist"),
+        ("catalog rasters SURVEY --dsm dsm/* --dtm dtm/* -o X.txt --tile-size 60", "ends in .parquet, .json"),
+    ],
+)
+def test_slips(words, message, slips_at, flexroad):
+    said = flexroad(*[slips_at.get(word, word) for word in words.split()])
+    assert said.code == 2
+    assert message in said.err
+    assert len([line for line in said.err.splitlines() if "rror: " in line]) == 1
+
+
+@pytest.fixture(scope="module")
+def slips_at(made_survey, tmp_path_factory):
+    from pipeline.config import compose
+    from pipeline.run import Run
+
+    folder = tmp_path_factory.mktemp("slips")
+    (folder / "p.csv").write_text("x,y\n1,2\n")
+    Run.create(folder / "run", compose({}, "default"), Catalog.read(made_survey / "catalog.parquet"))
+    return {
+        "RUN": folder / "run",
+        "CSV": folder / "p.csv",
+        "SURVEY": made_survey,
+        "X": folder / "x",
+        "X.json": folder / "x.json",
+        "X.txt": folder / "x.txt",
+    }
