@@ -20,7 +20,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -184,9 +184,10 @@ def execute(
     jobs = (run.job(graph, anew) for graph in graphs if only(graph))
     try:
         for result in executor.map(do_tile, jobs, _lost):
-            results.append(result)
             run.log("tile", **_event(result))
             watch(result)
+            # The marker keeps the rows of what is done; over a state they would fill the memory here.
+            results.append(result if result.failures else replace(result, rows=()))
     finally:
         # Also after an interruption: what is done is in the tables.
         write_tables(run.path, *outcome(run, results))
