@@ -33,16 +33,18 @@ class Watch:
         self.start = self.said = time.monotonic()
         self.progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(24),
             MofNCompleteColumn(),
+            TextColumn("tiles,"),
             TimeElapsedColumn(),
-            TextColumn("ETA"),
+            TextColumn("spent,"),
             TimeRemainingColumn(),
+            TextColumn("left:"),
+            TextColumn("{task.description}", markup=False),
             console=console,
             disable=not console.is_terminal,
         )
-        self.bar = self.progress.add_task("tiles", total=total)
+        self.bar = self.progress.add_task("starting", total=total)
 
     def __enter__(self) -> Watch:
         self.progress.start()
