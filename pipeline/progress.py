@@ -6,7 +6,8 @@ import time
 from collections import Counter
 from types import TracebackType
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -16,6 +17,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from pipeline.work import TileResult
 
@@ -39,21 +41,24 @@ class Watch:
             TimeElapsedColumn(),
             TextColumn("spent,"),
             TimeRemainingColumn(),
-            TextColumn("left:"),
-            TextColumn("{task.description}", markup=False),
+            TextColumn("left"),
             console=console,
-            disable=not console.is_terminal,
         )
-        self.bar = self.progress.add_task("starting", total=total)
+        self.bar = self.progress.add_task("tiles", total=total)
+        # Counts have a line of their own: beside the bar they would squeeze its figures.
+        self.below = Text("  starting", overflow="ellipsis", no_wrap=True)
+        self.live = Live(Group(self.progress, self.below), console=console) if console.is_terminal else None
 
     def __enter__(self) -> Watch:
-        self.progress.start()
+        if self.live:
+            self.live.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.progress.stop()
+        if self.live:
+            self.live.stop()
 
     def __call__(self, result: TileResult) -> None:
         """Take note of a tile."""
@@ -61,8 +66,9 @@ class Watch:
         self.stages.update(result.computed)
         for failure in result.failures:
             self._line(f"failed {failure.notice}")
-        self.progress.update(self.bar, advance=1, description=self.counts())
-        if not self.console.is_terminal and time.monotonic() - self.said > PLAIN_EVERY_S:
+        self.progress.update(self.bar, advance=1)
+        self.below.plain = f"  {self.counts()}"
+        if not self.live and time.monotonic() - self.said > PLAIN_EVERY_S:
             self.said = time.monotonic()
             self._line(self.line())
 
