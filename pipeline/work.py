@@ -151,7 +151,9 @@ class Pull:
         try:
             self.store.put(node, result, spent)
         except OSError as error:
-            failed = StageError(_failure(self.graph.tile, "store", error))
+            # The same for every artefact: a full disk is one failure, not one for each variant.
+            full = OSError(error.errno, error.strerror, str(self.store.root))
+            failed = StageError(_failure(self.graph.tile, "store", full))
             self.faults[node.fingerprint] = failed
             raise failed from error
 

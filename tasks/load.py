@@ -19,7 +19,7 @@ from catalog.crs import Unit, height_unit
 from catalog.raster_files import quiet
 from tasks import options
 from tasks.errors import TaskError
-from tasks.patch import Patch, misfit, onto, read
+from tasks.patch import Patch, Unreadable, misfit, onto, read
 from tasks.types import Bools, Floats, TileData
 
 VERSION = 1
@@ -76,8 +76,8 @@ def load(tile: Tile, options: Options) -> TileData:
     Raises
     ------
     TaskError
-        If a file is missing, broken or in another CRS, the layers differ in their unit of height, the
-        tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
+        If a file that the tile needs is missing or broken, one is in another CRS, the layers differ in
+        their unit of height, the tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
     """
     for name in ("dsm", "dtm"):
         if tile.layer(name) is None:
@@ -106,13 +106,20 @@ def load(tile: Tile, options: Options) -> TileData:
 
 def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     values = np.full(grid.shape, np.nan)
+    reached = np.zeros(grid.shape, bool)
+    broken: list[Unreadable] = []
     resampling = Resampling.bilinear if layer.name in HEIGHTS else Resampling.nearest
     patches: list[Patch] = []
     cut = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
-        patch = read(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
+        try:
+            patch = read(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
+        except Unreadable as error:
+            broken.append(error)
+            continue
         if patch is None:
             continue
+        reached |= _reached(patch, grid)
         if layer.name in HEIGHTS:
             patch, absurd = _metres(patch)
             cut += absurd
@@ -120,6 +127,9 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         np.copyto(values, onto(patch, grid, resampling), where=np.isnan(values))
         if not np.isnan(values).any():
             break
+    # Files are named for the ground around a tile, too: a broken one costs the tiles it lies on.
+    if broken and not reached[grid.window(tile.grid)].all():
+        raise TaskError(str(broken[0]), broken[0].file)
     if not patches:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         raise TaskError(
@@ -132,10 +142,20 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         for why in dict.fromkeys(misfit(p.lattice, grid) for p in patches)
         if why
     ]
+    notes += [f"the tile is whole without it: {error}" for error in broken]
     if cut:
         cells = "1 cell" if cut == 1 else f"{cut} cells"
         notes.append(f"{layer.name}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
     return _Mosaic(values, tuple(patches), tuple(notes))
+
+
+def _reached(patch: Patch, grid: Grid) -> Bools:
+    """Return the cells of the grid whose centres lie within the patch, with a value or not, ``(H, W)``."""
+    west, south, east, north = patch.lattice.bounds
+    inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
+        (west < grid.eastings) & (grid.eastings < east)
+    )
+    return inside
 
 
 def _metres(patch: Patch) -> tuple[Patch, int]:

@@ -21,6 +21,10 @@ from tasks.errors import TaskError
 from tasks.types import Floats
 
 
+class Unreadable(TaskError):
+    """A file that is missing or broken, so that nobody knows where it lies."""
+
+
 @dataclass(frozen=True)
 class Lattice:
     """Where a file's cells lie; like a `Grid`, but as the file has it."""
@@ -123,8 +127,10 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
 
     Raises
     ------
+    Unreadable
+        If the file is missing or broken.
     TaskError
-        If the file is missing, broken, rotated or in another CRS than the grid.
+        If it is rotated or in another CRS than the grid.
     """
     try:
         with rasterio.open(path) as src:
@@ -136,9 +142,9 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
             crs = src.crs.to_wkt() if src.crs else crs
     except (RasterioError, OSError) as error:
         if not path.exists():
-            raise TaskError(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
+            raise Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
         reason = str(error.__cause__ or error).partition("\n")[0]
-        raise TaskError(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
+        raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
     return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
 
 

@@ -7,6 +7,7 @@ travel as tags inside the files; names of files are for people. Heights are floa
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -139,9 +140,11 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
             dataset.update_tags(**tags)
         temporary.replace(path)
     except (OSError, RasterioIOError, CRSError) as error:
-        raise CatalogError(f"cannot write {path}: {error}") from error
+        # GDAL's own reason is the cause of rasterio's.
+        raise CatalogError(f"cannot write {path}: {error.__cause__ or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _read(path: Path) -> _File:

@@ -212,6 +212,28 @@ def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Pa
     assert line.removeprefix("failed ") in shown.out
 
 
+@pytest.mark.parametrize("name", ["dsm", "road_mask"])
+def test_a_file_cut_short_costs_no_neighbour(name, run, flexroad, survey, tmp_path):
+    """A catalog of rasters names for each tile the files around it as well, for a halo."""
+    into = survey.parent / "cut.json"
+    words = ["--road-mask", "road_mask/*.tif", "--tile-size", 60, "-o", into]
+    flexroad("catalog", "rasters", survey.parent, "--dsm", "dsm/*.tif", "--dtm", "dtm/*.tif", *words)
+    first = Catalog.read(into).tiles[0]
+    assert len(first.layer(name).files) == 4
+    path = survey.parent / name / f"{first.id}.tif"
+    path.write_bytes(path.read_bytes()[:300])
+    fault = Fault(None, name, f"{name} {name}/{first.id}.tif cannot be read: .*; fetch it again")
+    only_its_tile_failed(run(catalog=into), first, fault, flexroad, tmp_path / "run", str(path))
+    halo = tmp_path / "halo.yaml"
+    halo.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
+    said = run(catalog=into, config=halo)
+    assert [line.split(":")[0] for line in said.errors] == [f"failed {first.id}"]
+    other = Catalog.read(into).tiles[3].id
+    item = json.loads((tmp_path / "run" / "tiles" / other / "item.json").read_text())
+    (note,) = item["properties"]["flexroad:notes"]
+    assert note.startswith(f"the tile is whole without it: {name} {name}/{first.id}.tif cannot be read")
+
+
 @pytest.mark.parametrize(
     ("name", "stage", "message"),
     [
@@ -484,7 +506,7 @@ def test_a_full_disk(size, mount, run, flexroad, tmp_path):
     said = run(out=out)
     assert said.code == 1
     assert len({line.split(":")[0] for line in said.errors}) == len(said.errors) > 0
-    assert all("No space left on device" in line for line in said.errors)
+    assert all(f"No space left on device: '{out}/" in line for line in said.errors)
     assert not list(out.rglob("*.tmp"))
     subprocess.run(["mount", "-o", "remount,size=20m", out.parent], check=True)
     again = flexroad("rerun", out, "--executor", "serial")
@@ -658,16 +680,8 @@ def test_a_damaged_run_is_said_and_mended(name, content, status, message, run, f
 
 
 def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
-    words = [
-        "--config",
-        quick_config,
-        "--catalog",
-        survey,
-        "--store",
-        tmp_path / "store",
-        "--executor",
-        "serial",
-    ]
+    words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
+    words += ["--store", tmp_path / "store"]
     call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", *map(str, words), "--out"]
     both = [
         subprocess.Popen([*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
