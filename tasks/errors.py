@@ -20,6 +20,3 @@ class TaskError(Exception):
         super().__init__(message)
         self.file = file
         self.layer = layer
-
-    def __reduce__(self) -> tuple[type[TaskError], tuple[str, str, str]]:
-        return type(self), (str(self), self.file, self.layer)
