@@ -27,6 +27,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="Turn aerial geodata into smooth, light, georeferenced 3D road surfaces, for many tiles at once.",
 )
 catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
@@ -340,7 +341,9 @@ def query(
     """Tell height, unit normal, tile and class of the ground under points, as CSV."""
     from pipeline.query import query_csv
 
-    query_csv(path, points, variant, sys.stdout)
+    missed = query_csv(path, points, variant, sys.stdout)
+    if missed:
+        typer.echo(f"note: {missed} points lie on no finished tile; their columns are empty", err=True)
 
 
 # --- config -------------------------------------------------------------------------------------------

@@ -109,8 +109,13 @@ class Ground:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
 
 
-def query_csv(run: Path, csv: Path, variant: str | None, out: TextIO) -> None:
+def query_csv(run: Path, csv: Path, variant: str | None, out: TextIO) -> int:
     """Answer a CSV of points with a CSV: its columns, then height_m, nx, ny, nz, tile, class.
+
+    Returns
+    -------
+    int
+        How many points lie on no finished tile.
 
     Raises
     ------
@@ -132,3 +137,4 @@ def query_csv(run: Path, csv: Path, variant: str | None, out: TextIO) -> None:
     table["tile"] = answer.tile
     table["class"] = answer.kind
     table.to_csv(out, index=False, float_format="%.9g")
+    return int((answer.tile == "").sum())

@@ -1,5 +1,6 @@
 """Bad input, bad disks, bad words: one clear line, and no more lost than the tile it is about."""
 
+import io
 import json
 import re
 import shutil
@@ -19,7 +20,11 @@ from rasterio.warp import transform_bounds
 from catalog import Catalog, Grid, Tile
 from catalog.sources import prepared
 from pipeline.cli import main
+from pipeline.config import compose
+from pipeline.execute import SerialExecutor
+from pipeline.run import Run, execute
 from pipeline.tables import read_metrics
+from tests.conftest import QUICK
 from tests.make_rasters import write
 
 
@@ -311,7 +316,7 @@ def test_odd_input_is_done_with_finite_figures(spoil, note, run, survey, tmp_pat
     tile = Catalog.read(survey).tiles[1]
     spoil(tile)
     said = run("--tile", tile.id)
-    assert (said.code, said.errors) == (0, [])
+    assert (said.code, said.err) == (0, "")
     rows = read_metrics(tmp_path / "run")
     assert set(rows.status) == {"done"}
     flexroad = rows[rows.variant == "flexroad"].iloc[0]
@@ -373,7 +378,7 @@ def test_a_tile_of_2_by_2_cells(run, tmp_path):
     assert run(catalog=catalog, config=config, out=tmp_path / "linear").code == 0
 
 
-@pytest.mark.parametrize("tile_id", ["Köln 1/2", "../../escape", "...", "a\\b:c*?", "x" * 80])
+@pytest.mark.parametrize("tile_id", ["Köln 1/2", "../../escape", "..."])
 def test_a_tile_id_that_makes_no_file_name(tile_id, run, flexroad, survey, tmp_path):
     first, *_ = Catalog.read(survey).tiles
     Catalog((replace(first, id=tile_id),)).write(survey)
@@ -663,9 +668,10 @@ def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_
         ("tiles/*/*.glb", "", 0, "4 pending"),
     ],
 )
-def test_a_damaged_run_is_said_and_mended(name, content, status, message, run, flexroad, tmp_path):
-    out = tmp_path / "run"
-    run()
+def test_a_damaged_run_is_said_and_mended(
+    name, content, status, message, run, flexroad, finished, made_survey, tmp_path
+):
+    out = shutil.copytree(finished, tmp_path / "run")
     for path in list(out.glob(name)):
         path.unlink() if content is None else path.write_text(content)
     said = flexroad("status", out)
@@ -673,7 +679,7 @@ def test_a_damaged_run_is_said_and_mended(name, content, status, message, run, f
     assert message in said.out + said.err
     report = flexroad("report", out)
     assert report.code == (2 if name == "metrics.parquet" else status)
-    mended = run()
+    mended = run(catalog=made_survey / "catalog.parquet")
     assert mended.code == 0
     assert "4 tiles: 4 done" in mended.out
     assert flexroad("report", out).code == 0
@@ -724,16 +730,33 @@ def test_slips(words, message, slips_at, flexroad):
     assert len([line for line in said.err.splitlines() if "rror: " in line]) == 1
 
 
-@pytest.fixture(scope="module")
-def slips_at(made_survey, tmp_path_factory):
-    from pipeline.config import compose
-    from pipeline.run import Run
+def test_points_off_the_run_are_told_of(run, flexroad, survey, tmp_path):
+    grid = Catalog.read(survey).tiles[0].grid
+    points = tmp_path / "points.csv"
+    points.write_text(f"easting,northing\n{grid.west + 9},{grid.south + 9}\n7.1,50.2\n,\ninf,0\n")
+    run()
+    said = flexroad("query", tmp_path / "run", "--points", points)
+    assert said.code == 0
+    assert said.err == "note: 3 points lie on no finished tile; their columns are empty\n"
+    table = pd.read_csv(io.StringIO(said.out))
+    assert list(table.height_m.isna()) == [False, True, True, True]
 
+
+@pytest.fixture(scope="module")
+def finished(made_survey, tmp_path_factory) -> Path:
+    """A whole run, not to be touched."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    made = Run.create(out, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
+    execute(made, SerialExecutor())
+    return out
+
+
+@pytest.fixture(scope="module")
+def slips_at(made_survey, finished, tmp_path_factory):
     folder = tmp_path_factory.mktemp("slips")
     (folder / "p.csv").write_text("x,y\n1,2\n")
-    Run.create(folder / "run", compose({}, "default"), Catalog.read(made_survey / "catalog.parquet"))
     return {
-        "RUN": folder / "run",
+        "RUN": finished,
         "CSV": folder / "p.csv",
         "SURVEY": made_survey,
         "X": folder / "x",
