@@ -198,10 +198,10 @@ def run_command(
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
     from catalog import Catalog
     from pipeline.config import load_config
-    from pipeline.run import Run
+    from pipeline.run import Run, asked, select
 
-    chosen = load_config(config)
-    tiles = Catalog.read(catalog).select(tile or (), bbox)
+    chosen, whole = load_config(config), Catalog.read(catalog)
+    tiles = whole.select(tile or (), bbox)
     if not tiles.tiles:
         raise ConfigError(f"catalog {catalog} has no tiles")
     if dry_run:
@@ -212,8 +212,10 @@ def run_command(
         for line in plan(tile_graphs(tiles, chosen, checksum), root, out):
             _say(line)
         return
-    run = Run.create(out, chosen, tiles, store, checksum)
-    _carry_out(run, _executor(executor, workers, scheduler))
+    some = bool(tile) or bbox is not None
+    run = Run.create(out, chosen, asked(out, whole, tiles) if some else whole, store, checksum)
+    only = select(run, [tile.id for tile in tiles.tiles], failed=False)
+    _carry_out(run, _executor(executor, workers, scheduler), only)
 
 
 @app.command()
@@ -253,15 +255,18 @@ def _executor(name: str, workers: int | None, scheduler: str | None) -> Executor
 def _carry_out(
     run: Run,
     executor: Executor,
-    only: Callable[[TileGraph], bool] | None = None,
+    only: Callable[[TileGraph], bool],
     anew: frozenset[str] = frozenset(),
 ) -> None:
+    import signal
+
     from rich.console import Console
 
     from pipeline.progress import Watch
     from pipeline.run import execute, summary
 
-    only = only or (lambda graph: True)
+    # An operator's `kill` ends the run as Ctrl-C does: workers gone, tables written.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     total = sum(1 for graph in run.graphs() if only(graph))
     folder = shlex.quote(str(run.path))
     results: list[TileResult]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
@@ -102,14 +103,29 @@ class DaskExecutor:
                     n_workers=self.workers or os.cpu_count() or 1,
                     threads_per_worker=1,
                     processes=True,
-                    dashboard_address="127.0.0.1:0",
+                    dashboard_address=None,
                     local_directory=scratch,
                     env=ONE_THREAD,
                     silence_logs=logging.CRITICAL,
                 )
                 stack.enter_context(cluster)
                 client = stack.enter_context(Client(cluster))
+                client.register_plugin(_deaf_to_ctrl_c())
             yield client
+
+
+def _deaf_to_ctrl_c() -> Any:
+    """Return a plugin for workers of one's own terminal, which sends Ctrl-C to all of its processes.
+
+    The client hears it and ends them; they would only print tracebacks.
+    """
+    from distributed import WorkerPlugin
+
+    class DeafToCtrlC(WorkerPlugin):  # type: ignore[misc]
+        def setup(self, worker: Any) -> None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    return DeafToCtrlC()
 
 
 def _submit(client: Any, function: Callable[[J], R], job: J, running: Any) -> Any:
@@ -125,5 +141,6 @@ def _result(future: Any, job: J, lost: Callable[[J, str], R]) -> R:
     try:
         result: R = future.result()
     except KilledWorker as error:
-        return lost(job, f"the worker process died {error.allowed_failures + 1} times on this tile")
+        times = error.allowed_failures + 1
+        return lost(job, f"the worker process died {times} times here; too little memory is the usual cause")
     return result

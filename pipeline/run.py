@@ -250,6 +250,17 @@ def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[TileGraph]
     return chosen
 
 
+def asked(path: Path, whole: Catalog, wanted: Catalog) -> Catalog:
+    """Return the tiles a run is about when some tiles of a catalog are asked for.
+
+    Those, and those it was asked for before that the catalog still has: their results stay in the tables.
+    """
+    record = path / "catalog.parquet"
+    before = {tile.id for tile in Catalog.read(record).tiles} if record.exists() else set()
+    known = before | {tile.id for tile in wanted.tiles}
+    return Catalog(tuple(tile for tile in whole.tiles if tile.id in known))
+
+
 def versions() -> dict[str, str]:
     """Return the versions of what computes, for the record."""
     found = {"python": platform.python_version()}
@@ -264,7 +275,7 @@ def versions() -> dict[str, str]:
 def _lost(job: Job, why: str) -> TileResult:
     """Make the failed result of a tile whose worker died."""
     graph = job.graph
-    failure = Failure(graph.tile.id, "worker", "WorkerDied", f"{why}; too little memory is the usual cause")
+    failure = Failure(graph.tile.id, "worker", "WorkerDied", why)
     rows = tuple(failed_row(graph, variant, failure.line) for variant in graph.variants)
     give_up(job, rows, [failure])
     return TileResult(graph.tile.id, "failed", rows, (failure,))

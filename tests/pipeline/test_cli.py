@@ -158,6 +158,29 @@ def test_only_the_tiles_asked_for(made_survey, tmp_path):
     assert one.id not in said
 
 
+def test_asking_for_a_tile_keeps_the_others_of_the_run(survey, tmp_path):
+    catalog = Catalog.read(survey)
+    config = tmp_path / "c.yaml"
+    config.write_text("fit: {control_points: [12, 12], iterations: 5}\n")
+    words = [
+        "run",
+        "--config",
+        config,
+        "--catalog",
+        survey,
+        "--out",
+        tmp_path / "run",
+        "--executor",
+        "serial",
+    ]
+    one, two = catalog.tiles[3].id, catalog.tiles[1].id
+    assert "1 tiles: 1 done (0 of them before)" in flexroad(*words, "--tile", one)
+    assert "2 tiles: 2 done (0 of them before)" in flexroad(*words, "--tile", two)
+    table = pd.read_parquet(tmp_path / "run" / "metrics.parquet")
+    assert table.tile_id.tolist() == [two, one]
+    assert "4 tiles: 4 done (2 of them before)" in flexroad(*words)
+
+
 def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
     catalog = Catalog.read(survey)
     tile = catalog.tiles[2]

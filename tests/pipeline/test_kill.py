@@ -90,11 +90,16 @@ def test_a_worker_is_killed(place, undisturbed, tmp_path):
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
 
 
-def test_an_interrupt_ends_in_seconds_and_keeps_what_is_done(place, undisturbed, tmp_path):
+@pytest.mark.parametrize("how", ["ctrl-c", "kill"])
+def test_an_interrupt_ends_in_seconds_and_keeps_what_is_done(place, undisturbed, tmp_path, how):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(place, out), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command(place, out), start_new_session=True, stderr=subprocess.PIPE, text=True)
     until(lambda: len(markers(out)) >= 1)
-    process.send_signal(signal.SIGINT)
+    if how == "ctrl-c":
+        # A terminal sends it to all processes of the command, workers too.
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.terminate()
     _, said = process.communicate(timeout=30)
     assert process.returncode == 130
     assert "interrupted" in said
