@@ -178,6 +178,7 @@ def item(tile: Tile, root: str = "") -> Item:
             "proj:shape": [grid.height, grid.width],
             "proj:transform": [grid.cell, 0.0, west, 0.0, -grid.cell, north],
             "flexroad:stratum": tile.stratum,
+            "flexroad:dataset": tile.dataset,
             "flexroad:datetime_assumed": tile.datetime_assumed,
             "flexroad:root": root,
         },
@@ -210,6 +211,8 @@ def _tile(item: Item, folder: str) -> Tile:
         datetime=datetime.fromisoformat(properties["datetime"]),
         datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
         stratum=properties["flexroad:stratum"],
+        # Catalogs written before reports named their data lack it.
+        dataset=properties.get("flexroad:dataset") or "",
     )
 
 

@@ -46,6 +46,8 @@ class Tile:
     """True if no tag told the date and the file's time stands in."""
     stratum: str = ""
     """Class of area for reports (urban, suburban, rural), or empty."""
+    dataset: str = ""
+    """What the tile was taken from, as reports say it ("GeRoD"), or empty where nothing tells."""
 
     def layer(self, name: str) -> Layer | None:
         """Return the named layer, or None if the tile has none."""

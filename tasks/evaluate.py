@@ -1,10 +1,13 @@
 """Compare a mesh with the reference: the paper's "Evaluation Metrics".
 
 Distances are vertical, at the reference's cell centres in the tile's core; a cell, like the face whose
-centroid lies in it, is road by the evaluation mask: the reference's own, else the raw segmented one.
+centroid lies in it, is road by the evaluation mask: the reference's own, else the raw segmented one, which
+is also the paper's.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -25,6 +28,11 @@ class Options(base.Options):
     """What is measured beside the paper's figures."""
 
     nearest: bool = Field(False, description="also measure the distance in space (slower)")
+    classes: Literal["reference", "segmented"] = Field(
+        "reference",
+        description="what is road: reference: by the true mask, else the raw segmented one; "
+        "segmented: by the raw segmented one, as in the paper",
+    )
 
 
 def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Metrics:
@@ -37,9 +45,9 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
     data : TileData
         Its reference heights, or else its DTM, are the truth.
     road : RoadMask
-        Its raw mask stands in where the tile has no reference mask.
+        Its raw mask classes the cells if so asked for, or where the tile has no reference mask.
     options : Options
-        Whether to measure distances in space.
+        Whether to measure distances in space, and which mask says what is road.
 
     Returns
     -------
@@ -48,7 +56,8 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
         NaN for a class without any.
     """
     truth = data.dtm if data.reference is None else data.reference
-    is_road = road.mask if data.reference_road is None else data.reference_road
+    known_road = data.reference_road if options.classes == "reference" else None
+    is_road = road.mask if known_road is None else known_road
     window = data.grid.window(data.core)
     heights = np.ascontiguousarray(truth[window]) - mesh.origin[2]
     off = drape(mesh, data.core) - heights

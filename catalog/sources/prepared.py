@@ -29,6 +29,7 @@ HEIGHTS = ("dsm", "dtm", "reference")
 MASKS = ("road_mask", "reference_road")
 
 TILE_TAG, LAYER_TAG, STRATUM_TAG = "FLEXROAD_TILE", "FLEXROAD_LAYER", "FLEXROAD_STRATUM"
+DATASET_TAG = "FLEXROAD_DATASET"
 DATE_TAG, DATE_FORMAT = "TIFFTAG_DATETIME", "%Y:%m:%d %H:%M:%S"
 """TIFF knows no time zone: ours is UTC."""
 
@@ -40,6 +41,7 @@ def write_tile(
     layers: Mapping[str, NDArray[Any]],
     stratum: str = "",
     date: datetime | None = None,
+    dataset: str = "",
 ) -> None:
     """Write a tile's layers; files already there are replaced, each at once.
 
@@ -58,6 +60,8 @@ def write_tile(
         Class of area for reports.
     date : datetime, optional
         When the data was taken, with a time zone.
+    dataset : str
+        What reports call the data.
 
     Raises
     ------
@@ -67,7 +71,7 @@ def write_tile(
     """
     if not tile_id or Path(tile_id).name != tile_id:
         raise CatalogError(f"tile id {tile_id!r} makes no file name in {folder}; leave out slashes")
-    tags = {TILE_TAG: tile_id, STRATUM_TAG: stratum}
+    tags = {TILE_TAG: tile_id, STRATUM_TAG: stratum, DATASET_TAG: dataset}
     if date is not None:
         tags[DATE_TAG] = date.astimezone(UTC).strftime(DATE_FORMAT)
     for name, array in layers.items():
@@ -104,6 +108,7 @@ class _File:
     tile_id: str
     layer: str
     stratum: str
+    dataset: str
     date: datetime | None
     grid: Grid
 
@@ -166,6 +171,7 @@ def _read(path: Path) -> _File:
         tile_id=tags[TILE_TAG],
         layer=tags[LAYER_TAG],
         stratum=tags.get(STRATUM_TAG, ""),
+        dataset=tags.get(DATASET_TAG, ""),
         date=_date(path, tags.get(DATE_TAG)),
         grid=Grid(crs.to_string(), transform.c, transform.f, cell, width, height),
     )
@@ -192,7 +198,7 @@ def _tile(files: Iterable[_File], root: Path) -> Tile:
                 f"{by_layer[file.layer].path} and {file.path} both say they are layer {file.layer} "
                 f"of tile {file.tile_id}; remove one"
             )
-        for what in ("grid", "stratum"):
+        for what in ("grid", "stratum", "dataset"):
             mine, other = getattr(first, what), getattr(file, what)
             if mine != other:
                 raise CatalogError(
@@ -213,4 +219,5 @@ def _tile(files: Iterable[_File], root: Path) -> Tile:
         datetime=date,
         datetime_assumed=first.date is None,
         stratum=first.stratum,
+        dataset=first.dataset,
     )

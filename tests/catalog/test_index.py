@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import geopandas
@@ -17,7 +18,9 @@ def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
         for name in LAYERS
         if name in layers
     )
-    return Tile(f"{east}_5629250", grid, made, str(root), datetime(2020, 5, 1, 10, tzinfo=UTC), True, "urban")
+    return Tile(
+        f"{east}_5629250", grid, made, str(root), datetime(2020, 5, 1, 10, tzinfo=UTC), True, "urban", "made"
+    )
 
 
 @pytest.mark.parametrize("name", ["catalog.parquet", "catalog.json", "catalog.geojson"])
@@ -25,6 +28,14 @@ def test_round_trip(tmp_path, name):
     tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS))
     Catalog(tiles).write(tmp_path / name)
     assert Catalog.read(tmp_path / name).tiles == tiles
+
+
+def test_a_catalog_that_does_not_name_its_data_can_be_read(tmp_path):
+    Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
+    items = json.loads((tmp_path / "c.json").read_text())
+    del items["features"][0]["properties"]["flexroad:dataset"]
+    (tmp_path / "c.json").write_text(json.dumps(items))
+    assert Catalog.read(tmp_path / "c.json").tiles == (replace(tile(295500, tmp_path), dataset=""),)
 
 
 def test_round_trip_of_a_crs_without_a_code(tmp_path):

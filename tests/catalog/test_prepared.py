@@ -24,11 +24,12 @@ def road(grid: Grid = GRID) -> np.ndarray:
 
 
 def test_round_trip(tmp_path):
-    write_tile(tmp_path, "b", GRID, {"dsm": heights(), "road_mask": road()}, "urban", TAKEN)
+    write_tile(tmp_path, "b", GRID, {"dsm": heights(), "road_mask": road()}, "urban", TAKEN, "made")
     write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
     first, second = index(tmp_path)
     assert (first.id, second.id) == ("a", "b")
-    assert (second.grid, second.stratum) == (GRID, "urban")
+    assert (second.grid, second.stratum, second.dataset) == (GRID, "urban", "made")
+    assert first.dataset == ""
     assert second.datetime == TAKEN
     assert not second.datetime_assumed
     assert second.root == str(tmp_path)

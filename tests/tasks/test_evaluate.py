@@ -113,6 +113,21 @@ def test_reference_layers_take_the_place_of_dtm_and_mask():
     assert (given_layers.l2_road_m, given_layers.l2_terrain_m) == pytest.approx((3, 2))
 
 
+def test_the_segmented_mask_classes_cells_and_faces_if_asked_for():
+    grid = ground()
+    layers = {"reference": np.where(western_half(grid), 161.0, 165.0), "reference_road": ~western_half(grid)}
+    segmented = western_half(grid)
+    segmented[:, 10:] = False
+    mesh = on_lattice(grid, lambda x, y: 160 + 0.01 * (x - 295500) ** 2)
+    true = figures(mesh, grid, layers["reference"], segmented, **layers)
+    by_mask = figures(mesh, grid, layers["reference"], segmented, Options(classes="segmented"), **layers)
+    only_mask = figures(mesh, grid, layers["reference"], segmented, reference=layers["reference"])
+    # As text, for NaN is unlike itself.
+    assert str(by_mask) == str(only_mask)
+    assert (true.road_fraction, by_mask.road_fraction) == (0.5, 0.25)
+    assert true.mad_road_deg != by_mask.mad_road_deg
+
+
 def test_unknown_reference_cells_count_for_nothing():
     grid = ground()
     truth = np.full(grid.shape, 161.0)
