@@ -281,7 +281,7 @@ def _carry_out(
         raise typer.Exit(1) from None
     how = summary(run, results)
     _say(
-        f"{how.tiles} tiles: {how.done} done ({how.cached} of them before), {how.failed} failed, "
+        f"{how.tiles} tiles: {how.done} done ({how.cached} cached), {how.failed} failed, "
         f"{how.pending} pending; results in {run.path}"
     )
     if results and all(result.status == "cached" for result in results):

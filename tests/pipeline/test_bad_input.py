@@ -197,7 +197,7 @@ def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Pa
     assert line.startswith(f"failed {tile.id}: {fault.stage}: TaskError: ")
     assert re.search(fault.message, line)
     assert line.endswith(f"  [{file}]" if file else line[-1])
-    assert "3 done (0 of them before), 1 failed, 0 pending" in said.out
+    assert "3 done (0 cached), 1 failed, 0 pending" in said.out
 
     rows = read_metrics(out)
     bad = rows[rows.tile_id == tile.id]
@@ -649,7 +649,7 @@ def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_
     (tmp_path / "away").mkdir()
     monkeypatch.chdir(tmp_path / "away")
     again = flexroad("rerun", "../my runs/1", "--from", "sample", "--executor", "serial")
-    assert "4 done (0 of them before)" in again.out
+    assert "4 done (0 cached)" in again.out
     assert not list((tmp_path / "away").iterdir())
 
 

@@ -42,7 +42,7 @@ def finished(made_survey, tmp_path_factory) -> Path:
     said = flexroad(
         "run", "--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, "--workers", 2
     )
-    assert "4 tiles: 4 done (0 of them before), 0 failed, 0 pending" in said
+    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said
     return out
 
 
@@ -65,7 +65,7 @@ def test_status(finished):
 
 def test_rerun_says_that_nothing_changed(finished):
     said = flexroad("rerun", finished, "--executor", "serial")
-    assert "4 done (4 of them before)" in said
+    assert "4 done (4 cached)" in said
     assert "nothing had changed" in said
 
 
@@ -174,11 +174,11 @@ def test_asking_for_a_tile_keeps_the_others_of_the_run(survey, tmp_path):
         "serial",
     ]
     one, two = catalog.tiles[3].id, catalog.tiles[1].id
-    assert "1 tiles: 1 done (0 of them before)" in flexroad(*words, "--tile", one)
-    assert "2 tiles: 2 done (0 of them before)" in flexroad(*words, "--tile", two)
+    assert "1 tiles: 1 done (0 cached)" in flexroad(*words, "--tile", one)
+    assert "2 tiles: 2 done (0 cached)" in flexroad(*words, "--tile", two)
     table = pd.read_parquet(tmp_path / "run" / "metrics.parquet")
     assert table.tile_id.tolist() == [two, one]
-    assert "4 tiles: 4 done (2 of them before)" in flexroad(*words)
+    assert "4 tiles: 4 done (2 cached)" in flexroad(*words)
 
 
 def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
@@ -191,7 +191,7 @@ def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
     words = ["--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
     said = flexroad("run", *words, expect=1)
     assert f"failed {tile.id}: load: TaskError: " in said
-    assert "3 done (0 of them before), 1 failed" in said
+    assert "3 done (0 cached), 1 failed" in said
     (failure,) = json.loads(flexroad("status", tmp_path / "run", "--json"))["failures"]
     assert (failure["tile_id"], failure["stage"]) == (tile.id, "load")
     assert failure["file"] == str(path)
