@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,8 +13,9 @@ from pathlib import Path
 
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.warp import transform_bounds
 
-from catalog.crs import in_plan
+from catalog.crs import in_plan, plan_unit, short, utm_of
 from catalog.errors import CatalogError
 from catalog.grid import Bounds
 
@@ -23,6 +24,8 @@ GDAL = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
     # GeoTIFF 1.0 files keep their vertical CRS to themselves otherwise.
     "GTIFF_REPORT_COMPD_CS": "YES",
+    # GDAL would leave a note of a packed file's size beside it.
+    "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
 }
 
 
@@ -84,7 +87,22 @@ def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[Ra
     CatalogError
         If nothing matches or is usable, or a file without a CRS meets no ``crs``.
     """
-    paths = _matching(root, layer, pattern)
+    found, notes = opened(root, layer, matching(root, layer, pattern), crs)
+    if not found:
+        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {root}; {notes[0]}")
+    return found, notes
+
+
+def opened(
+    root: Path, layer: str, paths: Iterable[Path], crs: str | None
+) -> tuple[list[RasterFile], list[str]]:
+    """Open files of a layer, each once; return those that can be used, and what was skipped and why.
+
+    Raises
+    ------
+    CatalogError
+        If a file without a CRS meets no ``crs``.
+    """
     found: list[RasterFile] = []
     skipped: dict[str, list[str]] = defaultdict(list)
     with quiet():
@@ -93,10 +111,7 @@ def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[Ra
                 found.append(_open(root, path, crs))
             except _Skip as reason:
                 skipped[str(reason)].append(path.relative_to(root).as_posix())
-    notes = [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
-    if not found:
-        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {root}; {notes[0]}")
-    return found, notes
+    return found, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
 
 
 def some(names: Sequence[str]) -> str:
@@ -109,7 +124,14 @@ def _option(layer: str) -> str:
     return "--" + layer.replace("_", "-")
 
 
-def _matching(root: Path, layer: str, pattern: str) -> list[Path]:
+def matching(root: Path, layer: str, pattern: str) -> list[Path]:
+    """Return the files that match a glob pattern relative to ``root``, by name.
+
+    Raises
+    ------
+    CatalogError
+        If there is none; the line shows what there is.
+    """
     try:
         paths = sorted(path for path in root.glob(pattern) if path.is_file())
     except (ValueError, NotImplementedError) as error:
@@ -166,3 +188,22 @@ def _taken(tags: Mapping[str, str]) -> datetime | None:
 def zoned(date: datetime) -> datetime:
     """Return the date with a time zone; UTC where it has none."""
     return date if date.tzinfo else date.replace(tzinfo=UTC)
+
+
+def require_metric(file: RasterFile) -> None:
+    """Refuse a file whose plan counts in anything but metres.
+
+    Raises
+    ------
+    CatalogError
+        The line names the command that reprojects it.
+    """
+    unit, metres = plan_unit(file.crs)
+    if unit in ("metre", "meter") and metres == 1.0:
+        return
+    units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
+    zone = utm_of(transform_bounds(file.crs, "EPSG:4326", *file.bounds))
+    raise CatalogError(
+        f"{file.name} is in {short(file.crs)}, which counts in {units}; "
+        f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}"
+    )

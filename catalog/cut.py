@@ -1,0 +1,222 @@
+"""The ground that rasters cover, cut into tiles on an absolute grid.
+
+A survey's files rarely have the tiles' cut, so each tile names every file that reaches into it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import compress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from rasterio.warp import transform_bounds
+
+from catalog.crs import same, short
+from catalog.errors import CatalogError
+from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from catalog.raster_files import RasterFile, require_metric, some, zoned
+from catalog.tile import LAYERS, Layer, Tile
+
+REACH_M = 100.0
+"""A tile names the files within this distance of it, so that `load` can read a halo around it."""
+
+MASKS = ("road_mask", "reference_road")
+
+
+@dataclass(frozen=True)
+class Indexed:
+    """The tiles of a folder."""
+
+    tiles: tuple[Tile, ...]
+    """In the order of their ids."""
+    notes: tuple[str, ...]
+    """What was skipped, left out or assumed, one line each."""
+
+
+class _Placed(NamedTuple):
+    file: RasterFile
+    bounds: Bounds
+    """In the tiles' CRS (m)."""
+
+
+class _Near(NamedTuple):
+    """The files of one layer near one tile, by name."""
+
+    files: list[RasterFile]
+    """Those within `REACH_M`."""
+    in_core: list[RasterFile]
+    """Those that reach into the tile itself by more than a lattice error."""
+    shared: NDArray[np.float64]
+    """What each of ``in_core`` shares with the tile, ``(n, 4)``: west, south, east, north (m)."""
+
+
+def cut(
+    root: Path,
+    found: Mapping[str, Sequence[RasterFile]],
+    *,
+    road_values: tuple[int, ...] = (),
+    tile_size_m: float = 250,
+    date: datetime | None = None,
+    crs: str | None = None,
+    min_cover: float = 0.25,
+    dataset: str = "",
+) -> Indexed:
+    """Cut the ground that the DSM files cover into tiles.
+
+    Parameters
+    ----------
+    root : Path
+        The folder that the files' names are relative to, resolved.
+    found : Mapping[str, Sequence[RasterFile]]
+        Layer name (see `catalog.LAYERS`) to its files, one at least; ``dsm`` must be there. Of files
+        that overlap, the first with a value wins.
+    road_values : tuple of int
+        Cell values that mean road in the masks; empty: every value but 0 and nodata.
+    tile_size_m : float
+        Edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
+    date : datetime, optional
+        When the data was taken; overrules the files.
+    crs : str, optional
+        CRS of files that carry none.
+    min_cover : float
+        Tiles of which the DSM's files cover less than this share (0 to 1) are left out.
+    dataset : str
+        What reports call the data.
+
+    Raises
+    ------
+    CatalogError
+        If the CRS is not in metres, the tiles' size does not fit the cells, or no tile is left.
+    """
+    dsm = found["dsm"]
+    grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]
+    require_metric(next(file for file in dsm if file.crs == grid_crs))
+    placed = {name: _place(found[name], grid_crs) for name in LAYERS if name in found}
+    notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs)]
+
+    grids = _cut(placed["dsm"], grid_crs, tile_size_m)
+    grids, left_out = _covered(grids, _near(grids, placed["dsm"]), min_cover)
+    near = {name: _near(grids, files) for name, files in placed.items()}
+    values = dict.fromkeys(MASKS, road_values)
+    tiles = []
+    for tile_id, grid in grids.items():
+        layers = tuple(
+            _layer(name, here[tile_id], values.get(name, ()), crs)
+            for name, here in near.items()
+            if here[tile_id].in_core
+        )
+        taken = _taken(near["dsm"][tile_id].in_core, date)
+        tiles.append(Tile(tile_id, grid, layers, str(root), *taken, dataset=dataset))
+    return Indexed(tuple(tiles), (*notes, *left_out, *_assumed(tiles)))
+
+
+def _place(files: Sequence[RasterFile], crs: str) -> list[_Placed]:
+    """Return where the files lie in the tiles' CRS."""
+    placed = [
+        _Placed(f, f.bounds if same(f.crs, crs) else transform_bounds(f.crs, crs, *f.bounds)) for f in files
+    ]
+    for file, bounds in placed:
+        if not np.isfinite(bounds).all():
+            raise CatalogError(
+                f"{file.name} in {short(file.crs)} lies nowhere in {short(crs)}, the CRS of the dsm; "
+                "leave it out of the pattern or correct its CRS with `gdal_edit.py -a_srs`"
+            )
+    return placed
+
+
+def _other_crs(layer: str, files: Sequence[_Placed], crs: str) -> list[str]:
+    """Return a note if files are in another CRS: they cost the tiles they lie on, not the others."""
+    others = [placed.file for placed in files if not same(placed.file.crs, crs)]
+    if not others:
+        return []
+    names = some([file.name for file in others])
+    return [f"{layer} is in {short(others[0].crs)}, not {short(crs)}, in {names}: tiles there will fail"]
+
+
+def _cut(dsm: Sequence[_Placed], crs: str, size_m: float) -> dict[str, Grid]:
+    """Return the tiles that the DSM files touch, by id, with the cells that most files have."""
+    cell = Counter(p.file.cell for p in dsm if p.file.crs == crs).most_common(1)[0][0]
+    grids: dict[str, Grid] = {}
+    for file, bounds in dsm:
+        if file.crs == crs and file.cell == cell:
+            extent = Grid(crs, bounds[0], bounds[3], cell, file.width, file.height)
+        else:
+            extent = Grid.covering(crs, bounds, cell)
+        grids.update(extent.tiles(size_m))
+    return dict(sorted(grids.items()))
+
+
+def _near(grids: Mapping[str, Grid], files: Sequence[_Placed]) -> dict[str, _Near]:
+    """Return the files near each tile, by tile id."""
+    cores = np.array([grid.bounds for grid in grids.values()])
+    theirs = np.array([placed.bounds for placed in files])
+    tree = shapely.STRtree(shapely.box(*theirs.T))
+    tile, file = tree.query(shapely.box(*(cores + REACH_M * np.array([-1, -1, 1, 1])).T))
+    order = np.lexsort((file, tile))
+    tile, file = tile[order], file[order]
+    shared = np.hstack(
+        [np.maximum(cores[tile, :2], theirs[file, :2]), np.minimum(cores[tile, 2:], theirs[file, 2:])]
+    )
+    cell = next(iter(grids.values())).cell
+    in_core = (shared[:, 2:] - shared[:, :2]).min(axis=1) > LATTICE_TOLERANCE * cell
+    ends = np.searchsorted(tile, np.arange(len(grids) + 1))
+    near = {}
+    for tile_id, begin, end in zip(grids, ends[:-1], ends[1:], strict=True):
+        here, core = [files[k].file for k in file[begin:end]], in_core[begin:end]
+        near[tile_id] = _Near(here, list(compress(here, core)), shared[begin:end][core])
+    return near
+
+
+def _covered(
+    grids: Mapping[str, Grid], near: Mapping[str, _Near], min_cover: float
+) -> tuple[dict[str, Grid], list[str]]:
+    """Return the tiles that the DSM's files cover well enough, and a note on the others."""
+    cover = {
+        tile_id: _area(near[tile_id].shared) / (grid.width * grid.cell) ** 2
+        for tile_id, grid in grids.items()
+    }
+    kept = {tile_id: grid for tile_id, grid in grids.items() if cover[tile_id] >= max(min_cover, 1e-9)}
+    thin = [tile_id for tile_id in grids if 0 < cover[tile_id] < min_cover]
+    note = (
+        f"left out {_count(thin)} covered less than {min_cover:.0%} by the DSM "
+        f"(--min-cover 0 keeps them): {some(thin)}"
+    )
+    if not kept:
+        raise CatalogError(f"no tile is left: {note}")
+    return kept, [note] if thin else []
+
+
+def _area(boxes: NDArray[np.float64]) -> float:
+    """Return the area under boxes, ``(n, 4)``; ground that several share counts once."""
+    return float(shapely.union_all(shapely.box(*boxes.T)).area)
+
+
+def _layer(name: str, near: _Near, values: tuple[int, ...], crs: str | None) -> Layer:
+    bare = any(not file.has_crs for file in near.files)
+    return Layer(name, tuple(file.name for file in near.files), values, crs if bare else None)
+
+
+def _taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
+    """Return when a tile's DSM was taken, and whether that is only assumed."""
+    if date is not None:
+        return zoned(date), False
+    told = [file.taken for file in dsm if file.taken]
+    return (told[0], False) if told else (dsm[0].modified, True)
+
+
+def _assumed(tiles: Sequence[Tile]) -> list[str]:
+    assumed = [tile.id for tile in tiles if tile.datetime_assumed]
+    if not assumed:
+        return []
+    return [f"no date in the dsm of {_count(assumed)}: the files' times stand in (--date sets it)"]
+
+
+def _count(ids: Sequence[str]) -> str:
+    return f"{len(ids)} tile" + "s" * (len(ids) != 1)
