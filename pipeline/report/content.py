@@ -127,8 +127,11 @@ def _reference(run: Run, done: set[str]) -> str:
         else f"Heights: {len(tiles) - truth} of {len(tiles)} tiles have no reference surface; "
         "their DTM stands in, which also supports the fit, so their terrain figures are optimistic"
     )
+    segmented = any(chain["evaluate"].classes == "segmented" for chain in run.config.chains.values())
     classes = (
-        "cells are classed by the catalog's reference road mask"
+        "cells are classed by the raw segmented mask (evaluate.classes)"
+        if segmented
+        else "cells are classed by the catalog's reference road mask"
         if roads == len(tiles)
         else f"cells of {len(tiles) - roads} of {len(tiles)} tiles are classed by the raw segmented mask"
     )
