@@ -6,6 +6,7 @@ A program of its own, imported by nothing: VTK ends the process it runs in where
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def main(folder: Path) -> str:
     for file in sorted(folder.glob("*.npz")):
         try:
             with np.load(file) as arrays:
-                picture = draw(arrays["vertices"], arrays["faces"], arrays["road"])
+                picture = draw(**arrays)
         except Exception as error:
             # One odd mesh must not cost the others their pictures.
             wrong.append(f"{file.name}: {error!r}")
@@ -42,7 +43,13 @@ def main(folder: Path) -> str:
     return "; ".join(wrong)
 
 
-def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[np.bool_]) -> Image.Image:
+def draw(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    road: NDArray[np.bool_],
+    colours: NDArray[np.uint8] | None = None,
+    size_px: Sequence[int] = SIZE_PX,
+) -> Image.Image:
     """Return one mesh, seen obliquely from the south-south-west.
 
     Parameters
@@ -53,13 +60,30 @@ def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[
         ``(F, 3)``, counter-clockwise from above.
     road : ndarray
         ``(F,)``, True on faces of road.
+    colours : ndarray, optional
+        ``(V, 3)``, red, green and blue at the vertices, in place of the colours of road and terrain.
+    size_px : sequence of int
+        Width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
     # Normals of the whole mesh, so that the classes meet without a seam.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
-    scale = OVERSAMPLING
-    plotter = pv.Plotter(off_screen=True, window_size=[n * scale for n in SIZE_PX], lighting="none")
+    size = [int(n) for n in size_px]
+    plotter = pv.Plotter(off_screen=True, window_size=[n * OVERSAMPLING for n in size], lighting="none")
     plotter.set_background(SKY)
+    if colours is None:
+        _add_classes(plotter, whole, road, _edge_opacity(vertices, faces[~road]))
+    else:
+        # More ambient light than on plain colours: these are read against a colour bar.
+        plotter.add_mesh(whole, scalars=colours, rgb=True, smooth_shading=True, ambient=0.45, diffuse=0.6)
+    _look(plotter, whole.bounds, size[0])
+    picture = Image.fromarray(plotter.screenshot(return_img=True))
+    plotter.close()
+    return picture.resize(size, Image.Resampling.LANCZOS)
+
+
+def _add_classes(plotter: Any, whole: Any, road: NDArray[np.bool_], edge_opacity: float) -> None:
+    """Add the terrain with its edges and the road without."""
     if not road.all():
         plotter.add_mesh(
             whole.extract_cells(~road),
@@ -67,17 +91,13 @@ def draw(vertices: NDArray[np.float64], faces: NDArray[np.int32], road: NDArray[
             smooth_shading=True,
             show_edges=True,
             edge_color=EDGE,
-            edge_opacity=_edge_opacity(vertices, faces[~road]),
+            edge_opacity=edge_opacity,
             line_width=1,
             ambient=0.25,
             diffuse=0.8,
         )
     if road.any():
         plotter.add_mesh(whole.extract_cells(road), color=ROAD, smooth_shading=True, ambient=0.3, diffuse=0.8)
-    _look(plotter, whole.bounds)
-    picture = Image.fromarray(plotter.screenshot(return_img=True))
-    plotter.close()
-    return picture.resize(SIZE_PX, Image.Resampling.LANCZOS)
 
 
 def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
@@ -88,7 +108,7 @@ def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> fl
     return float(np.clip(side_px / DENSE_PX, 0.1, 1.0)) * 0.7
 
 
-def _look(plotter: Any, bounds: tuple[float, ...]) -> None:
+def _look(plotter: Any, bounds: tuple[float, ...], width_px: int) -> None:
     """Place sun and camera: sun in the north-west as on the maps, eye in the south-south-west."""
     west, east, south, north, low, high = bounds
     middle = np.array([(west + east) / 2, (south + north) / 2, (low + high) / 2])
@@ -102,7 +122,7 @@ def _look(plotter: Any, bounds: tuple[float, ...]) -> None:
     plotter.add_text(
         f"seen from the south-south-west, heights x {EXAGGERATION:g}",
         position="lower_left",
-        font_size=5 * OVERSAMPLING,
+        font_size=round(5 * OVERSAMPLING * width_px / SIZE_PX[0]),
         color="#555555",
     )
 

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from PIL import Image
 
 from catalog import Grid
@@ -162,13 +164,22 @@ def error_map(
     return _png(figure)
 
 
-def render_meshes(meshes: Mapping[str, Mesh]) -> dict[str, bytes | None]:
+def render_meshes(
+    meshes: Mapping[str, Mesh],
+    colours: Mapping[str, NDArray[np.uint8]] | None = None,
+    size_px: tuple[int, int] | None = None,
+) -> dict[str, bytes | None]:
     """Draw meshes seen obliquely from the south, all in one child process.
 
     Parameters
     ----------
     meshes : Mapping of str to Mesh
         By any name.
+    colours : Mapping of str to ndarray, optional
+        By the same names, ``(V, 3)``: red, green and blue at the vertices, in place of the colours of road
+        and terrain.
+    size_px : tuple of int, optional
+        Width and height of a picture.
 
     Returns
     -------
@@ -180,8 +191,10 @@ def render_meshes(meshes: Mapping[str, Mesh]) -> dict[str, bytes | None]:
         return {}
     with tempfile.TemporaryDirectory(prefix="flexroad-") as name:
         folder = Path(name)
-        for i, mesh in enumerate(meshes.values()):
-            np.savez(folder / f"{i}.npz", vertices=mesh.vertices, faces=mesh.faces, road=mesh.road)
+        size: dict[str, Any] = {} if size_px is None else {"size_px": np.array(size_px)}
+        for i, (mesh_name, mesh) in enumerate(meshes.items()):
+            further = size if colours is None else size | {"colours": colours[mesh_name]}
+            np.savez(folder / f"{i}.npz", vertices=mesh.vertices, faces=mesh.faces, road=mesh.road, **further)
         reason = _draw_in_child(folder, CHILD_START_S + CHILD_MESH_S * len(meshes))
         files = [folder / f"{i}.png" for i in range(len(meshes))]
         pictures = [_small(Image.open(file)) if file.exists() else None for file in files]

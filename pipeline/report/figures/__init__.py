@@ -1,0 +1,78 @@
+"""The paper's figures, drawn from a run: each as vector PDF and PNG, with a page of captions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib import rc_context
+
+from pipeline.errors import ConfigError
+from pipeline.report.figures import dataset, maps, profile, renders, trade_off
+from pipeline.report.figures.cast import Cast, cast_of
+from pipeline.report.figures.plate import STYLE, Plate, save
+from pipeline.report.figures.view import TileView, typical_tile, view_tile
+from pipeline.run import Run
+from pipeline.store import write_atomic
+from pipeline.tables import read_metrics
+
+
+def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast | None = None) -> list[str]:
+    """Draw every figure the run has the variants for, and ``figures.md`` with their captions.
+
+    Parameters
+    ----------
+    run : Run
+        A run with finished tiles.
+    folder : Path
+        Where NAME.pdf, NAME.png and figures.md are written.
+    tile_id : str, optional
+        The tile of the maps, renders and profile; by default the one of median road L2.
+    cast : Cast, optional
+        Which variant plays which part; by default as its options tell.
+
+    Returns
+    -------
+    list of str
+        One line per figure that could not be drawn, and why.
+
+    Raises
+    ------
+    ConfigError
+        If the run has no finished tile, the tile is not finished or its results cannot be made again.
+    CatalogError
+        If the tile is unknown.
+    """
+    cast = cast or cast_of(run.config)
+    rows = read_metrics(run.path)
+    done = rows[rows.status == "done"]
+    if done.empty:
+        raise ConfigError(f"{run.path} has no finished tile; see `flexroad status {run.path}`")
+    with rc_context(STYLE):
+        plates = _plates(run, cast, view_tile(run, tile_id or typical_tile(done, cast.full), cast), done)
+        missing = [f"no figure {plate.name}: {plate.missing}" for plate in plates if plate.figure is None]
+        for plate in plates:
+            if plate.figure is not None:
+                save(plate.figure, folder, plate.name)
+    write_atomic(folder / "figures.md", _page(run, plates).encode())
+    return missing
+
+
+def _plates(run: Run, cast: Cast, view: TileView, done: dataset.Table) -> list[Plate]:
+    return [
+        profile.plate(view, cast),
+        maps.plate(view, cast),
+        renders.plate(view, cast),
+        trade_off.plate(run.config, cast.full, done),
+        dataset.plate(dataset.statistics(run, cast.full, done)),
+    ]
+
+
+def _page(run: Run, plates: list[Plate]) -> str:
+    sources = sorted(
+        {tile.dataset or "a catalog that does not name its source" for tile in run.catalog.tiles}
+    )
+    parts = [f"# Figures: {run.config.name}", f"Data: {', '.join(sources)}."]
+    for plate in plates:
+        drawn = f"![{plate.name}]({plate.name}.png)\n\n{plate.caption}"
+        parts.append(drawn if plate.figure is not None else f"No figure `{plate.name}`: {plate.missing}")
+    return "\n\n".join(parts) + "\n"

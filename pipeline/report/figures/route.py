@@ -1,0 +1,70 @@
+"""The way of a vehicle through a tile: the longest one along the middle of its roads."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import dijkstra
+
+from tasks.types import Bools, Floats
+
+EIGHT = np.ones((3, 3), dtype=bool)
+EDGE_COST = 8.0
+"""How much a way avoids the road's edge: one cell from it a step costs as much as 1 + this in the open."""
+SMOOTHING_CELLS = 3.0
+STEP_CELLS = 0.5
+
+
+def longest_route(road: Bools) -> tuple[Floats, Floats]:
+    """Return the way as rows and columns half a cell apart; empty where there is no road.
+
+    The two ends are as far from each other as any on the largest connected road, by the shortest way that
+    keeps to the middle. Found by going to the far end twice, which is exact on roads without loops.
+
+    Parameters
+    ----------
+    road : Bools
+        Road cells, ``(H, W)``.
+    """
+    if not road.any():
+        return np.empty(0), np.empty(0)
+    parts, _ = ndimage.label(road, EIGHT)
+    road = parts == np.argmax(np.bincount(parts.ravel())[1:]) + 1
+    # Roads go on beyond the tile.
+    clear = ndimage.distance_transform_edt(np.pad(road, 16, mode="edge"))[16:-16, 16:-16]
+    # Ways start and end in the middle of the road: where no cell around is further from its edge.
+    middle = road & (clear == ndimage.maximum_filter(clear, 3))
+    number = np.cumsum(road).reshape(road.shape) - 1
+    graph = _steps(road, clear, number)
+    ends = number[middle]
+    start = ends[np.argmax(dijkstra(graph, directed=False, indices=ends[0])[ends])]
+    cost, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+    way = [ends[np.argmax(cost[ends])]]
+    while way[-1] != start:
+        way.append(before[way[-1]])
+    row, col = np.nonzero(road)
+    return _smooth(row[way].astype(np.float64), col[way].astype(np.float64))
+
+
+def _steps(road: Bools, clear: Floats, number: np.ndarray) -> sparse.coo_array:
+    """Return the cost of every step from a road cell to one of its eight neighbours, each way once."""
+    a, b, cost = [], [], []
+    height, width = road.shape
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = slice(0, height - down), slice(max(0, -right), width - max(0, right))
+        there = slice(down, height), slice(max(0, right), width + min(0, right))
+        both = road[here] & road[there]
+        a.append(number[here][both])
+        b.append(number[there][both])
+        room = np.minimum(clear[here][both], clear[there][both])
+        cost.append(np.hypot(down, right) * (1 + EDGE_COST / room**2))
+    n = int(road.sum())
+    return sparse.coo_array((np.concatenate(cost), (np.concatenate(a), np.concatenate(b))), shape=(n, n))
+
+
+def _smooth(row: Floats, col: Floats) -> tuple[Floats, Floats]:
+    """Round off the corners of a way from cell to cell, and cut it into equal steps."""
+    row, col = (ndimage.gaussian_filter1d(axis, SMOOTHING_CELLS, mode="nearest") for axis in (row, col))
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(row), np.diff(col)))])
+    at = np.arange(0.0, along[-1], STEP_CELLS)
+    return np.interp(at, along, row), np.interp(at, along, col)
