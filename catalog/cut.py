@@ -112,9 +112,9 @@ def cut(
             for name, here in near.items()
             if here[tile_id].in_core
         )
-        taken = _taken(near["dsm"][tile_id].in_core, date)
-        tiles.append(Tile(tile_id, grid, layers, str(root), *taken, dataset=dataset))
-    return Indexed(tuple(tiles), (*notes, *left_out, *_assumed(tiles)))
+        when = taken(near["dsm"][tile_id].in_core, date)
+        tiles.append(Tile(tile_id, grid, layers, str(root), *when, dataset=dataset))
+    return Indexed(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
 
 
 def _place(files: Sequence[RasterFile], crs: str) -> list[_Placed]:
@@ -203,19 +203,20 @@ def _layer(name: str, near: _Near, values: tuple[int, ...], crs: str | None) -> 
     return Layer(name, tuple(file.name for file in near.files), values, crs if bare else None)
 
 
-def _taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
-    """Return when a tile's DSM was taken, and whether that is only assumed."""
+def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
+    """Return when a tile's DSM was taken (``date`` overrules its files), and whether that is only assumed."""
     if date is not None:
         return zoned(date), False
     told = [file.taken for file in dsm if file.taken]
     return (told[0], False) if told else (dsm[0].modified, True)
 
 
-def _assumed(tiles: Sequence[Tile]) -> list[str]:
-    assumed = [tile.id for tile in tiles if tile.datetime_assumed]
-    if not assumed:
+def assumed(tiles: Sequence[Tile]) -> list[str]:
+    """Return a note on the tiles whose date is only assumed."""
+    undated = [tile.id for tile in tiles if tile.datetime_assumed]
+    if not undated:
         return []
-    return [f"no date in the dsm of {_count(assumed)}: the files' times stand in (--date sets it)"]
+    return [f"no date in the dsm of {_count(undated)}: the files' times stand in (--date sets it)"]
 
 
 def _count(ids: Sequence[str]) -> str:

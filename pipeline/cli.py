@@ -17,6 +17,7 @@ from catalog.errors import CatalogError
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from catalog.cut import Indexed
     from pipeline.execute import Executor
     from pipeline.graph import TileGraph
     from pipeline.run import Run
@@ -37,7 +38,7 @@ app.add_typer(configs, name="config")
 
 SEVERAL = ("--tile", "--road-value")
 """Options that take several values in a row."""
-FOLDER_FIRST = ("rerun", "rasters")
+FOLDER_FIRST = ("rerun", "rasters", "nrw")
 """Commands with a folder of their own, which must come first for that."""
 
 
@@ -92,27 +93,32 @@ def _root(
 
 # --- catalog ------------------------------------------------------------------------------------------
 
+Output = Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")]
+RoadValue = Annotated[
+    list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
+]
+TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
+MinCover = Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")]
+Date = Annotated[datetime | None, typer.Option(help="When the data was taken.")]
+
 
 @catalogs.command("rasters")
 def catalog_rasters(
     root: Annotated[Path, typer.Argument(help="Folder of rasters.")],
     dsm: Annotated[str, typer.Option(help="Files of the surface model, relative to ROOT ('dsm/*.tif').")],
     dtm: Annotated[str, typer.Option(help="Files of the terrain model.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")],
+    output: Output,
     dop: Annotated[str | None, typer.Option(help="Files of the orthophoto.")] = None,
     road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
-    road_value: Annotated[
-        list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
-    ] = None,
+    road_value: RoadValue = None,
     reference: Annotated[str | None, typer.Option(help="Files of true heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, typer.Option(help="Files of the true road mask.")] = None,
-    tile_size: Annotated[float, typer.Option(help="Size of a tile in m.")] = 250,
-    min_cover: Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")] = 0.25,
-    date: Annotated[datetime | None, typer.Option(help="When the data was taken.")] = None,
+    tile_size: TileSize = 250,
+    min_cover: MinCover = 0.25,
+    date: Date = None,
     crs: Annotated[str | None, typer.Option(help="CRS of files that carry none: EPSG:25832.")] = None,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
-    from catalog import Catalog
     from catalog.sources import rasters
 
     asked = {
@@ -132,6 +138,70 @@ def catalog_rasters(
         crs=crs,
         min_cover=min_cover,
     )
+    _write_catalog(found, output)
+
+
+@catalogs.command("nrw")
+def catalog_nrw(
+    root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads, under their own names.")],
+    output: Output,
+    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    road_value: RoadValue = None,
+    tile_size: TileSize = 250,
+    min_cover: MinCover = 0.25,
+    date: Date = None,
+) -> None:
+    """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop) into tiles."""
+    from catalog.sources import nrw
+
+    found = nrw.index(
+        root,
+        road_mask=road_mask,
+        road_values=tuple(road_value or ()),
+        tile_size_m=tile_size,
+        date=date.replace(tzinfo=UTC) if date else None,
+        min_cover=min_cover,
+    )
+    _write_catalog(found, output)
+
+
+@catalogs.command("gerod")
+def catalog_gerod(
+    root: Annotated[Path, typer.Argument(help="Folder of the paper's GeRoD dataset.")],
+    output: Output,
+    layout: Annotated[
+        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+    ] = "gerod",
+    date: Date = None,
+) -> None:
+    """List the tiles of the GeRoD dataset."""
+    from catalog.sources import gerod
+    from pipeline.config import load_config
+
+    when = date.replace(tzinfo=UTC) if date else None
+    _write_catalog(gerod.index(root, load_config(layout).dataset, date=when), output)
+
+
+@catalogs.command("dsc3d")
+def catalog_dsc3d(
+    root: Annotated[Path, typer.Argument(help="Folder of rasters of DSC3D's scenes.")],
+    output: Output,
+    layout: Annotated[
+        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+    ] = "dsc3d",
+    date: Date = None,
+) -> None:
+    """List the scenes of the DSC3D dataset, one tile each."""
+    from catalog.sources import dsc3d
+    from pipeline.config import load_config
+
+    when = date.replace(tzinfo=UTC) if date else None
+    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=when), output)
+
+
+def _write_catalog(found: Indexed, output: Path) -> None:
+    from catalog import Catalog
+
     for note in found.notes:
         typer.echo(f"note: {note}", err=True)
     catalog = Catalog(found.tiles)
@@ -335,6 +405,22 @@ def report(
     if form != "html":
         _say(written.read_text())
     typer.echo(f"written to {written}", err=True)
+
+
+@app.command()
+def tables(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    true: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="The same run classed by the true mask.")
+    ] = None,
+) -> None:
+    """Write the paper's tables and claims with a run's figures beside them: Markdown, LaTeX, CSV, HTML."""
+    from pipeline.report.tables import write_comparison
+    from pipeline.run import Run
+
+    for written in write_comparison(Run.open(path), Run.open(true) if true else None, output):
+        _say(str(written))
 
 
 @app.command()

@@ -54,6 +54,8 @@ class Config(BaseModel):
     chains: dict[str, dict[str, Any]]
     """Variant -> stage -> options (`Options`), in the file's and the paper's order."""
     export: Export
+    dataset: dict[str, Any]
+    """Where a published dataset's files lie: for `catalog.sources`, which checks it."""
     raw: dict[str, Any]
     """The resolved file, as written to the run's config.yaml."""
 
@@ -114,7 +116,7 @@ def load_config(name: str | Path) -> Config:
 def compose(raw: Mapping[str, Any], name: str) -> Config:
     """Validate a configuration already read; ``name`` is what errors call it."""
     stages = list(stage_models())
-    known = [*stages, "export", "variants"]
+    known = ["dataset", *stages, "export", "variants"]
     _refuse_unknown(raw, known, name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
@@ -142,7 +144,8 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     for variant in export.variants:
         if variant not in chains:
             raise ConfigError(f"{name}: export.variants: no variant {variant!r}, only {', '.join(chains)}")
-    return Config(name=name, chains=chains, export=export, raw=dict(raw))
+    dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
+    return Config(name=name, chains=chains, export=export, dataset=dataset, raw=dict(raw))
 
 
 def schema() -> dict[str, Any]:
@@ -152,6 +155,7 @@ def schema() -> dict[str, Any]:
     variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
     properties = {
         "extends": {"type": "string", "description": "name of the configuration this one overrides"},
+        "dataset": {"type": "object", "description": "where a dataset's files lie: layers, road_values, crs"},
         **stages,
         "export": Export.model_json_schema(),
         "variants": {"type": "object", "additionalProperties": variant},
@@ -219,7 +223,7 @@ def _raw(name: str | Path, heirs: tuple[Path, ...] = ()) -> dict[str, Any]:
 def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
     merged = dict(parent)
     for key, value in child.items():
-        if key in ("variants", "export"):
+        if key in ("variants", "export", "dataset"):
             merged[key] = value
         else:
             merged[key] = _merge(parent.get(key) or {}, value, TAG.get(key), key)

@@ -1,0 +1,175 @@
+"""Downloads of Geobasis NRW (North Rhine-Westphalia), known by their names and cut into tiles.
+
+The state delivers squares of a kilometre, as in ``dom1_32_356_5699_1_nw_2020.tif``: product, UTM zone,
+kilometres of the south-west corner, length of the side (km), state, year of the survey (in newer names).
+``dom1`` is the surface model, ``dgm1`` the terrain model, ``dop10rgbi`` the orthophoto, ``3dm`` the
+classified point cloud. The names tell what a file is and of which year; where it lies tells the file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from catalog.crs import short
+from catalog.cut import Indexed, cut
+from catalog.errors import CatalogError
+from catalog.grid import Bounds
+from catalog.raster_files import RasterFile, opened, scan, some
+from catalog.tile import Tile
+
+CRS = "EPSG:25832"
+"""The state's own, which its XYZ files do not carry."""
+DATASET = "Geobasis NRW"
+
+NAME = re.compile(
+    r"(?P<product>dom1|dgm1|dop\d+[a-z]*|3dm)_32_(?P<east>\d{3})_(?P<north>\d{4})_(?P<side>\d{1,2})_nw"
+    r"(?:_(?P<year>\d{4}))?\.(?P<form>tif|xyz|xyz\.gz|jp2|laz)",
+    re.IGNORECASE,
+)
+LAYER_OF = {"dom": "dsm", "dgm": "dtm", "dop": "dop"}
+"""Layer by the first letters of the product; point clouds are none."""
+
+
+@dataclass(frozen=True)
+class Download:
+    """What a file's name tells."""
+
+    path: Path
+    layer: str | None
+    """Layer of the catalog, or None for a point cloud."""
+    square: Bounds
+    """Where the file should lie (m, EPSG:25832)."""
+    year: int
+    """Year of the survey; 0 where the name has none."""
+
+
+def parse(path: Path) -> Download | None:
+    """Return what the name of a download tells, or None if it is none of Geobasis NRW."""
+    name = NAME.fullmatch(path.name)
+    if name is None:
+        return None
+    west, south, side = (1000.0 * int(name[part]) for part in ("east", "north", "side"))
+    square = (west, south, west + side, south + side)
+    return Download(path, LAYER_OF.get(name["product"][:3].lower()), square, int(name["year"] or 0))
+
+
+def index(
+    root: Path,
+    *,
+    road_mask: str | None = None,
+    road_values: tuple[int, ...] = (),
+    tile_size_m: float = 250,
+    date: datetime | None = None,
+    min_cover: float = 0.25,
+) -> Indexed:
+    """Cut the downloads below a folder into tiles; where years overlap, the newest one counts.
+
+    Parameters
+    ----------
+    root : Path
+        The folder; files may lie in folders below it.
+    road_mask : str, optional
+        Glob pattern, relative to ``root``, of rasters with road cells: the state has none.
+    road_values : tuple of int
+        Cell values that mean road in them; empty: every value but 0 and nodata.
+    tile_size_m : float
+        Edge of a tile (m).
+    date : datetime, optional
+        When the data was taken; overrules names and tags.
+    min_cover : float
+        Tiles of which the surface model covers less than this share (0 to 1) are left out.
+
+    Raises
+    ------
+    CatalogError
+        If there is no surface model, the mask's pattern finds nothing, or no tile is left.
+    """
+    root = root.resolve()
+    downloads = _downloads(root)
+    notes = _clouds(root, downloads)
+    found: dict[str, list[RasterFile]] = {}
+    for layer in LAYER_OF.values():
+        named = [download for download in downloads if download.layer == layer]
+        files, skipped = opened(root, layer, [download.path for download in named], CRS)
+        files, misplaced = _placed(root, files, named)
+        notes += [*skipped, *misplaced]
+        if files:
+            found[layer] = files
+    if "dsm" not in found:
+        raise CatalogError(
+            f"no dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz of use below {root}; {_seen(root, notes)}"
+        )
+    if road_mask is not None:
+        found["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS)
+        notes += skipped
+    indexed = cut(
+        root,
+        found,
+        road_values=road_values,
+        tile_size_m=tile_size_m,
+        date=date,
+        crs=CRS,
+        min_cover=min_cover,
+        dataset=DATASET,
+    )
+    return replace(indexed, notes=(*notes, *indexed.notes, *_without_terrain(indexed.tiles)))
+
+
+def _downloads(root: Path) -> list[Download]:
+    """Return the downloads below a folder, newest first, as the first with a value wins."""
+    if not root.is_dir():
+        raise CatalogError(f"folder {root} does not exist")
+    parsed = (parse(path) for path in sorted(root.rglob("*")) if path.is_file())
+    return sorted((download for download in parsed if download), key=lambda download: -download.year)
+
+
+def _placed(
+    root: Path, files: Sequence[RasterFile], named: Sequence[Download]
+) -> tuple[list[RasterFile], list[str]]:
+    """Return the files that lie where their names say, with the years of these, and notes on the others."""
+    told = {download.path.relative_to(root).as_posix(): download for download in named}
+    kept, notes = [], []
+    for file in files:
+        download = told[file.name]
+        west, south, east, north = download.square
+        x, y = (file.bounds[0] + file.bounds[2]) / 2, (file.bounds[1] + file.bounds[3]) / 2
+        if file.crs == CRS and west < x < east and south < y < north:
+            kept.append(_dated(file, download.year))
+        else:
+            notes.append(
+                f"skipped {file.name} ({download.layer}): it lies at {x:.0f} {y:.0f} in {short(file.crs)}, "
+                f"not where its name says; download it again"
+            )
+    return kept, notes
+
+
+def _dated(file: RasterFile, year: int) -> RasterFile:
+    """Return the file with the year of its name, unless its tags know the day in that year."""
+    if not year or (file.taken and file.taken.year == year):
+        return file
+    return replace(file, taken=datetime(year, 1, 1, tzinfo=UTC))
+
+
+def _clouds(root: Path, downloads: Sequence[Download]) -> list[str]:
+    clouds = [download.path.relative_to(root).as_posix() for download in downloads if download.layer is None]
+    if not clouds:
+        return []
+    return [f"point clouds are not read yet, so the terrain lacks the bridges in {some(clouds)}"]
+
+
+def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
+    lacking = [tile.id for tile in tiles if tile.layer("dtm") is None]
+    if not lacking:
+        return []
+    return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model, too"]
+
+
+def _seen(root: Path, notes: Sequence[str]) -> str:
+    if notes:
+        return notes[0]
+    files = sorted(path.name for path in root.rglob("*") if path.is_file())
+    return f"there are {some(files)}" if files else "the folder is empty"

@@ -1,0 +1,125 @@
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from catalog import CatalogError
+from catalog.layout import Layout, read
+from catalog.sources import dsc3d, gerod
+from tests.make_rasters import UTM, write
+
+FLAT = np.full((20, 20), 100, np.float32)
+CORNERS = {"295500_5629250": (295500, 5629270), "295750_5629250": (295750, 5629270)}
+"""Tiles of 20 m, by the corners of the paper's."""
+TWO = {"dsm": "{stratum}/{tile}/dsm.tif", "dtm": "{stratum}/{tile}/dtm_*.tif"}
+
+
+def made(root, layers=("dsm.tif", "dtm_2020.tif"), stratum="urban", crs=UTM):
+    for tile, (west, north) in CORNERS.items():
+        for name in layers:
+            write(root / stratum / tile / name, FLAT, west, north, crs=crs)
+    return root
+
+
+def test_templates_tell_tile_layer_and_stratum(tmp_path):
+    made(tmp_path)
+    write(tmp_path / "rural" / "one" / "dsm.tif", FLAT, 1000, 2000)
+    found = read(tmp_path, Layout(TWO), dataset="mine", date=datetime(2020, 5, 1))
+    assert [(tile.id, tile.stratum, tile.dataset) for tile in found.tiles] == [
+        ("295500_5629250", "urban", "mine"),
+        ("295750_5629250", "urban", "mine"),
+        ("one", "rural", "mine"),
+    ]
+    first = found.tiles[0]
+    assert first.layer("dtm").files == ("urban/295500_5629250/dtm_2020.tif",)
+    assert first.grid.bounds == (295500, 5629250, 295520, 5629270)
+    assert first.datetime == datetime(2020, 5, 1, tzinfo=UTC)
+    assert found.notes == ("no dtm at '{stratum}/{tile}/dtm_*.tif' for 1 of 3 tiles: one",)
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    tile=st.text("abcXYZ019_-.+()[]", min_size=1, max_size=12).filter(lambda name: name.strip(".")),
+    template=st.sampled_from(
+        ["dsm/{tile}.tif", "{tile}/dsm_{tile}.tif", "a.b/x_{tile}_1m.tif", "*/{tile}.tif"]
+    ),
+)
+def test_an_id_is_what_it_was_named(tmp_path_factory, tile, template):
+    root = tmp_path_factory.mktemp("layout")
+    write(root / template.replace("{tile}", tile).replace("*", "any"), FLAT)
+    (found,) = read(root, Layout({"dsm": template, "dtm": "dtm/{tile}.tif"}), dataset="").tiles
+    assert found.id == tile
+
+
+def test_road_values_and_crs_go_where_they_are_missing(tmp_path):
+    made(tmp_path, ("dsm.tif", "dtm_1.tif"))
+    made(tmp_path, ("road.tif",), crs=None)
+    layout = Layout.of({"layers": TWO | {"road_mask": "*/{tile}/road.tif"}, "road_values": [2], "crs": UTM})
+    layers = {layer.name: layer for layer in read(tmp_path, layout, dataset="").tiles[0].layers}
+    assert (layers["road_mask"].values, layers["road_mask"].crs) == ((2,), UTM)
+    assert (layers["dsm"].values, layers["dsm"].crs) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("raw", "line"),
+    [
+        ({}, "no template for dsm"),
+        ({"layers": {"dsm": "{tile}.tif"}}, "no template for dtm; a tile needs dsm and dtm"),
+        ({"layers": {"dom": "{tile}.tif"}}, "no layer is called 'dom'; there are dsm"),
+        ({"layers": {"dsm": "dsm.tif"}}, r"dsm: 'dsm.tif' needs \{tile\}"),
+        ({"layers": {"dsm": "{tile}_{year}.tif"}}, r"needs \{tile\} and may have \{stratum\}"),
+        ({"layers": {"dsm": 3}}, "a template is text"),
+        ({"layers": ["dsm"]}, r"layers: expected a mapping of layers to templates, not \['dsm'\]"),
+        ({"layer": {}}, "no key is called 'layer'; there are layers"),
+        ({"road_values": ["a"]}, "road_values: expected whole numbers"),
+        ({"crs": 25832}, "crs: expected a CRS such as EPSG:25832, not 25832"),
+    ],
+)
+def test_a_layout_that_is_none_is_named(raw, line):
+    with pytest.raises(CatalogError, match=line):
+        Layout.of(raw)
+
+
+def test_a_folder_that_is_not_so_is_named(tmp_path):
+    with pytest.raises(CatalogError, match="nowhere does not exist"):
+        read(tmp_path / "nowhere", Layout(TWO), dataset="")
+    with pytest.raises(CatalogError, match=r"no file of use matches '\{stratum\}.*the folder is empty"):
+        read(tmp_path, Layout(TWO), dataset="")
+    made(tmp_path)
+    with pytest.raises(CatalogError, match="there are urban/.*dsm.tif.*--layout"):
+        read(tmp_path, Layout(TWO | {"dsm": "{tile}.tif"}), dataset="")
+    with pytest.raises(CatalogError, match="is no path below"):
+        read(tmp_path, Layout(TWO | {"dsm": "/{tile}.tif"}), dataset="")
+    both = {"dsm": "urban/{tile}/d*.tif", "dtm": "urban/{tile}/dtm_*.tif"}
+    with pytest.raises(CatalogError, match=r"dsm.tif and .*dtm_2020.tif are both the dsm of tile 295500"):
+        read(tmp_path, Layout(both), dataset="")
+
+
+def test_feet_are_refused(tmp_path):
+    made(tmp_path, crs="EPSG:2994")
+    with pytest.raises(CatalogError, match="which counts in feet; reproject"):
+        read(tmp_path, Layout(TWO), dataset="")
+
+
+def test_gerod_s_tiles_lie_at_their_ids(tmp_path):
+    made(tmp_path)
+    found = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
+    assert {tile.dataset for tile in found.tiles} == {"GeRoD"}
+    assert found.notes == ("2 of the dataset's 240 tiles are here",)
+    write(tmp_path / "rural" / "295000_5629250" / "dsm.tif", FLAT, 296000, 5629270)
+    moved = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
+    assert "not at the corner that its name tells: 295000_5629250; are layout and CRS right?" in moved.notes
+
+
+def test_dsc3d_says_where_truth_is_missing(tmp_path):
+    made(tmp_path, ("dsm.tif", "dtm_1.tif", "truth.tif"), stratum="a")
+    date = datetime(2023, 1, 1)
+    whole = dsc3d.index(tmp_path, {"layers": TWO | {"reference": "a/{tile}/truth.tif"}}, date=date)
+    assert whole.notes == ()
+    assert {tile.dataset for tile in whole.tiles} == {"DSC3D"}
+    without = dsc3d.index(tmp_path, {"layers": TWO}, date=date)
+    assert without.notes == (
+        "no reference for 295500_5629250, 295750_5629250: the DTM stands in for it, unlike in the paper",
+    )

@@ -1,0 +1,152 @@
+import gzip
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catalog import CatalogError
+from catalog.sources.nrw import index, parse
+from tasks.load import Options, load
+from tests.make_rasters import UTM, write, write_xyz
+
+WEST, NORTH = 356000, 5700000
+
+
+def heights(rows=500, columns=500):
+    return np.random.default_rng(0).uniform(87, 168, (rows, columns)).astype(np.float32)
+
+
+def packed(path: Path, values, west=WEST, north=NORTH) -> Path:
+    """An XYZ file as the state packs it."""
+    plain = write_xyz(path.with_suffix(""), values, west, north)
+    path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
+    plain.unlink()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "layer", "square", "year"),
+    [
+        ("dom1_32_356_5699_1_nw_2020.tif", "dsm", (356e3, 5699e3, 357e3, 5700e3), 2020),
+        ("dom1_32_356_5699_1_nw.xyz.gz", "dsm", (356e3, 5699e3, 357e3, 5700e3), 0),
+        ("dgm1_32_280_5652_2_nw.xyz", "dtm", (280e3, 5652e3, 282e3, 5654e3), 0),
+        ("dop10rgbi_32_356_5699_1_nw_2021.jp2", "dop", (356e3, 5699e3, 357e3, 5700e3), 2021),
+        ("3dm_32_356_5699_1_nw.laz", None, (356e3, 5699e3, 357e3, 5700e3), 0),
+        ("DGM1_32_356_5699_1_NW_2022.TIF", "dtm", (356e3, 5699e3, 357e3, 5700e3), 2022),
+    ],
+)
+def test_a_name_tells_product_place_and_year(name, layer, square, year):
+    told = parse(Path("below") / name)
+    assert (told.layer, told.square, told.year) == (layer, square, year)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dom1_32_356_5699_1_nw_2020.tif.aux.xml",
+        "dom1_33_356_5699_1_nw_2020.tif",
+        "dom1_32_356_5699_1_he_2020.tif",
+        "dom1_32_356_5699_1_nw_2020.csv",
+        "dom_356.tif",
+    ],
+)
+def test_other_files_are_none(name):
+    assert parse(Path(name)) is None
+
+
+@given(st.integers(100, 999), st.integers(1000, 9999), st.sampled_from(["dom1", "dgm1", "dop10rgbi", "3dm"]))
+def test_every_square_is_read_as_it_was_named(east, north, product):
+    told = parse(Path(f"{product}_32_{east}_{north}_1_nw_2019.tif"))
+    assert told.square == (east * 1000, north * 1000, east * 1000 + 1000, north * 1000 + 1000)
+
+
+def test_a_square_becomes_the_paper_s_tiles(tmp_path):
+    """DSM as GeoTIFF, DTM as packed XYZ without a CRS, JP2 of four bands: 250 m tiles of all three."""
+    dom, dgm = heights(), heights() - 10
+    write(tmp_path / "dom" / "dom1_32_356_5699_1_nw_2020.tif", dom, WEST, NORTH)
+    packed(tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz", dgm)
+    rgbi = np.random.default_rng(1).integers(0, 255, (4, 500, 500), dtype=np.uint8)
+    form = {"count": 4, "dtype": "uint8", "width": 500, "height": 500, "crs": UTM}
+    place = Affine(1, 0, WEST, 0, -1, NORTH)
+    photo = tmp_path / "dop10rgbi_32_356_5699_1_nw_2021.jp2"
+    with rasterio.open(photo, "w", driver="JP2OpenJPEG", transform=place, **form) as dst:
+        dst.write(rgbi)
+    (tmp_path / "dom" / "dom1_nw.csv").write_text("metadata")
+    before = sorted(tmp_path.rglob("*"))
+    found = index(tmp_path)
+    assert [tile.id for tile in found.tiles] == [
+        "356000_5699500", "356000_5699750", "356250_5699500", "356250_5699750",
+    ]  # fmt: skip
+    assert found.notes == ()
+    tile = found.tiles[1]
+    assert (tile.datetime, tile.datetime_assumed) == (datetime(2020, 1, 1, tzinfo=UTC), False)
+    assert (tile.dataset, tile.grid.crs) == ("Geobasis NRW", UTM)
+    assert [(layer.name, layer.files, layer.crs) for layer in tile.layers] == [
+        ("dsm", ("dom/dom1_32_356_5699_1_nw_2020.tif",), None),
+        ("dtm", ("dgm1_32_356_5699_1_nw.xyz.gz",), UTM),
+        ("dop", ("dop10rgbi_32_356_5699_1_nw_2021.jp2",), None),
+    ]
+    data = load(tile, Options())
+    assert data.notes == ()
+    assert np.array_equal(data.dsm, dom[:250, :250].astype(np.float64))
+    assert np.allclose(data.dtm, dgm[:250, :250], atol=0.0051)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_newest_year_counts(tmp_path):
+    for year in (2016, 2022, 2019):
+        write(tmp_path / f"dom1_32_356_5699_1_nw_{year}.tif", np.full((250, 250), year - 2000.0), WEST, NORTH)
+    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
+    (tile,) = index(tmp_path).tiles
+    assert tile.datetime.year == 2022
+    assert (load(tile, Options()).dsm == 22).all()
+
+
+def test_a_tag_tells_the_day_within_the_year_of_the_name(tmp_path):
+    square = np.zeros((250, 250), np.float32)
+    name = "dom1_32_356_5699_1_nw_2020.tif"
+    write(tmp_path / name, square, WEST, NORTH, tags={"TIFFTAG_DATETIME": "2020:03:07 00:00:00"})
+    assert index(tmp_path).tiles[0].datetime == datetime(2020, 3, 7, tzinfo=UTC)
+    write(tmp_path / name, square, WEST, NORTH, tags={"TIFFTAG_DATETIME": "2023:03:07 00:00:00"})
+    assert index(tmp_path).tiles[0].datetime == datetime(2020, 1, 1, tzinfo=UTC)
+    assert index(tmp_path, date=datetime(2019, 5, 1)).tiles[0].datetime == datetime(2019, 5, 1, tzinfo=UTC)
+
+
+def test_what_does_not_help_is_said(tmp_path):
+    write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
+    write(tmp_path / "dom1_32_400_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
+    (tmp_path / "dgm1_32_356_5699_1_nw_2020.tif").write_bytes(b"cut short")
+    (tmp_path / "3dm_32_356_5699_1_nw.laz").write_bytes(b"points")
+    found = index(tmp_path)
+    assert found.notes == (
+        "point clouds are not read yet, so the terrain lacks the bridges in 3dm_32_356_5699_1_nw.laz",
+        "skipped dom1_32_400_5699_1_nw_2020.tif (dsm): it lies at 356125 5699875 in EPSG:25832, "
+        "not where its name says; download it again",
+        "skipped dgm1_32_356_5699_1_nw_2020.tif (dtm): not a raster GDAL can read",
+        "no dgm1 file under 356000_5699750: these tiles will fail; download the terrain model, too",
+    )
+    assert found.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
+
+
+def test_a_mask_of_one_s_own_goes_with_it(tmp_path):
+    write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
+    write(tmp_path / "atkis.tif", np.full((250, 250), 3, np.uint8), WEST, NORTH)
+    mask = index(tmp_path, road_mask="atkis.tif", road_values=(3, 4)).tiles[0].layer("road_mask")
+    assert (mask.files, mask.values) == (("atkis.tif",), (3, 4))
+    with pytest.raises(CatalogError, match="no file matches --road-mask 'osm.tif'"):
+        index(tmp_path, road_mask="osm.tif")
+
+
+def test_a_folder_without_a_surface_model_is_named(tmp_path):
+    with pytest.raises(CatalogError, match=r"no dom1_32_E_N_1_nw\*.tif.*the folder is empty"):
+        index(tmp_path)
+    (tmp_path / "dom.tif").write_bytes(b"x")
+    with pytest.raises(CatalogError, match="there are dom.tif"):
+        index(tmp_path)
+    with pytest.raises(CatalogError, match="nowhere does not exist"):
+        index(tmp_path / "nowhere")
