@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -13,6 +14,9 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.content import Content
+
+PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
+"""A number as it is printed, perhaps with its interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,7 @@ def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     parts = [f"# {content.title}", content.state + ".", content.reference]
     for title, table in _sections(content):
-        parts += [f"## {title}", _markdown(table)]
+        parts += [f"## {title}", markdown(table)]
     versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
     parts += ["## Configuration", f"```yaml\n{content.config}```", f"Versions: {versions}."]
     return "\n\n".join(parts) + "\n"
@@ -42,13 +46,18 @@ def csv_page(content: Content) -> str:
 
 def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
     """Return one self-contained page."""
+    return template("page.html.j2").render(
+        title=content.title, content=content, sections=list(_sections(content)), tiles=tiles
+    )
+
+
+def template(name: str) -> jinja2.Template:
+    """Return one of the pages' templates, with filters for tables and pictures."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["table"] = _html
     environment.filters["inline"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    return environment.get_template("page.html.j2").render(
-        content=content, sections=list(_sections(content)), tiles=tiles
-    )
+    return environment.get_template(name)
 
 
 def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame]]:
@@ -63,6 +72,14 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame]]:
         ("Failures", content.failures),
     )
     return ((title, table) for title, table in named if len(table))
+
+
+def are_numbers(table: pd.DataFrame) -> list[bool]:
+    """Return which columns hold numbers, printed already or not."""
+    return [
+        pd.api.types.is_numeric_dtype(column) or all(PRINTED.fullmatch(str(cell)) for cell in column)
+        for _, column in table.items()
+    ]
 
 
 def _cell(value: object, column: str) -> str:
@@ -81,14 +98,15 @@ def _cells(table: pd.DataFrame) -> list[list[str]]:
     ]
 
 
-def _markdown(table: pd.DataFrame) -> str:
-    numeric = [pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes]
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table as Markdown."""
+    numeric = are_numbers(table)
     lines = [list(table.columns), ["---:" if number else "---" for number in numeric], *_cells(table)]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def _html(table: pd.DataFrame) -> Markup:
-    kinds = ["number" if pd.api.types.is_numeric_dtype(kind) else "text" for kind in table.dtypes]
+    kinds = ["number" if number else "text" for number in are_numbers(table)]
 
     def line(tag: str, cells: Iterable[object]) -> Markup:
         cell = Markup(f'<{tag} class="{{}}">{{}}</{tag}>')

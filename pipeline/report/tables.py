@@ -1,0 +1,109 @@
+"""Write the comparison with the paper: Markdown, LaTeX, CSV and HTML, and the figures they rest on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from pipeline.errors import ConfigError
+from pipeline.report.comparison import Comparison, compare
+from pipeline.report.evidence import Evidence, collect, write_evidence
+from pipeline.report.pages import are_numbers, markdown, template
+from pipeline.run import Run
+from pipeline.store import write_atomic
+
+TITLE = "The paper's tables, and ours"
+LATEX = {
+    "θz": r"$\theta_z$",
+    "L2": r"$\mathcal{L}_2$",
+    "°": r"\textdegree{}",
+    "×": r"$\times$",
+    "–": "--",
+    "<": "$<$",
+    ">": "$>$",
+}
+"""What pdflatex does not print, or not as the paper does."""
+
+
+def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ...]:
+    """Write the tables of a run beside the paper's; return the files.
+
+    Parameters
+    ----------
+    run : Run
+        With variants named as in configs/ablation.yaml; those it lacks are left out.
+    true : Run, optional
+        The same with ``evaluate.classes: reference``.
+    folder : Path
+        Where to.
+
+    Raises
+    ------
+    ConfigError
+        If a run has no figures, mixes data or is about other tiles than the other, or the folder cannot be
+        written.
+    """
+    evidence = collect(run, true)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_evidence(evidence, folder)
+        for name, text in pages(evidence).items():
+            write_atomic(folder / name, text.encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write the tables to {folder}: {error}; choose another -o") from error
+    return tuple(folder / name for name in pages(evidence))
+
+
+def pages(evidence: Evidence) -> dict[str, str]:
+    """Return the pages by file name; equal figures give equal pages."""
+    found = compare(evidence)
+    return {
+        "tables.md": markdown_page(found),
+        "tables.tex": latex_page(found),
+        "tables.csv": csv_page(found.numbers, found.line),
+        "claims.csv": csv_page(found.claims, found.line),
+        "tables.html": html_page(found),
+    }
+
+
+def markdown_page(found: Comparison) -> str:
+    """Return the comparison as Markdown; the data comes first."""
+    parts = [found.line, f"# {TITLE}", *found.notes]
+    for section in found.sections:
+        parts += [f"## {section.title}", markdown(section.table)]
+    return "\n\n".join(parts) + "\n"
+
+
+def csv_page(table: pd.DataFrame, line: str) -> str:
+    """Return a table as CSV below a comment that names the data."""
+    return f"# {line}\n{table.to_csv(index=False)}"
+
+
+def html_page(found: Comparison) -> str:
+    """Return one self-contained page."""
+    sections = [(section.title, section.table) for section in found.sections]
+    page = template("tables.html.j2").render(
+        title=TITLE, line=found.line, notes=found.notes, sections=sections
+    )
+    return f"<!-- {found.line} -->\n{page}\n"
+
+
+def latex_page(found: Comparison) -> str:
+    r"""Return tables to ``\input`` into a document with the package booktabs."""
+    parts = [f"% {found.line}", *(f"% {note}" for note in found.notes)]
+    for section in found.sections:
+        parts.append(_latex(section.table, f"{section.title}. {found.line}"))
+    return "\n".join(parts) + "\n"
+
+
+def _latex(table: pd.DataFrame, caption: str) -> str:
+    kinds = "".join("r" if number else "l" for number in are_numbers(table))
+    body = table.to_latex(index=False, escape=True, column_format=kinds)
+    caption = caption.replace("_", r"\_").replace("%", r"\%")
+    for plain, printed in LATEX.items():
+        body, caption = body.replace(plain, printed), caption.replace(plain, printed)
+    return (
+        "\\begin{table*}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
+        f"\\caption{{{caption}}}\n{body}\\end{{table*}}"
+    )

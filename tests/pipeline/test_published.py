@@ -1,0 +1,52 @@
+"""The paper's numbers agree with one another, and so do the claims with the tables they quote."""
+
+from itertools import pairwise
+
+import pytest
+
+from pipeline.config import load_config
+from pipeline.report.claims import CLAIMS, Change, Order
+from pipeline.report.content import FIGURES
+from pipeline.report.published import GEROD, TABLE_I, TABLE_II, published
+
+TEXT_AND_TABLE_DIFFER = {"Sampling at 0.5 m / 5 m doubles the triangles (four times in Table II)"}
+
+
+def test_table_ii_has_the_papers_rows_and_the_configuration_has_them_all():
+    assert len(TABLE_II) == 19
+    names = [row.variant for row in (*TABLE_I[:2], *TABLE_II)]
+    assert names == list(load_config("ablation").chains)
+
+
+def test_the_full_pipeline_is_the_flexroad_of_table_i():
+    main, full = TABLE_I[-1], TABLE_II[0]
+    for figure in FIGURES:
+        # Table I rounds triangles to thousands.
+        assert main.value(figure) == pytest.approx(full.value(figure), rel=0.02)
+    assert published("flexroad") == full
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.text)
+def test_the_papers_tables_bear_out_its_claims(claim):
+    if isinstance(claim, Order):
+        values = [published(name, claim.dataset).value(claim.figure) for name in claim.ascending]
+        assert all(a <= b for a, b in pairwise(values))
+        return
+    base, changed = (
+        published(name, claim.dataset).value(claim.figure) for name in (claim.base, claim.variant)
+    )
+    percent = 100 * (changed / base - 1)
+    if claim.text in TEXT_AND_TABLE_DIFFER:
+        assert abs(percent - claim.quoted) > 100
+    elif "doubles" in claim.text:
+        assert percent == pytest.approx(claim.quoted, abs=5)
+    else:
+        assert percent == pytest.approx(claim.quoted, abs=1.0)
+
+
+def test_claims_name_what_there_is():
+    assert len({claim.text for claim in CLAIMS}) == len(CLAIMS)
+    for claim in CLAIMS:
+        assert claim.figure in FIGURES
+        if isinstance(claim, Change) and claim.dataset == GEROD:
+            assert {claim.base, claim.variant} <= set(load_config("ablation").chains)

@@ -1,0 +1,268 @@
+"""The comparison with the paper: means, intervals, verdicts, and pages that say whose data they are."""
+
+import io
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from catalog import LAYERS, Catalog, Grid, Layer, Tile
+from pipeline.config import load_config
+from pipeline.errors import ConfigError
+from pipeline.report.bootstrap import bootstrap
+from pipeline.report.claims import DIRECTION, HELD, NOT_HELD, NOT_TESTED, Change, Order, check, percent
+from pipeline.report.comparison import compare
+from pipeline.report.content import FIGURES
+from pipeline.report.evidence import Evidence, collect, read_evidence, write_evidence
+from pipeline.report.published import TABLE_II, published
+from pipeline.report.tables import pages, write_comparison
+from pipeline.run import Run
+from pipeline.store import write_atomic
+from pipeline.tables import metrics_frame
+
+VARIANTS = list(load_config("ablation").chains)
+
+
+def figures(values: dict[str, list[float]]) -> pd.DataFrame:
+    """Every figure of each variant's tiles is the value given."""
+    rows = [
+        (f"t{i}", variant, *[value] * len(FIGURES))
+        for variant, tiles in values.items()
+        for i, value in enumerate(tiles)
+    ]
+    return pd.DataFrame(rows, columns=["tile_id", "variant", *FIGURES]).set_index(["tile_id", "variant"])
+
+
+def as_published(tiles: int = 3, classes: str = "segmented") -> Evidence:
+    """Tiles whose every figure is the paper's."""
+    rows = [
+        ("made", classes, f"t{i}", ("urban", "rural")[i % 2], name, *map(published(name).value, FIGURES))
+        for i in range(tiles)
+        for name in VARIANTS
+    ]
+    return Evidence(
+        pd.DataFrame(rows, columns=["dataset", "classes", "tile_id", "stratum", "variant", *FIGURES])
+    )
+
+
+def test_means_are_over_tiles_that_have_the_figure():
+    means = bootstrap(figures({"a": [1.0, 3.0, np.nan], "b": [2.0, 2.0, 5.0]}))
+    assert means.mean["a", "l2_road_m"] == 2
+    assert means.mean["b", "triangles"] == 3
+    assert means.ratio("b", "a", "l2_road_m")[0] == 1.5
+
+
+def test_intervals_are_those_of_scipy():
+    values = np.random.default_rng(3).gamma(2, 1, 60)
+    low, high = bootstrap(figures({"a": values.tolist()})).interval("a", "l2_road_m")
+    peer = scipy.stats.bootstrap((values,), np.mean, method="percentile", n_resamples=20_000, rng=1)
+    width = peer.confidence_interval.high - peer.confidence_interval.low
+    assert (low, high) == pytest.approx(tuple(peer.confidence_interval), abs=0.05 * width)
+
+
+def test_ratios_are_over_the_same_tiles():
+    tiles = np.random.default_rng(1).gamma(1, 5, 40)
+    ratio, drawn = bootstrap(figures({"a": tiles.tolist(), "b": (2 * tiles).tolist()})).ratio(
+        "b", "a", "l2_road_m"
+    )
+    assert ratio == pytest.approx(2)
+    assert drawn == pytest.approx(2)
+
+
+RISE = Change("rises", "x", "l2_road_m", "wo_ecsrc", 111)
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"),
+    [
+        (2.1, HELD),
+        (1.5, HELD),
+        (4.4, HELD),
+        (1.4, DIRECTION),
+        (4.5, DIRECTION),
+        (1.0, NOT_HELD),
+        (0.9, NOT_HELD),
+    ],
+)
+def test_a_change_holds_between_half_and_twice_the_papers(ours, verdict):
+    # The paper's ratio is 2.114: the square root is 1.454, the square 4.469.
+    found = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": [ours] * 4})))
+    assert (found.verdict, found.paper, found.ours) == (verdict, "+111%", percent(ours))
+
+
+@pytest.mark.parametrize(
+    ("values", "slack", "verdict", "shown"),
+    [
+        ((1, 2), 0, HELD, "1.000 < 2.000"),
+        ((2, 1), 0, NOT_HELD, "2.000 > 1.000"),
+        ((1.04, 1), 0, NOT_HELD, "1.040 > 1.000"),
+        ((1.04, 1), 0.05, HELD, "1.040 > 1.000"),
+    ],
+)
+def test_an_order_holds_as_the_means_are(values, slack, verdict, shown):
+    claim = Order("x", "x", "l2_road_m", ("flexroad", "wo_ecsrc"), slack)
+    means = bootstrap(figures({"flexroad": [values[0]] * 4, "wo_ecsrc": [values[1]] * 4}))
+    found = check(claim, means)
+    assert (found.verdict, found.paper, found.ours) == (verdict, "0.483 < 1.021", shown)
+    assert found.certainty == ("100% of resamples" if verdict == HELD else "0% of resamples")
+
+
+def test_claims_about_other_data_or_missing_variants_are_not_tested():
+    means = bootstrap(figures({"flexroad": [1.0]}))
+    assert check(RISE, means).verdict == NOT_TESTED
+    both = bootstrap(figures({"flexroad": [1.0], "wo_ecsrc": [2.0]}))
+    assert check(replace(RISE, dataset="GeRoD"), both, "DSC3D").verdict == NOT_TESTED
+
+
+def test_the_papers_own_figures_hold_every_claim_about_its_data():
+    found = compare(as_published())
+    verdicts = found.claims.verdict.value_counts()
+    assert verdicts.to_dict() == {HELD: len(found.claims) - 3, NOT_TESTED: 3}
+    # But for triangles, which Table I rounds.
+    exact = found.numbers[found.numbers.figure != "triangles"]
+    assert exact.difference.abs().max() < 1e-12
+    assert len(found.numbers) == (3 + 19) * len(FIGURES)
+
+
+def test_changes_are_those_the_paper_quotes():
+    table = next(s.table for s in compare(as_published()).sections if "changes" in s.title)
+    without = table[table.variant == "w/o ECSRC"].iloc[0]
+    assert (without["L2 road, paper"], without["MAD road, ours"]) == ("+111%", "+135%")
+    assert len(table) == len(TABLE_II) - 1
+
+
+def test_strata_have_tables_of_their_own():
+    evidence = as_published(3)
+    rural = (evidence.rows.stratum == "rural") & (evidence.rows.variant == "rgt")
+    evidence.rows.loc[rural, "l2_road_m"] = 9.0
+    tables = {s.title: s.table for s in compare(evidence).sections}
+    assert tables["Ours, rural: 1 tile"]["L2 road (m)"][1] == "9.000"
+    assert tables["Ours, urban: 2 tiles"]["L2 road (m)"][1] == "0.415"
+
+
+def test_every_page_says_first_what_the_data_is():
+    line = "Data: made, 3 tiles (2 urban, 1 rural)."
+    for name, text in pages(as_published()).items():
+        assert line in text.splitlines()[0], name
+    assert "The paper's figures are on GeRoD, ours are not" in pages(as_published())["tables.md"]
+    real = as_published()
+    real = Evidence(real.rows.assign(dataset="GeRoD"))
+    assert "ours are not" not in pages(real)["tables.md"]
+
+
+def test_tiles_that_failed_count_for_nothing_and_are_told_of():
+    evidence = as_published(3)
+    failed = (evidence.rows.tile_id == "t1") & (evidence.rows.variant == "rgt")
+    evidence.rows.loc[failed, list(FIGURES)] = np.nan
+    evidence.rows.loc[evidence.rows.tile_id == "t1", "l2_road_m"] += 100
+    assert evidence.line == "Data: made, 2 tiles (2 urban); 1 more failed and are left out."
+    assert compare(evidence).numbers.ours.max() < 200_000
+    assert abs(compare(evidence).numbers.query("figure == 'l2_road_m'").difference).max() < 1e-12
+
+
+def test_the_kept_figures_alone_give_the_same_pages(tmp_path):
+    rng = np.random.default_rng(0)
+    evidence = as_published(5)
+    evidence.rows[list(FIGURES)] = (evidence.rows[list(FIGURES)] * rng.random((5 * 21, 1))).round(6)
+    write_evidence(evidence, tmp_path)
+    assert pages(read_evidence(tmp_path)) == pages(evidence)
+
+
+def test_csv_is_read_back(tmp_path):
+    page = pages(as_published())["tables.csv"]
+    table = pd.read_csv(io.StringIO(page), comment="#")
+    row = table[(table.variant == "wo_dtm") & (table.figure == "l2_terrain_m")].iloc[0]
+    assert (row.paper, row.table) == (2.941, "Table II")
+    assert row.ours == pytest.approx(2.941)
+
+
+def test_latex_is_well_formed():
+    text = pages(as_published())["tables.tex"]
+    assert text.isascii()
+    assert text.count("\\begin{") == text.count("\\end{")
+    for table in re.findall(r"\\begin{tabular}.*?\\end{tabular}", text, flags=re.DOTALL):
+        kinds = re.match(r"\\begin{tabular}{([lr]+)}", table)[1]
+        rows = [line for line in table.splitlines() if line.endswith("\\\\")]
+        assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {len(kinds) - 1}
+        assert {"\\toprule", "\\midrule", "\\bottomrule"} <= set(table.splitlines())
+        assert not re.search(r"(?<!\\)%", table)
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_latex_compiles(tmp_path):
+    (tmp_path / "tables.tex").write_text(pages(as_published())["tables.tex"])
+    head = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}\\input{tables}\\end{document}"
+    (tmp_path / "page.tex").write_text(head)
+    done = subprocess.run(
+        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-2000:]
+
+
+def made_run(path, config="ablation", dataset=("made",), factor=1.0, layers=LAYERS) -> Run:
+    """A run folder over four tiles with the paper's figures for rows."""
+    tiles = tuple(
+        Tile(
+            f"{east}_5629250",
+            Grid("EPSG:25832", east, 5629500.0, 1.0, 250, 250),
+            tuple(Layer(name, (f"{name}.tif",)) for name in layers),
+            str(path),
+            datetime(2025, 1, 1, tzinfo=UTC),
+            dataset=dataset[i % len(dataset)],
+        )
+        for i, east in enumerate(range(295500, 296500, 250))
+    )
+    run = Run.create(path, load_config(config), Catalog(tiles))
+    rows = [
+        {"tile_id": tile.id, "variant": name, "stratum": tile.stratum, "status": "done"}
+        | {figure: published(name).value(figure) * (factor if "l2" in figure else 1) for figure in FIGURES}
+        for tile in tiles
+        for name in VARIANTS
+    ]
+    buffer = io.BytesIO()
+    metrics_frame(rows).to_parquet(buffer, index=False)
+    write_atomic(run.path / "metrics.parquet", buffer.getvalue())
+    return run
+
+
+def test_a_run_and_its_true_classes_stand_side_by_side(tmp_path):
+    ours = made_run(tmp_path / "ours")
+    true = made_run(tmp_path / "true", "ablation_true", factor=2)
+    written = write_comparison(ours, true, tmp_path / "out")
+    assert {path.name for path in written} == {*pages(collect(ours, true))}
+    page = (tmp_path / "out" / "tables.md").read_text()
+    assert page.startswith("Data: made, 4 tiles")
+    assert "| Full Pipeline | 0.483 | 0.966 |" in page
+    kept = read_evidence(tmp_path / "out")
+    assert kept.classes == ("segmented", "reference")
+    for path in written:
+        assert path.read_text() == pages(kept)[path.name]
+
+
+def test_data_is_never_mixed(tmp_path):
+    mixed = made_run(tmp_path / "mixed", dataset=("GeRoD", ""))
+    with pytest.raises(ConfigError, match="mixes data: unnamed, GeRoD; run each by itself"):
+        collect(mixed)
+    ours = made_run(tmp_path / "ours")
+    other = made_run(tmp_path / "other", "ablation_true", dataset=("GeRoD",))
+    with pytest.raises(ConfigError, match="is not about the data, tiles and variants of"):
+        collect(ours, other)
+    with pytest.raises(ConfigError, match="both class by the segmented mask"):
+        collect(ours, ours)
+
+
+def test_no_true_mask_no_true_run(tmp_path):
+    ours = made_run(tmp_path / "ours", layers=("dsm", "dtm"))
+    true = made_run(tmp_path / "true", "ablation_true", layers=("dsm", "dtm"))
+    with pytest.raises(ConfigError, match="has no true road mask in its catalog; leave out --true"):
+        collect(ours, true)
