@@ -55,8 +55,15 @@ def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250) -> Path
 
 def _write_scene(job: SceneJob) -> str:
     scene = make_scene(job.grid, job.seed)
-    prepared.write_tile(Path(job.folder), job.tile_id, job.grid, scene.layers, scene.stratum, MADE)
+    prepared.write_tile(
+        Path(job.folder), job.tile_id, job.grid, scene.layers, scene.stratum, MADE, _name(job)
+    )
     return ""
+
+
+def _name(job: SceneJob) -> str:
+    """Return what reports call the data."""
+    return f"synthetic, seed {job.seed}"
 
 
 def _lost(job: SceneJob, why: str) -> str:

@@ -44,7 +44,7 @@ class Comparison:
 
 def compare(evidence: Evidence) -> Comparison:
     """Lay the figures of a run beside the paper's."""
-    paper = DSC3D if DSC3D in evidence.dataset else GEROD
+    paper = DSC3D if evidence.dataset == DSC3D else GEROD
     tables = {"Table I": TABLE_I_DSC3D} if paper == DSC3D else {"Table I": TABLE_I, "Table II": TABLE_II}
     means = {classes: bootstrap(evidence.part(classes)) for classes in evidence.classes}
     head = means[evidence.classes[0]]
@@ -69,7 +69,7 @@ def compare(evidence: Evidence) -> Comparison:
 
 def _notes(evidence: Evidence, paper: str, verdicts: dict[str, list[Verdict]]) -> Iterator[str]:
     classes = evidence.classes[0]
-    if paper not in evidence.dataset:
+    if evidence.dataset != paper:
         yield (
             f"The paper's figures are on {paper}, ours are not: orders and ratios can be compared, metres "
             "and degrees only as far as the data are alike."
