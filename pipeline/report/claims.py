@@ -11,7 +11,9 @@ import numpy as np
 from pipeline.report.bootstrap import Means, interval
 from pipeline.report.published import BASE, DSC3D, GEROD, published
 
-HELD, DIRECTION, NOT_HELD, NOT_TESTED = "held", "direction only", "not held", "not tested"
+HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED = "held", "weaker", "stronger", "not held", "not tested"
+REACH = 2.0
+"""A change that goes further than so many times the paper's is stronger; weaker is less than its inverse."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +149,8 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
     """Return whether a claim holds.
 
     An order holds if the means over tiles are so ordered. A change holds if it goes the paper's way and its
-    ratio, as a logarithm, is between half and twice that of the paper's tables; if only its direction is
-    the paper's, so it is said.
+    ratio, as a logarithm, is between half and twice that of the paper's tables; a change that way is
+    weaker or stronger otherwise.
 
     Parameters
     ----------
@@ -196,13 +198,17 @@ def _check_order(claim: Order, paper: list[float], means: Means) -> Verdict:
 def _check_change(claim: Change, paper: float, means: Means) -> Verdict:
     ratio, drawn = means.ratio(claim.variant, claim.base, claim.figure)
     low, high = interval(drawn)
+    certainty = f"{percent(low)} to {percent(high)}"
+    return Verdict(claim, percent(paper), percent(ratio), certainty, _judged(ratio, paper))
+
+
+def _judged(ratio: float, paper: float) -> str:
     if not (math.isfinite(ratio) and ratio > 0):
-        verdict = NOT_TESTED
-    elif (ratio - 1) * (paper - 1) <= 0:
-        verdict = NOT_HELD
-    else:
-        verdict = HELD if 0.5 <= math.log(ratio) / math.log(paper) <= 2 else DIRECTION
-    return Verdict(claim, percent(paper), percent(ratio), f"{percent(low)} to {percent(high)}", verdict)
+        return NOT_TESTED
+    far = math.log(ratio) / math.log(paper)
+    if far <= 0:
+        return NOT_HELD
+    return STRONGER if far > REACH else WEAKER if far < 1 / REACH else HELD
 
 
 def _paper(claim: Claim, variant: str) -> float:

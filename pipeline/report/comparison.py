@@ -8,8 +8,19 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from pipeline.errors import ConfigError
 from pipeline.report.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
-from pipeline.report.claims import CLAIMS, DIRECTION, HELD, NOT_HELD, NOT_TESTED, Verdict, check, percent
+from pipeline.report.claims import (
+    CLAIMS,
+    HELD,
+    NOT_HELD,
+    NOT_TESTED,
+    STRONGER,
+    WEAKER,
+    Verdict,
+    check,
+    percent,
+)
 from pipeline.report.content import FIGURES
 from pipeline.report.evidence import Evidence
 from pipeline.report.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
@@ -43,7 +54,13 @@ class Comparison:
 
 
 def compare(evidence: Evidence) -> Comparison:
-    """Lay the figures of a run beside the paper's."""
+    """Lay the figures of a run beside the paper's.
+
+    Raises
+    ------
+    ConfigError
+        If there is nothing to compare FlexRoad with.
+    """
     paper = DSC3D if evidence.dataset == DSC3D else GEROD
     tables = {"Table I": TABLE_I_DSC3D} if paper == DSC3D else {"Table I": TABLE_I, "Table II": TABLE_II}
     means = {classes: bootstrap(evidence.part(classes)) for classes in evidence.classes}
@@ -51,7 +68,10 @@ def compare(evidence: Evidence) -> Comparison:
     tables = {
         name: tuple(row for row in rows if row.variant in head.variants) for name, rows in tables.items()
     }
-    tables = {name: rows for name, rows in tables.items() if rows}
+    # A table of the full pipeline alone would say nothing that Table I does not.
+    tables = {name: rows for name, rows in tables.items() if {row.variant for row in rows} - {BASE}}
+    if not tables:
+        raise ConfigError("the run has none of the variants FlexRoad is compared with; use --config ablation")
     verdicts = {classes: [check(claim, made, paper) for claim in CLAIMS] for classes, made in means.items()}
     claims = _claims(verdicts)
     sections = [
@@ -78,14 +98,13 @@ def _notes(evidence: Evidence, paper: str, verdicts: dict[str, list[Verdict]]) -
         f"Means over tiles; in brackets {LEVEL}% intervals from {RESAMPLES} resamples of the tiles. "
         f"Road is told from terrain by the {MASKS[classes]}."
     )
-    counts = [
-        sum(v.verdict == kind for v in verdicts[classes]) for kind in (HELD, DIRECTION, NOT_HELD, NOT_TESTED)
-    ]
+    kinds = (HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED)
+    counts = [f"{sum(v.verdict == kind for v in verdicts[classes])} {kind}" for kind in kinds]
     yield (
-        f"Of {len(CLAIMS)} claims {counts[0]} held, {counts[1]} held in direction only, {counts[2]} did not "
-        f"hold, {counts[3]} could not be tested here. An order holds if the means are so ordered; a change "
-        "holds if it goes the paper's way and its ratio, as a logarithm, is between half and twice that of "
-        "the paper's tables."
+        f"The paper's {len(CLAIMS)} claims: {', '.join(counts)}. An order holds if the means are so ordered. "
+        "A change holds if it goes the paper's way and its ratio, as a logarithm, is between half and twice "
+        "that of the paper's tables; beyond it is weaker or stronger. What other data or variants would have "
+        "to show is not tested."
     )
 
 

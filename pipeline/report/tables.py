@@ -45,14 +45,15 @@ def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ..
         written.
     """
     evidence = collect(run, true)
+    made = pages(evidence)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_evidence(evidence, folder)
-        for name, text in pages(evidence).items():
+        for name, text in made.items():
             write_atomic(folder / name, text.encode())
     except OSError as error:
         raise ConfigError(f"cannot write the tables to {folder}: {error}; choose another -o") from error
-    return tuple(folder / name for name in pages(evidence))
+    return tuple(folder / name for name in made)
 
 
 def pages(evidence: Evidence) -> dict[str, str]:

@@ -16,7 +16,7 @@ from catalog import LAYERS, Catalog, Grid, Layer, Tile
 from pipeline.config import load_config
 from pipeline.errors import ConfigError
 from pipeline.report.bootstrap import bootstrap
-from pipeline.report.claims import DIRECTION, HELD, NOT_HELD, NOT_TESTED, Change, Order, check, percent
+from pipeline.report.claims import HELD, NOT_HELD, NOT_TESTED, STRONGER, WEAKER, Change, Order, check, percent
 from pipeline.report.comparison import compare
 from pipeline.report.content import FIGURES
 from pipeline.report.evidence import Evidence, collect, read_evidence, write_evidence
@@ -84,8 +84,8 @@ RISE = Change("rises", "x", "l2_road_m", "wo_ecsrc", 111)
         (2.1, HELD),
         (1.5, HELD),
         (4.4, HELD),
-        (1.4, DIRECTION),
-        (4.5, DIRECTION),
+        (1.4, WEAKER),
+        (4.5, STRONGER),
         (1.0, NOT_HELD),
         (0.9, NOT_HELD),
     ],
@@ -128,6 +128,19 @@ def test_the_papers_own_figures_hold_every_claim_about_its_data():
     exact = found.numbers[found.numbers.figure != "triangles"]
     assert exact.difference.abs().max() < 1e-12
     assert len(found.numbers) == (3 + 19) * len(FIGURES)
+
+
+def test_flexroad_alone_is_nothing_to_compare():
+    evidence = as_published()
+    with pytest.raises(ConfigError, match="none of the variants FlexRoad is compared with"):
+        compare(Evidence(evidence.rows[evidence.rows.variant == "flexroad"]))
+
+
+def test_the_main_comparison_alone_has_no_table_ii():
+    rows = as_published().rows
+    titles = [s.title for s in compare(Evidence(rows[rows.variant.isin(VARIANTS[:3])])).sections]
+    assert "Table I: L2" in titles
+    assert not any("Table II" in title for title in titles)
 
 
 def test_changes_are_those_the_paper_quotes():
