@@ -48,6 +48,7 @@ def draw(
     faces: NDArray[np.int32],
     road: NDArray[np.bool_],
     colours: NDArray[np.uint8] | None = None,
+    within: Sequence[float] | None = None,
     size_px: Sequence[int] = SIZE_PX,
 ) -> Image.Image:
     """Return one mesh, seen obliquely from the south-south-west.
@@ -62,28 +63,39 @@ def draw(
         ``(F,)``, True on faces of road.
     colours : ndarray, optional
         ``(V, 3)``, red, green and blue at the vertices, in place of the colours of road and terrain.
+    within : sequence of float, optional
+        West, south, east and north of the part that is drawn, in the vertices' coordinates (m).
     size_px : sequence of int
         Width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
     # Normals of the whole mesh, so that the classes meet without a seam.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
+    whole.cell_data["road"] = road
+    if colours is not None:
+        whole.point_data["colours"] = colours
+    if within is not None:
+        west, south, east, north = within
+        whole = whole.clip_box([west, east, south, north, *whole.bounds[4:]], invert=False).extract_surface(
+            algorithm=None
+        )
     size = [int(n) for n in size_px]
     plotter = pv.Plotter(off_screen=True, window_size=[n * OVERSAMPLING for n in size], lighting="none")
     plotter.set_background(SKY)
     if colours is None:
-        _add_classes(plotter, whole, road, _edge_opacity(vertices, faces[~road]))
+        _add_classes(plotter, whole, _edge_opacity(vertices, faces[~road]))
     else:
         # More ambient light than on plain colours: these are read against a colour bar.
-        plotter.add_mesh(whole, scalars=colours, rgb=True, smooth_shading=True, ambient=0.45, diffuse=0.6)
+        plotter.add_mesh(whole, scalars="colours", rgb=True, smooth_shading=True, ambient=0.45, diffuse=0.6)
     _look(plotter, whole.bounds, size[0])
     picture = Image.fromarray(plotter.screenshot(return_img=True))
     plotter.close()
     return picture.resize(size, Image.Resampling.LANCZOS)
 
 
-def _add_classes(plotter: Any, whole: Any, road: NDArray[np.bool_], edge_opacity: float) -> None:
+def _add_classes(plotter: Any, whole: Any, edge_opacity: float) -> None:
     """Add the terrain with its edges and the road without."""
+    road = np.asarray(whole.cell_data["road"], dtype=bool)
     if not road.all():
         plotter.add_mesh(
             whole.extract_cells(~road),

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from catalog import Grid
+from catalog.grid import Bounds
 from tasks.types import Bools, Floats, Mesh
 
 log = logging.getLogger(__name__)
@@ -167,6 +168,7 @@ def error_map(
 def render_meshes(
     meshes: Mapping[str, Mesh],
     colours: Mapping[str, NDArray[np.uint8]] | None = None,
+    within: Bounds | None = None,
     size_px: tuple[int, int] | None = None,
 ) -> dict[str, bytes | None]:
     """Draw meshes seen obliquely from the south, all in one child process.
@@ -178,6 +180,8 @@ def render_meshes(
     colours : Mapping of str to ndarray, optional
         By the same names, ``(V, 3)``: red, green and blue at the vertices, in place of the colours of road
         and terrain.
+    within : Bounds, optional
+        The part that is drawn (m, in the meshes' CRS).
     size_px : tuple of int, optional
         Width and height of a picture.
 
@@ -191,9 +195,13 @@ def render_meshes(
         return {}
     with tempfile.TemporaryDirectory(prefix="flexroad-") as name:
         folder = Path(name)
-        size: dict[str, Any] = {} if size_px is None else {"size_px": np.array(size_px)}
         for i, (mesh_name, mesh) in enumerate(meshes.items()):
-            further = size if colours is None else size | {"colours": colours[mesh_name]}
+            asked = {
+                "colours": None if colours is None else colours[mesh_name],
+                "within": None if within is None else np.subtract(within, mesh.origin[:2] * 2),
+                "size_px": size_px,
+            }
+            further: dict[str, Any] = {key: value for key, value in asked.items() if value is not None}
             np.savez(folder / f"{i}.npz", vertices=mesh.vertices, faces=mesh.faces, road=mesh.road, **further)
         reason = _draw_in_child(folder, CHILD_START_S + CHILD_MESH_S * len(meshes))
         files = [folder / f"{i}.png" for i in range(len(meshes))]

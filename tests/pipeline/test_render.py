@@ -179,6 +179,23 @@ def test_meshes_are_drawn_the_right_way_round():
     assert (dark.sum(0) * columns).sum() / dark.sum() < (drawn.sum(0) * columns).sum() / drawn.sum() - 50
 
 
+@pytest.mark.usefixtures("opengl")
+def test_a_part_of_a_mesh_is_drawn_in_given_colours():
+    whole = sheet()
+    red_in_the_west = np.where(whole.vertices[:, :1] < 125, [[200, 30, 30]], [[30, 30, 200]]).astype(np.uint8)
+    west, south = whole.origin[:2]
+    shares = []
+    for within in (None, (west + 150, south + 50, west + 240, south + 200)):
+        picture = render.render_meshes({"a": whole}, {"a": red_in_the_west}, within, (300, 240))["a"]
+        image = pixels(picture)
+        assert image.shape == (240, 300, 3)
+        red, blue = ((image[..., a] - image[..., b]) > 60 for a, b in ((0, 2), (2, 0)))
+        shares.append((red.mean(), blue.mean()))
+    assert min(shares[0]) > 0.05
+    assert shares[1][0] == 0
+    assert shares[1][1] > shares[0][1], "a part fills the picture"
+
+
 def test_no_meshes_need_no_child(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nonexistent")
     assert render.render_meshes({}) == {}

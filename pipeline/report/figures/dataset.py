@@ -52,9 +52,9 @@ def statistics(run: Run, full: str, done: Table) -> Table:
 def plate(table: Table) -> Plate:
     """Draw how many tiles each stratum has, and how road share and height range are distributed."""
     caption = (
-        f"The {len(table)} tiles: their strata, share of road and range of heights in the DSM, houses and "
-        f"trees included. Dashed: the means, {table.road_percent.mean():.1f}% and "
-        f"{table.height_range_m.mean():.1f} m."
+        f"The {len(table)} tiles: their strata, share of road by the mask of the evaluation, and range of "
+        "heights in the DSM, houses and trees included. Dashed: the means, "
+        f"{table.road_percent.mean():.1f}% and {table.height_range_m.mean():.1f} m."
     )
     return Plate(NAME, caption, draw(table))
 
@@ -69,6 +69,7 @@ def draw(table: Table) -> Figure:
     )
     bars.bar_label(drawn, fontsize=7)
     bars.set_ylabel("tiles")
+    bars.yaxis.set_major_locator(MaxNLocator(integer=True))
     _histogram(roads, table, groups, "road_percent", "share of road (%)")
     _histogram(heights, table, groups, "height_range_m", "range of heights (m)")
     if len(groups) > 1:
@@ -90,6 +91,8 @@ def _histogram(axes: Axes, table: Table, groups: dict[str, Table], column: str, 
     edges = list(np.histogram_bin_edges(table[column].dropna(), BINS))
     parts: Any = [part[column].dropna() for part in groups.values()]
     axes.hist(parts, edges, stacked=True, label=list(groups), color=[_colour(name) for name in groups])
-    axes.axvline(table[column].mean(), color=PATH, linestyle="--", linewidth=0.9)
+    mean = table[column].mean()
+    axes.axvline(mean, color=PATH, linestyle="--", linewidth=0.9)
+    axes.set_title(f"mean {mean:.1f}", color=PATH)
     axes.set_xlabel(label)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))

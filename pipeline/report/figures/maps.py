@@ -5,20 +5,22 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import Collection
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from catalog import Grid
 from pipeline.report.figures.cast import Cast
-from pipeline.report.figures.errors import ERROR_COLOURS, ERROR_NORM
 from pipeline.report.figures.plate import Plate, new_figure
+from pipeline.report.figures.scales import (
+    ANGLE_COLOURS,
+    ANGLE_NORM,
+    ERROR_COLOURS,
+    ERROR_NORM,
+    drawable,
+)
 from pipeline.report.figures.view import Result, TileView, absent
-from tasks.types import Mesh
 
 NAME = "error_and_smoothness"
-ANGLE_COLOURS, ANGLE_NORM = "viridis_r", LogNorm(0.1, 60)
-"""Degrees; logarithmic, as smooth and rough differ by powers of ten."""
 
 
 def plate(view: TileView, cast: Cast) -> Plate:
@@ -36,16 +38,15 @@ def plate(view: TileView, cast: Cast) -> Plate:
 
 def draw(view: TileView, columns: dict[str, str]) -> Figure:
     """Draw one column per label and variant."""
-    figure = new_figure(4.9)
+    figure = new_figure(4.6)
     axes = figure.subplots(2, len(columns), sharex=True, sharey=True, squeeze=False)
     drawn: list[tuple[AxesImage, Collection]] = []
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
         found = view.results[variant]
-        drawn.append((_errors(upper, view, variant), _angles(lower, found.mesh, view.grid)))
-        drawn[-1][1].set_array(np.ma.masked_invalid(found.angles))
+        drawn.append((_errors(upper, view, variant), _angles(lower, found, view.grid)))
         _titles(upper, lower, label, found)
     for row, (artist, text) in enumerate(zip(drawn[0], ("error (m)", "angle (°)"), strict=True)):
-        bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=24)
+        bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=22, shrink=0.85)
         bar.set_label(text)
         bar.ax.yaxis.set_major_formatter("{x:g}")
     _places(axes, view.grid)
@@ -54,13 +55,14 @@ def draw(view: TileView, columns: dict[str, str]) -> Figure:
 
 def _errors(axes: Axes, view: TileView, variant: str) -> AxesImage:
     size = (0.0, view.grid.width * view.grid.cell, 0.0, view.grid.height * view.grid.cell)
-    error = np.ma.masked_invalid(view.error(variant))
+    error = drawable(view.error(variant))
     return axes.imshow(
         error, cmap=ERROR_COLOURS, norm=ERROR_NORM, extent=size, origin="upper", interpolation="nearest"
     )
 
 
-def _angles(axes: Axes, mesh: Mesh, grid: Grid) -> Collection:
+def _angles(axes: Axes, found: Result, grid: Grid) -> Collection:
+    mesh = found.mesh
     x = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west)
     y = mesh.vertices[:, 1] + (mesh.origin[1] - grid.south)
     # Pixels inside the PDF: a hundred thousand triangles would make it slow to open.
@@ -68,7 +70,7 @@ def _angles(axes: Axes, mesh: Mesh, grid: Grid) -> Collection:
         x,
         y,
         mesh.faces,
-        facecolors=np.zeros(len(mesh.faces)),
+        facecolors=drawable(found.angles),
         cmap=ANGLE_COLOURS,
         norm=ANGLE_NORM,
         edgecolors="none",

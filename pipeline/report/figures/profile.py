@@ -17,9 +17,9 @@ from pipeline.report.figures.view import TileView, absent
 from tasks.types import Floats
 
 NAME = "road_profile"
-CLOSE_M = 0.6
+CLOSE_M = 0.5
 """Half the height of the close view of the errors."""
-HEADROOM = 0.6
+HEADROOM = 0.25
 """Of the road's own height range, shown above and below it; what stands over the road is cut off there."""
 
 
@@ -27,9 +27,10 @@ def plate(view: TileView, cast: Cast) -> Plate:
     """Draw the path, the heights along it and their errors."""
     row, col = longest_route(view.street)
     caption = (
-        f"{view}: heights along a vehicle's path (red, the longest way along the tile's roads) in the raw "
-        f"DSM, on the plane and on FlexRoad, over {view.against} (top), and their differences from it "
-        f"(bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are vehicles, crowns and lines over the road."
+        f"{view}: heights along a vehicle's path (red: the longest way along the tile's roads, on their "
+        f"right) in the raw DSM, on the plane and on FlexRoad, over {view.against} (top), and their "
+        f"differences from it (bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are what stands on the "
+        "road or hangs over it."
     )
     missing = absent((("Plane", cast.plane),)) or ("" if row.size > 1 else "the tile has no road")
     if missing or cast.plane is None:
@@ -78,7 +79,19 @@ def _map(axes: Axes, view: TileView, row: Floats, col: Floats, at: Floats) -> No
     for distance in np.arange(0, at[-1] + 1, 100):
         i = int(np.searchsorted(at, distance).clip(0, at.size - 1))
         axes.plot(x[i], y[i], "o", color=PATH, markersize=2.5)
-        axes.annotate(f"{distance:.0f} m", (x[i], y[i]), (3, 3), textcoords="offset points", fontsize=6)
+        # Towards the middle of the map, or labels of the ends would stand outside.
+        right, up = x[i] < x.max() / 2, y[i] < y.max() / 2
+        axes.annotate(
+            f"{distance:.0f} m",
+            (x[i], y[i]),
+            (4 if right else -4, 4 if up else -4),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            va="bottom" if up else "top",
+            fontsize=6,
+        )
+    axes.set_xlim(0, size[1])
+    axes.set_ylim(0, size[3])
     axes.set_xlabel("m east")
     axes.set_ylabel("m north")
 
@@ -86,7 +99,7 @@ def _map(axes: Axes, view: TileView, row: Floats, col: Floats, at: Floats) -> No
 def _frame(upper: Axes, lower: Axes, at: Floats, heights: dict[str, Floats]) -> None:
     road = np.concatenate([heights["truth"], heights["FlexRoad"]])
     low, high = np.nanmin(road), np.nanmax(road)
-    room = max(HEADROOM * (high - low), 1.5)
+    room = max(HEADROOM * (high - low), 2.0)
     upper.set_ylim(low - room, high + room)
     upper.set_ylabel("height (m)")
     upper.legend(ncols=4, loc="upper left", bbox_to_anchor=(0, 1.22), borderaxespad=0, handlelength=2.2)

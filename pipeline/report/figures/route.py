@@ -1,4 +1,4 @@
-"""The way of a vehicle through a tile: the longest one along the middle of its roads."""
+"""The way of a vehicle through a tile: the longest one along its roads, on the right of them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ EDGE_COST = 8.0
 """How much a way avoids the road's edge: one cell from it a step costs as much as 1 + this in the open."""
 SMOOTHING_CELLS = 3.0
 STEP_CELLS = 0.5
+SIDE = 0.5
+"""Part of the way from the middle of the road to its edge."""
 
 
 def longest_route(road: Bools) -> tuple[Floats, Floats]:
     """Return the way as rows and columns half a cell apart; empty where there is no road.
 
     The two ends are as far from each other as any on the largest connected road, by the shortest way that
-    keeps to the middle. Found by going to the far end twice, which is exact on roads without loops.
+    keeps to the middle. Found by going to the far end twice, which is exact on roads without loops. The way
+    is then moved to the right, halfway to the road's edge, as vehicles drive.
 
     Parameters
     ----------
@@ -42,8 +45,9 @@ def longest_route(road: Bools) -> tuple[Floats, Floats]:
     way = [ends[np.argmax(cost[ends])]]
     while way[-1] != start:
         way.append(before[way[-1]])
-    row, col = np.nonzero(road)
-    return _smooth(row[way].astype(np.float64), col[way].astype(np.float64))
+    middle_row, middle_col = (axis[way].astype(np.float64) for axis in np.nonzero(road))
+    row, col = _smooth(*_to_the_right(middle_row, middle_col, SIDE * clear[road][way]))
+    return row.clip(0, road.shape[0] - 1), col.clip(0, road.shape[1] - 1)
 
 
 def _steps(road: Bools, clear: Floats, number: np.ndarray) -> sparse.coo_array:
@@ -60,6 +64,18 @@ def _steps(road: Bools, clear: Floats, number: np.ndarray) -> sparse.coo_array:
         cost.append(np.hypot(down, right) * (1 + EDGE_COST / room**2))
     n = int(road.sum())
     return sparse.coo_array((np.concatenate(cost), (np.concatenate(a), np.concatenate(b))), shape=(n, n))
+
+
+def _to_the_right(row: Floats, col: Floats, by: Floats) -> tuple[Floats, Floats]:
+    """Move a way by so many cells at right angles to where it goes."""
+    if row.size < 2:
+        return row, col
+    # From cell to cell a way has eight directions only.
+    south, east = (
+        np.gradient(ndimage.gaussian_filter1d(a, SMOOTHING_CELLS, mode="nearest")) for a in (row, col)
+    )
+    length = np.maximum(np.hypot(south, east), 1e-9)
+    return row + by * east / length, col - by * south / length
 
 
 def _smooth(row: Floats, col: Floats) -> tuple[Floats, Floats]:

@@ -95,6 +95,6 @@ def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str
     for variant, x, y in means.itertuples(name=None):
         colour = PATH if variant == full else FLEXROAD
         axes.plot(x, y, "o", color=colour, markersize=4, zorder=3)
-        axes.annotate(labels[variant], (x, y), (0, 5), textcoords="offset points", ha="center", fontsize=6.5)
-    axes.margins(x=0.18)
+        axes.annotate(labels[variant], (x, y), (4, 3), textcoords="offset points", fontsize=6.5)
+    axes.margins(x=0.25, y=0.1)
     axes.set_xlim(left=0)

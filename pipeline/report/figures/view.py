@@ -47,6 +47,8 @@ class TileView:
     """What they are: the catalog's reference, or the DTM in its place."""
     street: Bools
     """Where vehicles drive: the true roads, or the filtered mask where they are not known."""
+    dropped: Bools
+    """Cells of the segmented mask that the filter took away."""
     results: dict[str, Result]
     """By variant."""
 
@@ -102,6 +104,7 @@ def _view(graph: TileGraph, pull: Pull, cast: Cast) -> TileView:
         (data.dtm if data.reference is None else data.reference)[window],
         "the DTM" if data.reference is None else "the reference surface",
         street[window] & ~road.outside[window],
+        (road.mask & ~clusters.mask)[window],
         {variant: _result(graph, pull, variant, core) for variant in cast.names},
     )
 

@@ -1,0 +1,323 @@
+"""The figures draw the run's own numbers."""
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from matplotlib import colormaps
+from PIL import Image
+
+from catalog import Catalog, Grid
+from catalog.errors import CatalogError
+from pipeline.config import compose, load_config
+from pipeline.errors import ConfigError
+from pipeline.execute import SerialExecutor
+from pipeline.report import figures
+from pipeline.report.figures import cast as casting
+from pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
+from pipeline.run import Run, execute
+from pipeline.tables import read_metrics
+
+PLATES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
+BASE = {"fit": {"method": "nurbs", "control_points": [10, 10], "iterations": 30}}
+ABLATION = {
+    **BASE,
+    "variants": {
+        "flat": {"fit": "plane", "sample": "corners"},
+        "cells": {"fit": "raster", "sample": "uniform"},
+        "flexroad": {},
+        "bare": {"ecsrc": "off"},
+        "mixed": {"fit": {"method": "raster", "terrain": "dtm"}, "sample": "uniform"},
+        "fine": {"fit": {"control_points": [14, 14]}},
+        "coarse": {"fit": {"control_points": [8, 8]}},
+        "quadratic": {"fit": {"degree": 2}},
+        "sparse": {"sample": {"road_m": 2, "terrain_m": 20}},
+        "two_things": {"fit": {"degree": 2, "control_points": [8, 8]}},
+    },
+}
+CAST = casting.Cast("flexroad", "flat", "cells", "mixed", "bare")
+
+
+def finished(folder, raw, survey) -> Run:
+    run = Run.create(folder, compose(raw, "quick"), Catalog.read(survey / "catalog.parquet"))
+    assert {result.status for result in execute(run, SerialExecutor())} == {"done"}
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(made_survey, tmp_path_factory) -> Run:
+    return finished(tmp_path_factory.mktemp("figures") / "run", ABLATION, made_survey)
+
+
+@pytest.fixture(scope="module")
+def rows(run) -> pd.DataFrame:
+    return read_metrics(run.path)
+
+
+@pytest.fixture(scope="module")
+def tile(run, rows) -> view.TileView:
+    return view.view_tile(run, view.typical_tile(rows, "flexroad"), CAST)
+
+
+def row_of(rows, tile, variant):
+    return rows[(rows.tile_id == tile.tile_id) & (rows.variant == variant)].iloc[0]
+
+
+# --- which variants ---------------------------------------------------------------------------------------
+
+
+def test_parts_are_told_by_options_not_by_names(run):
+    assert casting.cast_of(run.config) == CAST
+
+
+def test_the_shipped_configurations_have_their_parts():
+    assert casting.cast_of(load_config("paper")) == casting.Cast("flexroad", "plane", "rgt")
+    whole = casting.cast_of(load_config("ablation"))
+    assert whole == casting.Cast("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
+
+
+def test_changes_name_options_and_methods(run):
+    chains = run.config.chains
+    assert casting.changes(chains["flexroad"], chains["flexroad"]) == set()
+    assert casting.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
+    assert casting.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
+
+
+def test_the_typical_tile_is_the_median():
+    table = pd.DataFrame(
+        {"tile_id": list("abcde"), "variant": "v", "l2_road_m": [0.5, 0.1, np.nan, 0.2, 0.3]}
+    )
+    assert view.typical_tile(table, "v") == "d"
+    with pytest.raises(ConfigError, match="--tile"):
+        view.typical_tile(table[table.tile_id == "c"], "v")
+
+
+# --- maps -------------------------------------------------------------------------------------------------
+
+
+def test_maps_draw_what_the_table_says(run, rows, tile, made_survey):
+    columns = {"Plane": "flat", "RGT": "cells", "FlexRoad": "flexroad"}
+    drawn = maps.draw(tile, columns)
+    axes = np.array(drawn.axes[:6]).reshape(2, 3)
+    for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
+        row = row_of(rows, tile, variant)
+        error = upper.images[0].get_array()
+        np.testing.assert_allclose(error[tile.street].mean(), row.l2_road_m, rtol=1e-9)
+        np.testing.assert_allclose(error[~tile.street].mean(), row.l2_terrain_m, rtol=1e-9)
+        angles = lower.collections[0].get_array()
+        assert len(angles) == row.triangles
+        mesh = tile.results[variant].mesh
+        centroids = mesh.vertices[mesh.faces].mean(axis=1) + mesh.origin
+        on_road = tile.street[tile.grid.cells(centroids[:, 0], centroids[:, 1])]
+        if on_road.any() and not on_road.all():
+            np.testing.assert_allclose(angles[on_road].mean(), row.mad_road_deg, rtol=1e-6, atol=1e-8)
+            np.testing.assert_allclose(angles[~on_road].mean(), row.mad_terrain_deg, rtol=1e-6, atol=1e-8)
+        assert upper.get_title() == f"{label}\nroad {row.l2_road_m:.3f} m, terrain {row.l2_terrain_m:.3f} m"
+        assert lower.get_title() == f"road {row.mad_road_deg:.2f}°, terrain {row.mad_terrain_deg:.2f}°"
+
+
+# --- profile ----------------------------------------------------------------------------------------------
+
+
+def test_heights_along_are_bilinear():
+    rows, cols = np.mgrid[:6, :7]
+    at = np.array([0.25, 2.5, 4.75]), np.array([5.5, 0.0, 3.2])
+    np.testing.assert_allclose(profile.along(3.0 * rows - 2.0 * cols, *at), 3 * at[0] - 2 * at[1])
+    holed = np.where((rows == 2) & (cols == 0), np.nan, 1.0)
+    assert np.isnan(profile.along(holed, *at)).tolist() == [False, True, False]
+
+
+def test_the_profile_draws_the_rasters_along_the_path(tile):
+    drawn = profile.plate(tile, CAST).figure
+    path, *_ = next(axes for axes in drawn.axes if axes.images).lines
+    east, north = tile.grid.west + path.get_xdata(), tile.grid.south + path.get_ydata()
+    row, col = tile.grid.cells(east, north)
+    assert tile.street[row, col].mean() > 0.95, "the vehicle keeps to the road"
+    heights, errors = (axes for axes in drawn.axes if not axes.images)
+    lines = {line.get_label(): line for line in heights.lines}
+    # Between cells heights are interpolated; on a plane that is exact.
+    plane = tile.results["flat"].mesh
+    fit = np.linalg.lstsq(np.c_[plane.vertices[:, :2], np.ones(len(plane.vertices))], plane.vertices[:, 2])[0]
+    expected = fit @ np.array([east - plane.origin[0], north - plane.origin[1], np.ones(east.size)])
+    assert len(plane.vertices) == 4
+    np.testing.assert_allclose(lines["Plane"].get_ydata(), expected + plane.origin[2], atol=1e-6)
+    for line in errors.lines:
+        whole = lines[line.get_label()].get_ydata()
+        np.testing.assert_allclose(line.get_ydata(), whole - lines["truth"].get_ydata())
+
+
+def test_the_route_keeps_right_on_a_straight_road():
+    road = np.zeros((80, 120), bool)
+    road[40:50] = True
+    road[40:44, 60] = False  # a hole does not cut the road
+    row, col = route.longest_route(road)
+    assert np.ptp(col) > 110
+    assert road[row.round().astype(int), col.round().astype(int)].mean() > 0.98
+    # Rows count southwards: who drives east has the road's southern half on the right.
+    south = np.median(row) > 44.5
+    assert south == (col[-1] > col[0])
+    assert 1.5 < abs(np.median(row) - 44.5) < 3.5
+
+
+def test_the_route_is_the_longest_of_a_fork():
+    road = np.zeros((150, 150), bool)
+    road[70:78, :] = True
+    road[:75, 40:48] = True
+    row, col = route.longest_route(road)
+    along = np.hypot(np.diff(row), np.diff(col)).sum()
+    # From the northern end to the eastern one.
+    assert abs(along - (74 + 106)) < 20
+    ends = {(round(row[i] / 149), round(col[i] / 149)) for i in (0, -1)}
+    assert (0, 0) in ends
+    assert any(c == 1 for _, c in ends)
+
+
+@pytest.mark.parametrize("cells", [0, 1, 2])
+def test_a_route_needs_a_road(cells):
+    road = np.zeros((20, 20), bool)
+    road[5, 5 : 5 + cells] = True
+    row, col = route.longest_route(road)
+    assert row.size == col.size <= 4
+
+
+# --- renders ----------------------------------------------------------------------------------------------
+
+
+def test_vertices_have_the_colour_of_the_error_under_them(tile):
+    colours = renders.vertex_colours(tile, "cells")
+    mesh = tile.results["cells"].mesh
+    row, col = tile.grid.cells(mesh.vertices[:, 0] + mesh.origin[0], mesh.vertices[:, 1] + mesh.origin[1])
+    error = tile.error("cells")[row, col]
+    colour = colormaps[renders.ERROR_COLOURS]
+    worst = np.argmax(error)
+    assert tuple(colours[worst]) == colour(renders.ERROR_NORM(error[worst]), bytes=True)[:3]
+    exact = error < renders.ERROR_NORM.vmin
+    assert exact.any()
+    assert (colours[exact] == colour(-1.0, bytes=True)[:3]).all(), "no error at all is the scale's good end"
+
+
+def test_the_square_that_is_drawn_holds_most_of_what_was_dropped():
+    grid = Grid("EPSG:25832", 1000.0, 2250.0, 1.0, 250, 250)
+    dropped = np.zeros(grid.shape, bool)
+    dropped[10, 10] = dropped[200, 150:160] = True
+    west, south, east, north = renders.busiest(dropped, grid)
+    assert (east - west, north - south) == (renders.CLOSE_M, renders.CLOSE_M)
+    assert west <= 1150 < 1160 <= east
+    assert south <= 2049 < 2050 <= north
+    small = Grid("EPSG:25832", 1000.0, 2060.0, 1.0, 60, 50)
+    assert renders.busiest(np.zeros(small.shape, bool), small) == (1000.0, 2010.0, 1050.0, 2060.0)
+
+
+# --- trade-off --------------------------------------------------------------------------------------------
+
+
+def test_the_trade_off_draws_the_means_of_the_table(run, rows):
+    drawn = trade_off.plate(run.config, "flexroad", rows).figure
+    expected = {
+        "Control grid": ["coarse", "flexroad", "fine"],
+        "Degree p = q": ["quadratic", "flexroad"],
+        "Sampling, road / terrain (m)": ["flexroad", "sparse"],
+    }
+    assert [axes.get_title() for axes in drawn.axes] == list(expected)
+    means = rows.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
+    for axes, variants in zip(drawn.axes, expected.values(), strict=True):
+        np.testing.assert_array_equal(axes.lines[0].get_xydata(), means.loc[variants].to_numpy())
+        red = [line.get_xydata()[0] for line in axes.lines[1:] if line.get_color() == trade_off.PATH]
+        np.testing.assert_array_equal(red, [means.loc["flexroad"].to_numpy()])
+    assert [text.get_text() for text in drawn.axes[0].texts] == ["8×8", "10×10", "14×14"]
+    assert [text.get_text() for text in drawn.axes[2].texts] == ["1 / 10", "2 / 20"]
+
+
+# --- data set ---------------------------------------------------------------------------------------------
+
+
+def test_statistics_are_those_of_the_rasters_and_the_table(run, rows, made_survey):
+    table = dataset.statistics(run, "flexroad", rows).set_index("tile_id")
+    assert list(table.index) == [tile.id for tile in run.catalog.tiles]
+    for tile in run.catalog.tiles:
+        (path,) = tile.paths(tile.layer("dsm"))
+        with rasterio.open(path) as file:
+            heights = file.read(1, masked=True)
+        assert table.height_range_m[tile.id] == pytest.approx(float(heights.max() - heights.min()), abs=1e-4)
+        with rasterio.open(tile.paths(tile.layer("reference_road"))[0]) as file:
+            share = 100 * (file.read(1) > 0).mean()
+        assert table.road_percent[tile.id] == pytest.approx(share, abs=0.5)
+
+
+def test_the_data_set_is_drawn_whole():
+    table = pd.DataFrame(
+        {
+            "tile_id": list("abcdef"),
+            "stratum": ["rural", "urban", "urban", "rural", "urban", "harbour"],
+            "road_percent": [5.0, 18, 22, 4, 25, 9],
+            "height_range_m": [60.0, 30, 35, 80, np.nan, 20],
+        }
+    )
+    bars, roads, heights = dataset.draw(table).axes
+    assert [label.get_text() for label in bars.get_xticklabels()] == ["urban", "rural", "harbour"]
+    assert [bar.get_height() for bar in bars.patches] == [3, 2, 1]
+    assert sum(bar.get_height() for bar in roads.patches) == 6
+    assert sum(bar.get_height() for bar in heights.patches) == 5
+    assert roads.lines[0].get_xdata()[0] == pytest.approx(83 / 6)
+    assert heights.lines[0].get_xdata()[0] == pytest.approx(45)
+
+
+# --- all of them ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick_renders(monkeypatch):
+    """Draw no meshes: that is `test_render`'s, and takes seconds."""
+    buffer = io.BytesIO()
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(buffer, format="png")
+    monkeypatch.setattr(renders, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes, buffer.getvalue()))
+
+
+@pytest.mark.usefixtures("quick_renders")
+def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
+    for name in ("one", "two"):
+        assert figures.write_figures(run, tmp_path / name) == []
+    page = (tmp_path / "one" / "figures.md").read_text()
+    for plate in PLATES:
+        with Image.open(tmp_path / "one" / f"{plate}.png") as picture:
+            assert picture.width == 2100
+            assert np.asarray(picture.convert("L")).std() > 10, f"{plate} is blank"
+        assert (tmp_path / "one" / f"{plate}.pdf").read_bytes().startswith(b"%PDF")
+        assert f"({plate}.png)" in page
+    assert view.typical_tile(rows, "flexroad") in page
+    for file in (tmp_path / "one").iterdir():
+        assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes(), file.name
+
+
+def test_without_opengl_the_others_are_drawn(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(renders, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes))
+    (note,) = figures.write_figures(run, tmp_path)
+    assert "ablation_renders" in note
+    assert "OpenGL" in note
+    assert not list(tmp_path.glob("ablation_renders*"))
+    assert len(list(tmp_path.glob("*.pdf"))) == len(PLATES) - 1
+    assert "OpenGL" in (tmp_path / "figures.md").read_text()
+
+
+def test_a_run_without_variants_says_what_it_lacks(made_survey, tmp_path):
+    only = finished(tmp_path / "run", BASE, made_survey)
+    notes = figures.write_figures(only, tmp_path / "out", only.catalog.tiles[0].id)
+    assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(PLATES[:4])
+    assert all("--config ablation" in note for note in notes)
+    assert (tmp_path / "out" / "dataset.pdf").exists()
+
+
+def test_unknown_tiles_and_variants_are_named(run, tmp_path):
+    with pytest.raises(CatalogError, match="0_0"):
+        figures.write_figures(run, tmp_path, "0_0")
+    with pytest.raises(ConfigError, match="no variant 'nobody'"):
+        figures.write_figures(run, tmp_path, cast=casting.Cast("flexroad", plane="nobody"))
+
+
+def test_the_run_is_left_as_it_is(run, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
+    figures.write_figures(run, tmp_path, cast=casting.Cast("flexroad"))
+    assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before
