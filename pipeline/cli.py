@@ -38,7 +38,7 @@ app.add_typer(configs, name="config")
 
 SEVERAL = ("--tile", "--road-value")
 """Options that take several values in a row."""
-FOLDER_FIRST = ("rerun", "rasters", "nrw")
+FOLDER_FIRST = ("rerun", "figures", "rasters", "nrw")
 """Commands with a folder of their own, which must come first for that."""
 
 
@@ -421,6 +421,23 @@ def tables(
 
     for written in write_comparison(Run.open(path), Run.open(true) if true else None, output):
         _say(str(written))
+
+
+@app.command()
+def figures(
+    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")],
+    tile: Annotated[
+        str | None, typer.Option(help="Tile of the maps; default: the one of median road L2.")
+    ] = None,
+) -> None:
+    """Draw the paper's figures from a run, as PDF and PNG with a page of captions."""
+    from pipeline.report.figures import write_figures
+    from pipeline.run import Run
+
+    for note in write_figures(Run.open(path), output, tile):
+        typer.echo(f"note: {note}", err=True)
+    _say(f"figures in {output / 'figures.md'}")
 
 
 @app.command()
