@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import pandas as pd
 
@@ -16,8 +17,8 @@ from pipeline.tables import read_metrics
 
 FILE = "metrics.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
-DECIMALS = 6
-"""Of metres and degrees: what is kept is what is printed from, so that the file alone gives the tables."""
+KEPT: Final = "float32"
+"""Type of the figures kept: they are what is printed from, so that the small file alone gives the pages."""
 UNNAMED = "rasters whose catalog does not name them"
 
 
@@ -60,7 +61,7 @@ class Evidence:
         """Return the figures of the complete tiles, ``(tile, variant)`` -> figures."""
         complete = self.tiles.index[self.tiles.complete]
         rows = self.rows[(self.rows.classes == classes) & self.rows.tile_id.isin(complete)]
-        return rows.set_index(["tile_id", "variant"])[list(FIGURES)].sort_index()
+        return rows.set_index(["tile_id", "variant"])[list(FIGURES)].astype("float64").sort_index()
 
 
 def collect(run: Run, true: Run | None = None) -> Evidence:
@@ -91,9 +92,9 @@ def collect(run: Run, true: Run | None = None) -> Evidence:
 
 
 def write_evidence(evidence: Evidence, folder: Path) -> None:
-    """Write the figures, small enough to be kept with the pages made from them."""
+    """Write the figures."""
     buffer = io.BytesIO()
-    kept = evidence.rows.astype(dict.fromkeys(KEYS, "category"))
+    kept = evidence.rows.astype(dict.fromkeys(KEYS, "category") | dict.fromkeys(FIGURES, KEPT))
     kept.to_parquet(buffer, index=False, compression="zstd")
     write_atomic(folder / FILE, buffer.getvalue())
 
@@ -115,7 +116,7 @@ def _rows(run: Run) -> pd.DataFrame:
         raise ConfigError(f"{run.path}: evaluate.classes differs between variants; a table has one")
     rows = read_metrics(run.path)
     rows = rows.assign(dataset=datasets[0] or UNNAMED, classes=classes[0])
-    figures = rows[list(FIGURES)].astype("float64").where(rows.status == "done").round(DECIMALS)
+    figures = rows[list(FIGURES)].astype("float64").where(rows.status == "done").astype(KEPT)
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
 
 

@@ -1,0 +1,84 @@
+"""The published results stay true: pages are those of the figures beside them, and prose quotes them."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.report.content import FIGURES
+from pipeline.report.evidence import FILE, KEPT, read_evidence, write_evidence
+from pipeline.report.tables import pages
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "docs" / "results"
+LARGEST_BYTES = 300_000
+NUMBER = re.compile(r"(?<![\w.])(?:\d+\.\d+|[+-]\d+%)(?![\w.])")
+"""What a reader would take for a result: a decimal, or a signed change in percent."""
+QUOTED = re.compile(r"<!-- results -->(.*?)<!-- /results -->", flags=re.DOTALL)
+
+
+def stale(folder: Path) -> list[str]:
+    """Return the pages that are not what the folder's figures give."""
+    made = pages(read_evidence(folder))
+    return [name for name, text in made.items() if (folder / name).read_text() != text]
+
+
+def unfounded(text: str, folder: Path) -> list[str]:
+    """Return the numbers in a text that stand in none of the folder's tables."""
+    known = set(NUMBER.findall((folder / "tables.md").read_text()))
+    return [number for number in NUMBER.findall(text) if number not in known]
+
+
+def prose(folder: Path) -> dict[str, str]:
+    """Return the texts that quote the tables: pages beside them, and marked parts of README."""
+    generated = ("tables.md", "figures.md")
+    texts = {page.name: page.read_text() for page in folder.glob("*.md") if page.name not in generated}
+    return texts | {"README.md (quoted)": "".join(QUOTED.findall((ROOT / "README.md").read_text()))}
+
+
+@pytest.mark.skipif(not RESULTS.is_dir(), reason="no results are published yet")
+def test_published_results_are_those_of_their_figures():
+    assert (RESULTS / FILE).stat().st_size < LARGEST_BYTES
+    assert stale(RESULTS) == []
+    for name, text in prose(RESULTS).items():
+        assert unfounded(text, RESULTS) == [], name
+
+
+@pytest.fixture
+def published(tmp_path):
+    """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
+    import pandas as pd
+
+    from pipeline.report.evidence import Evidence
+    from pipeline.report.published import TABLE_I
+
+    rows = [
+        ("made", "segmented", f"t{i}", "", row.variant, *map(row.value, FIGURES))
+        for i in range(3)
+        for row in TABLE_I
+    ]
+    keys = ["dataset", "classes", "tile_id", "stratum", "variant"]
+    evidence = Evidence(pd.DataFrame(rows, columns=[*keys, *FIGURES]).astype(dict.fromkeys(FIGURES, KEPT)))
+    write_evidence(evidence, tmp_path)
+    for name, text in pages(evidence).items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_a_page_out_of_date_is_noticed(published):
+    assert stale(published) == []
+    page = published / "tables.md"
+    page.write_text(page.read_text().replace("15.550", "15.551", 1))
+    assert stale(published) == ["tables.md"]
+
+
+def test_figures_out_of_date_are_noticed(published):
+    evidence = read_evidence(published)
+    evidence.rows.loc[0, "l2_road_m"] += 0.01
+    write_evidence(evidence, published)
+    assert "tables.md" in stale(published)
+
+
+def test_a_number_from_nowhere_is_noticed(published):
+    assert unfounded("FlexRoad 0.483 m, RGT 0.415 m, -76%, 0.55 of 24 tiles", published) == ["0.55"]
+    assert unfounded("road L2 is 0.999 m", published) == ["0.999"]
