@@ -2,7 +2,8 @@
 
 Both directions stand here, so that no other file need know the layout. Tile, layer, stratum and date
 travel as tags inside the files; names of files are for people. Heights are float32, which is exact to
-0.03 mm below 512 m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 where there is road.
+0.03 mm below 512 m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 where there is road. The
+orthophoto has pixels of its own size over the same ground.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from catalog.tile import LAYERS, Layer, Tile
 
 HEIGHTS = ("dsm", "dtm", "reference")
 MASKS = ("road_mask", "reference_road")
+PHOTO = "dop"
+KNOWN = (*HEIGHTS, *MASKS, PHOTO)
 
 TILE_TAG, LAYER_TAG, STRATUM_TAG = "FLEXROAD_TILE", "FLEXROAD_LAYER", "FLEXROAD_STRATUM"
 DATASET_TAG = "FLEXROAD_DATASET"
@@ -52,10 +55,10 @@ def write_tile(
     tile_id : str
         The tile's id, unique in the folder.
     grid : Grid
-        The cells of every layer.
+        The cells of every layer but ``dop``.
     layers : mapping of str to (H, W) array
         By layer name: heights (m) as ``dsm``, ``dtm`` and ``reference``, masks as ``road_mask`` and
-        ``reference_road``.
+        ``reference_road``, red, green and blue (uint8) as ``dop``, ``(3, h, w)`` over the grid's bounds.
     stratum : str
         Class of area for reports.
     date : datetime, optional
@@ -66,7 +69,7 @@ def write_tile(
     Raises
     ------
     CatalogError
-        If a layer is unknown here or not on the grid, if the id makes no file name, or if the CRS or
+        If a layer is unknown here or does not fit the grid, if the id makes no file name, or if the CRS or
         the folder does not do.
     """
     if not tile_id or Path(tile_id).name != tile_id:
@@ -92,7 +95,7 @@ def index(folder: Path) -> list[Tile]:
     root = folder.resolve()
     files = [path for name in LAYERS for path in sorted((root / name).glob("*.tif"))]
     if not files:
-        raise CatalogError(f"no LAYER/*.tif in {folder} with LAYER one of {', '.join(HEIGHTS + MASKS)}")
+        raise CatalogError(f"no LAYER/*.tif in {folder} with LAYER one of {', '.join(KNOWN)}")
     by_id: dict[str, list[_File]] = {}
     for path in files:
         file = _read(path)
@@ -114,17 +117,33 @@ class _File:
 
 
 def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
-    if name not in HEIGHTS + MASKS:
-        raise CatalogError(f"no layer {name!r} in a prepared folder; known are {', '.join(HEIGHTS + MASKS)}")
-    if array.shape != grid.shape:
+    if name not in KNOWN:
+        raise CatalogError(f"no layer {name!r} in a prepared folder; known are {', '.join(KNOWN)}")
+    if name == PHOTO:
+        fits = array.ndim == 3 and len(array) == 3 and array.dtype == np.uint8
+        if not fits or array.shape[1] * grid.width != array.shape[2] * grid.height:
+            raise CatalogError(
+                f"layer dop of tile {tile_id} is {array.shape} of {array.dtype}, not 3 x h x w of uint8 "
+                f"with square pixels over {grid.width} x {grid.height} cells"
+            )
+    elif array.shape != grid.shape:
         raise CatalogError(f"layer {name} of tile {tile_id} is {array.shape}, but its grid is {grid.shape}")
 
 
-def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping[str, str]) -> None:
+def _bands(name: str, array: NDArray[Any]) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return what a file holds, ``(bands, H, W)``, and how it is kept."""
+    if name == PHOTO:
+        return array, {"photometric": "RGB", "interleave": "pixel", "predictor": 2}
     if name in HEIGHTS:
-        values, profile = array.astype(np.float32), {"nodata": np.nan, "predictor": 3}
-    else:
-        values, profile = (array != 0).astype(np.uint8), {}
+        return array.astype(np.float32)[None], {"nodata": np.nan, "predictor": 3}
+    return (array != 0).astype(np.uint8)[None], {}
+
+
+def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping[str, str]) -> None:
+    bands, profile = _bands(name, array)
+    count, height, width = bands.shape
+    if name == PHOTO:
+        grid = Grid(grid.crs, grid.west, grid.north, grid.width * grid.cell / width, width, height)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,16 +151,16 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
             temporary,
             "w",
             driver="GTiff",
-            width=grid.width,
-            height=grid.height,
-            count=1,
-            dtype=values.dtype,
+            width=width,
+            height=height,
+            count=count,
+            dtype=bands.dtype,
             crs=CRS.from_string(grid.crs),
             transform=grid.transform,
             compress="deflate",
             **profile,
         ) as dataset:
-            dataset.write(values, 1)
+            dataset.write(bands)
             dataset.update_tags(**tags)
         temporary.replace(path)
     except (OSError, RasterioIOError, CRSError) as error:
@@ -190,21 +209,20 @@ def _date(path: Path, tag: str | None) -> datetime | None:
 
 def _tile(files: Iterable[_File], root: Path) -> Tile:
     """Return the tile that files of one id make; the files come in the order of `LAYERS`."""
-    first, *others = files
-    by_layer = {first.layer: first}
-    for file in others:
+    files = list(files)
+    first = next((file for file in files if file.layer != PHOTO), None)
+    if first is None:
+        raise CatalogError(
+            f"{files[0].path} is all there is of tile {files[0].tile_id}; a tile needs heights"
+        )
+    by_layer: dict[str, _File] = {}
+    for file in files:
         if file.layer in by_layer:
             raise CatalogError(
                 f"{by_layer[file.layer].path} and {file.path} both say they are layer {file.layer} "
                 f"of tile {file.tile_id}; remove one"
             )
-        for what in ("grid", "stratum", "dataset"):
-            mine, other = getattr(first, what), getattr(file, what)
-            if mine != other:
-                raise CatalogError(
-                    f"{first.path} and {file.path} of tile {file.tile_id} differ in {what}: "
-                    f"{mine} and {other}; write the tile anew"
-                )
+        _check_alike(first, file)
         by_layer[file.layer] = file
     date = first.date or datetime.fromtimestamp(first.path.stat().st_mtime, UTC)
     return Tile(
@@ -221,3 +239,20 @@ def _tile(files: Iterable[_File], root: Path) -> Tile:
         stratum=first.stratum,
         dataset=first.dataset,
     )
+
+
+def _check_alike(first: _File, file: _File) -> None:
+    """Refuse files that contradict each other about their tile."""
+    for what in ("grid", "stratum", "dataset"):
+        mine, other = getattr(first, what), getattr(file, what)
+        if what == "grid" and file.layer == PHOTO and _same_ground(mine, other):
+            continue
+        if mine != other:
+            raise CatalogError(
+                f"{first.path} and {file.path} of tile {file.tile_id} differ in {what}: "
+                f"{mine} and {other}; write the tile anew"
+            )
+
+
+def _same_ground(one: Grid, other: Grid) -> bool:
+    return one.crs == other.crs and np.allclose(one.bounds, other.bounds, rtol=0, atol=1e-3)

@@ -171,3 +171,41 @@ def test_two_files_of_one_layer_are_named(tmp_path):
     (tmp_path / "dsm" / "b.tif").write_bytes((tmp_path / "dsm" / "a.tif").read_bytes())
     with pytest.raises(CatalogError, match=r"a.tif and .*b.tif both say they are layer dsm of tile a"):
         index(tmp_path)
+
+
+def photo(rows: int = 40, columns: int = 50) -> np.ndarray:
+    return np.random.default_rng(2).integers(0, 256, (3, rows, columns), dtype=np.uint8)
+
+
+def test_a_photo_keeps_its_own_pixels(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dop": photo(), "road_mask": road()}, "urban", TAKEN)
+    (tile,) = index(tmp_path)
+    assert tile.grid == GRID
+    dop, mask = tile.layers
+    assert (dop.name, dop.files, mask.name) == ("dop", ("dop/a.tif",), "road_mask")
+    with rasterio.open(tile.paths(dop)[0]) as file:
+        assert np.array_equal(file.read(), photo())
+        assert file.res == (0.5, 0.5)
+        assert tuple(file.bounds) == GRID.bounds
+        assert [band.name for band in file.colorinterp] == ["red", "green", "blue"]
+
+
+def test_a_photo_whose_pixels_are_no_round_part_of_a_cell_fits(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
+    assert index(tmp_path)[0].layer("dop") is not None
+
+
+@pytest.mark.parametrize("wrong", [photo()[0], photo()[:2], photo().astype(float), photo(40, 40)])
+def test_what_is_no_photo_of_the_tile_is_refused(tmp_path, wrong):
+    with pytest.raises(CatalogError, match="layer dop of tile a is .* over 25 x 20 cells"):
+        write_tile(tmp_path, "a", GRID, {"dop": wrong})
+
+
+def test_a_photo_alone_is_no_tile_and_must_lie_on_it(tmp_path):
+    write_tile(tmp_path, "a", GRID, {"dop": photo()})
+    with pytest.raises(CatalogError, match="dop/a.tif is all there is of tile a"):
+        index(tmp_path)
+    moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
+    write_tile(tmp_path, "a", moved, {"dsm": heights()})
+    with pytest.raises(CatalogError, match=r"dsm/a.tif and .*dop/a.tif of tile a differ in grid"):
+        index(tmp_path)
