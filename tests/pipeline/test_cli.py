@@ -55,6 +55,17 @@ def test_spread_repeats_the_option_for_each_value():
     assert spread(["rerun", "--tile", "a", "RUN"]) == ["rerun", "--tile", "a", "RUN"]
 
 
+def test_figures(finished, tmp_path):
+    tile = Catalog.read(finished / "catalog.parquet").tiles[1].id
+    said = flexroad("figures", "--tile", tile, finished, "-o", tmp_path)
+    assert str(tmp_path / "figures.md") in said
+    assert tile in (tmp_path / "figures.md").read_text()
+    # A run without the ablation has these, and says what it lacks.
+    drawn = ["dataset.pdf", "error_and_smoothness.pdf", "road_profile.pdf"]
+    assert sorted(path.name for path in tmp_path.glob("*.pdf")) == drawn
+    assert "no tile '0_0'" in flexroad("figures", finished, "--tile", "0_0", "-o", tmp_path, expect=2)
+
+
 def test_status(finished):
     found = json.loads(flexroad("status", finished, "--json"))
     counts = {key: found[key] for key in ("tiles", "done", "failed", "cached", "pending")}
