@@ -26,6 +26,10 @@ BENDS = ((3.7, 0.06), (7.9, 0.14))
 """Wavelength and amplitude of a line's bends, in blocks."""
 JITTER = 0.15
 """Greatest shift of a line from its place in the lattice, in blocks."""
+MEDIAN_M = 1.5
+"""Half width of the strip between two carriageways."""
+MEDIAN_END_M = 10.0
+"""From a crossing to the median's nose, and from there to its full width."""
 OUT_OF_STEP = 0.6
 """Greatest phase difference (rad) of a line's bends from those all lines share: blocks stay blocks."""
 
@@ -62,6 +66,10 @@ class Street:
     half_width_m: float
     """Half of the carriageway."""
     stratum: Stratum
+    cross_slope: float = 0.0
+    """One-sided fall of the carriageway, on top of its crown."""
+    median_m: float = 0.0
+    """Half of the strip that parts the two carriageways; 0 where there is one."""
 
     @property
     def runs_along_y(self) -> bool:
@@ -83,6 +91,20 @@ class Street:
         foot = np.clip(along + step, self.start, self.end)
         return foot, np.hypot(across - self.line.across(foot), along - foot)
 
+    def lateral(self, x: Floats, y: Floats, along: Floats) -> Floats:
+        """Return the signed offset of points from their foot, across the street only (m).
+
+        Beyond the street's ends it shrinks to 0 on the axis: no step where a dead end's sides meet.
+        """
+        across = x if self.runs_along_y else y
+        offset: Floats = (across - self.line.across(along)) * np.sqrt(1 + self.line.slope(along) ** 2)
+        return offset
+
+    def strip(self, along: Floats) -> Floats:
+        """Return half of the median's width (m); it ends before the crossings."""
+        inside = np.minimum(along - self.start, self.end - along) - MEDIAN_END_M
+        return self.median_m * np.clip(inside / MEDIAN_END_M, 0, 1)
+
     def point(self, along: Any, lateral: Any) -> tuple[Any, Any]:
         """Return x and y of points beside the centre line (``lateral`` m, to either side)."""
         slope = self.line.slope(along)
@@ -102,6 +124,8 @@ class Stream:
     """A watercourse half-way between two neighbouring lines."""
 
     banks: tuple[Line, Line]
+    paved: bool = False
+    """Whether it is a sunken road instead."""
 
     def distance(self, x: Floats, y: Floats) -> Floats:
         """Return the distance from the stream's axis (m)."""
@@ -122,10 +146,21 @@ class Plan:
     """Part of the gaps between lines with a stream."""
     stratum: str | None = None
     """The stratum of the whole world, or None for a mix of districts."""
+    turn_deg: float | None = None
+    """Direction of the lattice, or None for one of the seed."""
+    sunken_share: float = 0.0
+    """Part of the other gaps with a sunken road, which streets cross on bridges too."""
+    cross_slope: float = 0.0
+    """Greatest one-sided fall of a street."""
+    medians: float = 0.0
+    """Part of the main streets that are dual carriageways."""
+    roundabouts: float = 0.0
+    """Part of the crossings of two main streets that are roundabouts."""
 
     @cached_property
     def _turn(self) -> tuple[float, float]:
-        angle = generator(self.seed, "turn").uniform(np.pi / 12, np.pi * 5 / 12)
+        drawn = generator(self.seed, "turn").uniform(np.pi / 12, np.pi * 5 / 12)
+        angle = drawn if self.turn_deg is None else math.radians(self.turn_deg)
         return math.cos(angle), math.sin(angle)
 
     def from_map(self, easting: Any, northing: Any) -> tuple[Any, Any]:
@@ -150,10 +185,22 @@ class Plan:
         return [street for street in found if street is not None and _touch(street.box, box)]
 
     def streams(self, box: Box) -> Iterator[Stream]:
-        """Yield the streams that may touch the box; they run along y."""
+        """Yield the streams and sunken roads that may touch the box; they run along y."""
         for i in self._reach(box[0], box[2]):
-            if generator(self.seed, "stream", i).random() < self.stream_share:
-                yield Stream((_line(self, 0, i), _line(self, 0, i + 1)))
+            wet = generator(self.seed, "stream", i).random() < self.stream_share
+            if wet or generator(self.seed, "sunken", i).random() < self.sunken_share:
+                yield Stream((_line(self, 0, i), _line(self, 0, i + 1)), paved=not wet)
+
+    def circles(self, box: Box, margin_m: float) -> Iterator[tuple[float, float]]:
+        """Yield the centres of the roundabouts in the box grown by a margin; only main streets meet there."""
+        for i in self._reach(box[0], box[2]):
+            for j in self._reach(box[1], box[3]):
+                if i % 2 or j % 2 or generator(self.seed, "circle", i, j).random() >= self.roundabouts:
+                    continue
+                x, y = _crossing(self, i, j)
+                grown = (box[0] - margin_m, box[1] - margin_m, box[2] + margin_m, box[3] + margin_m)
+                if _touch((x, y, x, y), grown):
+                    yield x, y
 
     def _reach(self, low: float, high: float) -> range:
         """Return the indices of lines whose bends may bring them between two coordinates."""
@@ -202,4 +249,15 @@ def _street(plan: Plan, axis: int, line: int, piece: int) -> Street | None:
     width = low + wide * (high - low)
     along = 1 - axis
     key = (axis, line, piece)
-    return Street(key, _line(plan, axis, line), ends[0][along], ends[1][along], width / 2, stratum)
+    lean = plan.cross_slope * generator(plan.seed, "lean", axis, line).uniform(-1, 1)
+    parted = is_main and generator(plan.seed, "median", axis, line).random() < plan.medians
+    return Street(
+        key,
+        _line(plan, axis, line),
+        ends[0][along],
+        ends[1][along],
+        width / 2 + parted * MEDIAN_M,
+        stratum,
+        lean,
+        parted * MEDIAN_M,
+    )

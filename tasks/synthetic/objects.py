@@ -83,45 +83,13 @@ class Spot:
     """What it takes the patch for."""
 
 
-@dataclass(frozen=True)
-class Objects:
-    """Everything that stands between a survey and the truth, near one tile."""
+def houses(
+    streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float, storeys: float
+) -> tuple[House, ...]:
+    """Return the houses along both sides of streets, none of them on a road or in a stream.
 
-    houses: tuple[House, ...]
-    crowns: tuple[Crown, ...]
-    cars: tuple[Car, ...]
-    spots: tuple[Spot, ...]
-
-
-def populate(
-    streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float, errors: float
-) -> Objects:
-    """Return the objects of some streets.
-
-    Parameters
-    ----------
-    streets : sequence of Street
-        Whose objects are wanted.
-    seed : int
-        The world.
-    ground_at : callable
-        The ground with all streets that are near.
-    density : float
-        Part of the houses, trees and cars that is there, 0 to 1.
-    errors : float
-        Number of the segmentation's patches, 1 as usual.
+    Of a stratum's houses the part ``density`` is there, ``storeys`` times as high.
     """
-    built = houses(streets, seed, ground_at, density)
-    return Objects(
-        built,
-        crowns(streets, seed, ground_at, built, density),
-        tuple(car for street in streets for car in cars(street, seed, density)),
-        tuple(spot for street in streets for spot in spots(street, seed, errors)),
-    )
-
-
-def houses(streets: Sequence[Street], seed: int, ground_at: GroundAt, density: float) -> tuple[House, ...]:
-    """Return the houses along both sides of streets, none of them on a road or in a stream."""
     planned = [
         house
         for street in streets
@@ -136,7 +104,7 @@ def houses(streets: Sequence[Street], seed: int, ground_at: GroundAt, density: f
     under = ground_at(xy[..., 0], xy[..., 1])
     free = ((under.edge > 0.5) & (under.trough == 0)).all(axis=0)
     return tuple(
-        replace(house, eaves=float(base) + house.eaves)
+        replace(house, eaves=float(base) + storeys * house.eaves)
         for house, base, ok in zip(planned, under.bare[-1], free, strict=True)
         if ok
     )
@@ -168,10 +136,18 @@ def _footprint(house: House, spread: Floats) -> Floats:
 
 
 def crowns(
-    streets: Sequence[Street], seed: int, ground_at: GroundAt, built: Sequence[House], density: float
+    streets: Sequence[Street],
+    seed: int,
+    ground_at: GroundAt,
+    built: Sequence[House],
+    density: float,
+    gardens: float,
 ) -> tuple[Crown, ...]:
-    """Return the trees at the kerbs, whose crowns hang over the road, and those in the gardens."""
-    planned = [_trees(street, generator(seed, "crowns", *street.key)) for street in streets]
+    """Return the trees at the kerbs, whose crowns hang over the road, and those in the gardens.
+
+    Of a stratum's trees the part ``density`` is there; ``gardens`` is the number of garden trees, 1 as usual.
+    """
+    planned = [_trees(street, generator(seed, "crowns", *street.key), gardens) for street in streets]
     if not planned:
         return ()
     x, y, radius, height, hides, chance = np.concatenate(planned, axis=1)
@@ -187,9 +163,9 @@ def crowns(
     )
 
 
-def _trees(street: Street, rng: np.random.Generator) -> Floats:
+def _trees(street: Street, rng: np.random.Generator, gardens: float) -> Floats:
     """Return x, y, radius, height, whether it hides the road, and a thinning chance, one column a tree."""
-    along, lateral, radius = np.concatenate([_avenue(street, rng), _gardens(street, rng)], axis=1)
+    along, lateral, radius = np.concatenate([_avenue(street, rng), _gardens(street, rng, gardens)], axis=1)
     height = radius * rng.uniform(2.2, 3.2, radius.size) + 1.0
     hides = rng.random(radius.size) < HIDING
     return np.stack([*street.point(along, lateral), radius, height, hides, rng.random(radius.size)])
@@ -206,9 +182,9 @@ def _avenue(street: Street, rng: np.random.Generator) -> Floats:
     return np.stack([along, lateral, rng.uniform(2.0, 4.2, along.size)])
 
 
-def _gardens(street: Street, rng: np.random.Generator) -> Floats:
+def _gardens(street: Street, rng: np.random.Generator, share: float) -> Floats:
     """Return the same of the trees away from the kerb."""
-    count = rng.poisson(street.stratum.garden_trees)
+    count = rng.poisson(street.stratum.garden_trees * share)
     along = rng.uniform(street.start, street.end, count)
     lateral = rng.choice((-1.0, 1.0), count) * (street.half_width_m + rng.uniform(2, GARDEN_M, count))
     return np.stack([along, lateral, rng.uniform(1.5, 4.5, count)])

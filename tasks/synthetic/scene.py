@@ -8,19 +8,24 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.ndimage import gaussian_filter
 
 from catalog.grid import Grid
 from tasks.errors import TaskError
-from tasks.options import Options
+from tasks.synthetic.mixing import mixed
 from tasks.synthetic.network import Box, Plan
 from tasks.synthetic.noise import Waves, generator, waves
-from tasks.synthetic.objects import GroundAt, populate
-from tasks.synthetic.spoilers import Canvas, segmentation, surface_model
+from tasks.synthetic.objects import GroundAt
+from tasks.synthetic.options import DEFAULTS, SceneOptions
+from tasks.synthetic.plants import growth
+from tasks.synthetic.population import Objects, populate
+from tasks.synthetic.scars import scars
+from tasks.synthetic.spoilers import Canvas, Kind, segmentation, surface_model
 from tasks.synthetic.strata import named
-from tasks.synthetic.surfaces import ground, relief
+from tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
 from tasks.types import Bools, Floats
+
+__all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 
 OBJECT_REACH_M = 45.0
 """No house, crown, car or patch lies farther than this from its street's centre line."""
@@ -28,28 +33,6 @@ DTM_BLUR_M = 1.0
 """Gaussian smoothing of a terrain model by its interpolation."""
 DTM_GRAIN_M = 3.0
 """Correlation length of a terrain model's noise."""
-
-
-class SceneOptions(Options):
-    """How the made world looks."""
-
-    block_m: float = Field(100.0, ge=20, description="mean distance of parallel streets (m)")
-    slope: float = Field(0.05, ge=0, le=0.15, description="root mean square slope of the hills")
-    roughness_m: float = Field(0.6, ge=0, description="root mean square height of the terrain's humps (m)")
-    datum_m: float = Field(160.0, ge=-400, le=8000, description="mean height of the world (m)")
-    stream_share: float = Field(
-        0.12, ge=0, le=1, description="part of the gaps between streets with a stream"
-    )
-    density: float = Field(1.0, ge=0, le=1, description="part of houses, trees and cars that is there")
-    mask_errors: float = Field(1.0, ge=0, description="size of the road mask's errors; 0 is a perfect mask")
-    wobble_m: float = Field(0.5, ge=0, description="root mean square offset of the mask's edges (m)")
-    dsm_noise_m: tuple[float, float] = Field(
-        (0.03, 0.1), description="least and greatest noise (standard deviation) of a tile's DSM (m)"
-    )
-    dtm_noise_m: float = Field(0.04, ge=0, description="noise (standard deviation) of the DTM (m)")
-
-
-DEFAULTS = SceneOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,23 +92,23 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
         raise TaskError(f"a seed is 0 or more, not {seed}")
     if stratum is not None:
         named(stratum)
-    plan = Plan(seed, options.block_m, options.stream_share, stratum)
+    plan = _plan(seed, stratum, options)
     # The terrain model is smoothed; the margin keeps the tile's border from showing.
     wide = grid.buffered(4 * DTM_BLUR_M)
     canvas, inner = Canvas.of(wide, plan), wide.window(grid)
     ground_at = _ground_near(canvas, options)
     here = ground_at(canvas.x, canvas.y)
     streets = plan.streets(_box(canvas, OBJECT_REACH_M))
-    objects = populate(streets, seed, ground_at, options.density, options.mask_errors)
+    objects = populate(streets, seed, ground_at, options)
     rng = generator(seed, "survey", *map(int, grid.origin))
-    dsm, kind = surface_model(canvas, here.height, here.deck, objects, rng)
-    dsm += rng.uniform(*options.dsm_noise_m) * rng.standard_normal(dsm.shape)
+    dsm, kind = _survey(canvas, here, objects, options, rng)
     wobble = _wobble(seed, options.wobble_m)
+    bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m)
     return Scene(
         grid=grid,
         stratum=plan.stratum_at(*_centre(canvas)).name,
         dsm=dsm[inner],
-        dtm=_terrain_model(here.bare, wide.cell, options.dtm_noise_m, rng)[inner],
+        dtm=_terrain_model(bare, wide.cell, options.dtm_noise_m, rng)[inner],
         road_mask=segmentation(canvas, here.edge, objects, wobble, options.mask_errors)[inner],
         reference=here.height[inner],
         reference_road=here.road[inner],
@@ -133,13 +116,46 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     )
 
 
+def _plan(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
+    return Plan(
+        seed,
+        options.block_m,
+        options.stream_share,
+        stratum,
+        options.turn_deg,
+        options.sunken_share,
+        options.cross_slope,
+        options.medians,
+        options.roundabouts,
+    )
+
+
+def _survey(
+    canvas: Canvas, here: Ground, objects: Objects, options: SceneOptions, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the surface model with noise (m) and the `Kind` of each cell."""
+    dsm, kind = surface_model(canvas, here.height, here.deck, objects, options.overhang_m, rng)
+    dsm += rng.uniform(*options.dsm_noise_m) * rng.standard_normal(dsm.shape)
+    if options.growth_m > 0:
+        seed = canvas.plan.seed
+        height = options.density * growth(seed, canvas.x, canvas.y, here.edge, options.growth_m, rng)
+        overgrown = (kind == Kind.GROUND) & (height > 0)
+        dsm[overgrown] += height[overgrown]
+        kind[overgrown] = Kind.PLANTS
+    if options.mixed > 0:
+        dsm, chosen = mixed(dsm, here.height, options.mixed, rng)
+        kind[chosen & (kind == Kind.GROUND)] = Kind.MIXED
+    return dsm, kind
+
+
 def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
     """Return the ground as a function of points on and a little beyond the canvas."""
     plan = canvas.plan
-    land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m)
+    land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m, options.embankment_m)
     # Objects may lie beyond the tile, and the streets that lift their ground farther still.
     box = _box(canvas, 2 * OBJECT_REACH_M)
-    return partial(ground, land, plan.streets(box), tuple(plan.streams(box)))
+    circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
+    return partial(ground, land, Ways(plan.streets(box), tuple(plan.streams(box)), circles, options.curb_m))
 
 
 def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:

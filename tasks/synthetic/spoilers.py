@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from catalog.grid import Grid
+from tasks.synthetic.areas import Area
+from tasks.synthetic.linework import Trace
 from tasks.synthetic.network import Plan
 from tasks.synthetic.noise import Waves
-from tasks.synthetic.objects import Car, Crown, House, Objects
+from tasks.synthetic.objects import Car, Crown, House
+from tasks.synthetic.population import Objects
 from tasks.types import Bools, Floats
 
 
@@ -24,10 +27,21 @@ class Kind(IntEnum):
     PARKED_CAR = 3
     MOVING_CAR = 4
     CROWN = 5
+    PLANTS = 6
+    RAIL = 7
+    WIRE = 8
+    MIXED = 9
+    """Ground beside a wall, at a height that is neither's."""
+    PAVED = 10
+    """A car park's ground."""
+    FIELD = 11
+    """Bare ground that looks like a road from above."""
 
 
 GAPS_IN_CROWNS = 0.06
 """Part of a crown's cells through which the scan reaches what is below."""
+RAIL_ECHOES, WIRE_ECHOES = 0.3, 0.06
+"""Part of the points along a rail and a wire that give the cell its height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +80,21 @@ def surface_model(
     truth: Floats,
     deck: Bools,
     objects: Objects,
+    overhang_m: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return what a scan sees from above (m, without noise) and the `Kind` of each cell."""
+    """Return what a scan sees from above (m, without noise) and the `Kind` of each cell.
+
+    Low growth and mixed cells come later; roofs reach ``overhang_m`` beyond the walls.
+    """
     dsm, kind = truth.copy(), np.where(deck, Kind.DECK, Kind.GROUND).astype(np.uint8)
+    for area, what in [(a, Kind.PAVED) for a in objects.car_parks] + [
+        (a, Kind.FIELD) for a in objects.fields
+    ]:
+        window, inside = _covered(canvas, area, np.zeros(truth.shape))
+        kind[window][inside] = what
     for house in objects.houses:
-        window, z = _roof(canvas, house)
+        window, z = _roof(canvas, house, overhang_m)
         _raise(dsm[window], kind[window], z, Kind.BUILDING)
     for car in objects.cars:
         window, z = _bodywork(canvas, car)
@@ -83,7 +106,31 @@ def surface_model(
         window, z = _foliage(canvas, crown)
         z = np.where(seen[window], z + ragged[window], -np.inf)
         _raise(dsm[window], kind[window], z, Kind.CROWN)
+    _trace(canvas, dsm, kind, objects.rails, Kind.RAIL, rng)
+    _trace(canvas, dsm, kind, objects.wires, Kind.WIRE, rng)
     return dsm, kind
+
+
+def _trace(
+    canvas: Canvas,
+    dsm: Floats,
+    kind: NDArray[np.uint8],
+    trace: Trace,
+    what: Kind,
+    rng: np.random.Generator,
+) -> None:
+    """Lift the cells under some points of a thin line, in place; a part of the pulses meets it."""
+    share = RAIL_ECHOES if what == Kind.RAIL else WIRE_ECHOES
+    west, south, east, north = canvas.grid.bounds
+    easting, northing = canvas.plan.to_map(trace.x, trace.y)
+    inside = (easting > west) & (easting < east) & (northing > south) & (northing < north)
+    met = inside & (rng.random(inside.size) < share)
+    row, col = canvas.grid.cells(easting[met], northing[met])
+    z = trace.z[met]
+    higher = z > dsm[row, col]
+    row, col, z = row[higher], col[higher], z[higher]
+    np.maximum.at(dsm, (row, col), z)
+    kind[row, col] = what
 
 
 def _raise(dsm: Floats, kind: NDArray[np.uint8], z: Floats, what: Kind) -> None:
@@ -93,11 +140,12 @@ def _raise(dsm: Floats, kind: NDArray[np.uint8], z: Floats, what: Kind) -> None:
     kind[higher] = what
 
 
-def _roof(canvas: Canvas, house: House) -> tuple[tuple[slice, slice], Floats]:
-    window = canvas.around(house.x, house.y, float(np.hypot(house.half_length, house.half_depth)))
+def _roof(canvas: Canvas, house: House, overhang_m: float) -> tuple[tuple[slice, slice], Floats]:
+    reach = float(np.hypot(house.half_length, house.half_depth)) + 2 * overhang_m
+    window = canvas.around(house.x, house.y, reach)
     u, v = canvas.local(window, house.x, house.y, house.heading)
     # The highest point of a cell counts: roofs reach into cells they cover in part.
-    grown = canvas.grid.cell / 4
+    grown = canvas.grid.cell / 4 + overhang_m
     inside = (np.abs(u) <= house.half_length + grown) & (np.abs(v) <= house.half_depth + grown)
     ridge = np.clip(1 - np.abs(v) / house.half_depth, 0, 1)
     return window, np.where(inside, house.eaves + house.rise * ridge, -np.inf)
@@ -143,4 +191,16 @@ def segmentation(canvas: Canvas, edge: Floats, objects: Objects, wobble: Waves, 
         window = canvas.around(x, y, radius + 2)
         away = np.hypot(canvas.x[window] - x, canvas.y[window] - y)
         mask[window][away + error[window] < radius] = road
+    taken = [a for a in (*objects.car_parks, *objects.fields, *objects.false_roofs) if a.as_road]
+    for area in taken if scale > 0 else ():
+        window, inside = _covered(canvas, area, error)
+        mask[window][inside] = True
     return mask
+
+
+def _covered(canvas: Canvas, area: Area, error: Floats) -> tuple[tuple[slice, slice], Bools]:
+    """Return the cells of an area whose edge is off by ``error`` (m)."""
+    window = canvas.around(area.x, area.y, float(np.hypot(area.half_length, area.half_width)) + 2)
+    u, v = canvas.local(window, area.x, area.y, area.heading)
+    beyond = np.maximum(np.abs(u) - area.half_length, np.abs(v) - area.half_width)
+    return window, beyond + error[window] <= 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import EllipsisType
 
 import numpy as np
 
@@ -23,6 +24,10 @@ BED_M = 4.0
 """Half width of a stream's flat bed."""
 BANK_M = 8.0
 """Width of each bank."""
+SUNKEN_M = 3.6
+"""Half width of a sunken road."""
+CIRCLE_M, ISLAND_M = 15.0, 7.0
+"""Radius of a roundabout and of its island."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +40,11 @@ class Relief:
     """Humps and hollows that streets are cut through."""
     datum_m: float
     """Mean height of the world (m)."""
+    grading: Waves
+    """By how much streets lie above or below the hills (m): embankments and cuttings."""
 
 
-def relief(seed: int, slope: float, roughness_m: float, datum_m: float) -> Relief:
+def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankment_m: float = 0.0) -> Relief:
     """Return the relief of a world.
 
     Parameters
@@ -50,6 +57,8 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float) -> Relie
         Root mean square height of the humps (m).
     datum_m : float
         Mean height of the world (m).
+    embankment_m : float
+        Root mean square height of streets over or under the hills (m).
     """
     rng = generator(seed, "relief")
     hills, humps = np.geomspace(320, 2400, 9), np.geomspace(25, 140, 10)
@@ -57,7 +66,9 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float) -> Relie
     heights = slope * hills / (2 * np.pi) * np.sqrt(2 / hills.size)
     long_is_high = humps / np.sqrt(np.mean(humps**2))
     bumps = roughness_m * long_is_high * np.sqrt(2 / humps.size)
-    return Relief(waves(rng, hills, heights), waves(rng, humps, bumps), datum_m)
+    shifts = np.geomspace(160, 500, 5)
+    grading = waves(generator(seed, "grading"), shifts, embankment_m * np.sqrt(2 / shifts.size))
+    return Relief(waves(rng, hills, heights), waves(rng, humps, bumps), datum_m, grading)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +81,8 @@ class Ground:
     """How deep a stream has cut into it (m)."""
     edge: Floats
     """Distance (m) to the nearest carriageway's edge, negative on the road, infinite far away."""
+    over: Floats
+    """The same without the sunken roads: what may lie on a bridge (m)."""
 
     @property
     def bare(self) -> Floats:
@@ -78,8 +91,8 @@ class Ground:
 
     @property
     def deck(self) -> Bools:
-        """Where a bridge carries road and shoulder over a stream."""
-        return (self.edge < SHOULDER_M / 2) & (self.trough > 0)
+        """Where a bridge carries road and shoulder over a stream or a sunken road."""
+        return (self.over < SHOULDER_M / 2) & (self.trough > 0)
 
     @property
     def height(self) -> Floats:
@@ -92,9 +105,19 @@ class Ground:
         return self.edge <= 0
 
 
-def ground(
-    land: Relief, streets: Sequence[Street], streams: Sequence[Stream], x: Floats, y: Floats
-) -> Ground:
+@dataclass(frozen=True, eq=False)
+class Ways:
+    """What is cut into the terrain near some points."""
+
+    streets: Sequence[Street]
+    streams: Sequence[Stream]
+    circles: Sequence[tuple[float, float]] = ()
+    """Centres of roundabouts."""
+    curb_m: float = 0.0
+    """Height of the pavement over the carriageway's edge."""
+
+
+def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
     """Return the ground at points given in the plan's frame, in their shape.
 
     A street lies at the height of the hills under its centre line, with a rounded crossfall. Near
@@ -102,36 +125,86 @@ def ground(
     fade in, so neither kerb nor crossing makes a step.
     """
     hills = land.large(x, y)
-    total, total_weight, heaviest = np.zeros_like(hills), np.zeros_like(hills), np.zeros_like(hills)
-    edge = np.full_like(hills, np.inf)
-    for street in streets:
+    blend = _Blend.of(hills)
+    for street in ways.streets:
         near = _near(street, x, y)
-        if not near.any():
-            continue
-        lift, beyond = _levelled(street, land.large, x[near], y[near])
-        weight = 1 - _smoothstep((beyond - SHOULDER_M) / SLOPE_M)
-        total[near] += weight * (hills[near] + lift)
-        total_weight[near] += weight
-        heaviest[near] = np.maximum(heaviest[near], weight)
-        edge[near] = np.minimum(edge[near], beyond)
-    wild = 1 - heaviest
-    graded = (total + wild * (hills + land.small(x, y))) / (total_weight + wild)
-    return Ground(graded + land.datum_m, _trough(streams, x, y), edge)
+        if near.any():
+            lift, beyond, edge = _levelled(street, land, x[near], y[near])
+            blend.add(near, hills[near] + lift, beyond, edge)
+    for centre in ways.circles:
+        away = np.hypot(x - centre[0], y - centre[1])
+        blend.add(..., hills + land.grading(x, y), away - CIRCLE_M, away - CIRCLE_M)
+        np.maximum(blend.edge, ISLAND_M - away, out=blend.edge)
+    over = blend.edge.copy()
+    for stream in ways.streams:
+        if stream.paved:
+            beyond = stream.distance(x, y) - SUNKEN_M
+            # Streets pass over it on their own level.
+            blend.add(..., hills, beyond, beyond, 1 - blend.heaviest)
+    graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
+    if ways.curb_m:
+        graded = graded + ways.curb_m * _pavement(over)
+    return Ground(graded, _trough(ways.streams, x, y), blend.edge, over)
 
 
-def _levelled(street: Street, hills: Waves, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return by how much the street lifts the hills and the distance from its edge (m).
+@dataclass(frozen=True, eq=False)
+class _Blend:
+    """Heights of streets, weighted by how near they are; filled in place."""
+
+    total: Floats
+    weights: Floats
+    heaviest: Floats
+    edge: Floats
+
+    @classmethod
+    def of(cls, like: Floats) -> _Blend:
+        return cls(np.zeros_like(like), np.zeros_like(like), np.zeros_like(like), np.full_like(like, np.inf))
+
+    def add(
+        self,
+        where: Bools | EllipsisType,
+        height: Floats,
+        beyond: Floats,
+        edge: Floats,
+        share: Floats | float = 1.0,
+    ) -> None:
+        weight = share * (1 - _smoothstep((beyond - SHOULDER_M) / SLOPE_M))
+        self.total[where] += weight * height
+        self.weights[where] += weight
+        self.heaviest[where] = np.maximum(self.heaviest[where], weight)
+        self.edge[where] = np.minimum(self.edge[where], edge)
+
+    def with_terrain(self, terrain: Floats) -> Floats:
+        wild = 1 - self.heaviest
+        blended: Floats = (self.total + wild * terrain) / (self.weights + wild)
+        return blended
+
+
+def _levelled(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return by how much the street lifts the hills and the distances from its outer and any edge (m).
 
     Beyond the edge the lift stays that of the edge: were it level there too, a street that climbs away
     from a crossing would first be pulled down to it.
     """
     along, distance = street.foot(x, y)
+    beyond = distance - street.half_width_m
     inside = np.minimum(street.half_width_m / np.maximum(distance, 1e-9), 1)
     middle_x, middle_y = street.point(along, 0.0)
     at_x, at_y = middle_x + (x - middle_x) * inside, middle_y + (y - middle_y) * inside
     rounded = CROSSFALL * street.half_width_m * np.minimum(distance / street.half_width_m, 1) ** 2
-    lift = hills(middle_x, middle_y) - hills(at_x, at_y) - rounded
-    return lift, distance - street.half_width_m
+    lift = land.large(middle_x, middle_y) - land.large(at_x, at_y) - rounded
+    lift = lift + land.grading(middle_x, middle_y)
+    if street.cross_slope:
+        offset = np.clip(street.lateral(x, y, along), -street.half_width_m, street.half_width_m)
+        lift = lift + street.cross_slope * offset
+    strip = street.strip(along)
+    return lift, beyond, np.where(strip > 0, np.maximum(beyond, strip - distance), beyond)
+
+
+def _pavement(edge: Floats) -> Floats:
+    """Return the curb's profile beside an edge: up at once, level, and out into the terrain."""
+    up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
+    return up - down
 
 
 def _near(street: Street, x: Floats, y: Floats) -> Bools:

@@ -1,0 +1,151 @@
+"""The benchmark: independent tiles in the strata of the paper's dataset GeRoD, with what spoils real tiles.
+
+What the numbers were held against, and what not, is told in ``docs/decisions.md`` ("the benchmark").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from catalog.grid import Grid
+from tasks.synthetic.layout import SOUTH_M, WEST_M
+from tasks.synthetic.noise import generator
+from tasks.synthetic.options import SceneOptions
+
+STRATA = {"urban": 168, "suburban": 23, "rural": 49}
+"""Tiles of the whole benchmark, as in the paper."""
+TILES = sum(STRATA.values())
+SIZE_M = 250
+APART_M = 3000
+"""Between the tiles' corners: farther than the hills' longest wave, so that tiles have nothing in common."""
+COLUMNS = 16
+VARIED = {"block_m": 0.2, "slope": 0.4, "roughness_m": 0.3, "built": 0.3, "trees": 0.4, "growth_m": 0.3}
+"""By how much tiles of one stratum differ: greatest relative deviation from its options."""
+
+PRESET: Mapping[str, SceneOptions] = {
+    "urban": SceneOptions(
+        block_m=102,
+        density=0.9,
+        slope=0.122,
+        roughness_m=0.6,
+        stream_share=0.06,
+        dsm_noise_m=(0.04, 0.1),
+        embankment_m=0.2,
+        cross_slope=0.02,
+        curb_m=0.12,
+        medians=0.2,
+        roundabouts=0.08,
+        sunken_share=0.06,
+        built=0.5,
+        storeys=0.6,
+        towers=0.2,
+        overhang_m=0.4,
+        growth_m=0.7,
+        rails=0.03,
+        wires=0.1,
+        mixed=0.25,
+        car_parks=0.12,
+        fields=0.0,
+        false_roofs=0.015,
+        scars_m=0.25,
+    ),
+    "suburban": SceneOptions(
+        block_m=95,
+        density=0.85,
+        slope=0.122,
+        roughness_m=0.7,
+        stream_share=0.08,
+        dsm_noise_m=(0.04, 0.1),
+        embankment_m=0.3,
+        cross_slope=0.025,
+        curb_m=0.1,
+        medians=0.05,
+        roundabouts=0.1,
+        sunken_share=0.03,
+        built=0.6,
+        towers=0.2,
+        overhang_m=0.5,
+        trees=1.2,
+        growth_m=0.75,
+        rails=0.03,
+        wires=0.3,
+        mixed=0.25,
+        car_parks=0.06,
+        fields=0.03,
+        false_roofs=0.015,
+        scars_m=0.25,
+    ),
+    "rural": SceneOptions(
+        block_m=110,
+        density=0.9,
+        slope=0.122,
+        roughness_m=1.0,
+        stream_share=0.15,
+        dsm_noise_m=(0.04, 0.1),
+        embankment_m=0.8,
+        cross_slope=0.04,
+        medians=0.1,
+        roundabouts=0.06,
+        sunken_share=0.06,
+        built=0.7,
+        towers=0.2,
+        overhang_m=0.5,
+        trees=2.5,
+        growth_m=0.85,
+        rails=0.15,
+        wires=0.25,
+        mixed=0.25,
+        car_parks=0.02,
+        fields=0.15,
+        false_roofs=0.015,
+        scars_m=0.25,
+    ),
+}
+"""What the tiles of a stratum are like on average."""
+
+
+def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, SceneOptions]]:
+    """Return id, grid, stratum and options of the benchmark's tiles, the strata in the paper's shares.
+
+    A smaller survey's tiles are among those of a larger one. Tiles lie on the absolute grid, 3 km apart.
+
+    Parameters
+    ----------
+    tiles : int
+        How many; 240 as in the paper.
+    seed : int
+        The world, from which each tile's options are drawn too.
+    """
+    return [
+        _place(row, stratum, number, seed)
+        for row, (stratum, count) in enumerate(zip(STRATA, _counts(tiles), strict=True))
+        for number in range(count)
+    ]
+
+
+def _counts(tiles: int) -> list[int]:
+    """Return how many tiles of each stratum: the whole parts, then the largest remainders."""
+    exact = [tiles * share / TILES for share in STRATA.values()]
+    counts = [int(number) for number in exact]
+    by_rest = sorted(range(len(exact)), key=lambda i: counts[i] - exact[i])
+    for i in by_rest[: tiles - sum(counts)]:
+        counts[i] += 1
+    return counts
+
+
+def _place(row: int, stratum: str, number: int, seed: int) -> tuple[str, Grid, str, SceneOptions]:
+    down, along = divmod(number, COLUMNS)
+    west = WEST_M + along * APART_M
+    south = SOUTH_M + (down * len(STRATA) + row) * APART_M
+    grid = Grid("EPSG:25832", west, south + SIZE_M, 1.0, SIZE_M, SIZE_M)
+    return f"{west}_{south}", grid, stratum, _varied(PRESET[stratum], generator(seed, "gerod", row, number))
+
+
+def _varied(options: SceneOptions, rng: np.random.Generator) -> SceneOptions:
+    drawn = {
+        name: getattr(options, name) * (1 + rng.uniform(-spread, spread)) for name, spread in VARIED.items()
+    }
+    turn = rng.uniform(0, 90)
+    return SceneOptions(**options.model_dump() | drawn | {"turn_deg": turn})

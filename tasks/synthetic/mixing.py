@@ -1,0 +1,22 @@
+"""Mixed cells: at an edge or a wall, the echo of a cell lies anywhere between top and foot."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from tasks.types import Bools, Floats
+
+WALL_M = 1.5
+"""Least step to a neighbouring cell that counts as a wall."""
+
+
+def mixed(dsm: Floats, truth: Floats, share: float, rng: np.random.Generator) -> tuple[Floats, Bools]:
+    """Return the surface model with a share of the cells at walls mixed (m), and which those are.
+
+    A mixed cell is never below the truth.
+    """
+    low, high = minimum_filter(dsm, 3), maximum_filter(dsm, 3)
+    chosen = (high - low > WALL_M) & (rng.random(dsm.shape) < share)
+    between = np.maximum(low + rng.random(dsm.shape) * (high - low), truth)
+    return np.where(chosen, between, dsm), chosen

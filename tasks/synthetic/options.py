@@ -1,0 +1,62 @@
+"""What a made world is made of."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from tasks.options import Options
+
+
+class SceneOptions(Options):
+    """How the made world looks; what has a default of 0 is not there unless asked for."""
+
+    block_m: float = Field(100.0, ge=20, description="mean distance of parallel streets (m)")
+    turn_deg: float | None = Field(
+        None, ge=0, le=90, description="direction of the streets' lattice; null: drawn from the seed"
+    )
+    slope: float = Field(0.05, ge=0, le=0.25, description="root mean square slope of the hills")
+    roughness_m: float = Field(0.6, ge=0, description="root mean square height of the terrain's humps (m)")
+    datum_m: float = Field(160.0, ge=-400, le=8000, description="mean height of the world (m)")
+    stream_share: float = Field(
+        0.12, ge=0, le=1, description="part of the gaps between streets with a stream"
+    )
+    density: float = Field(1.0, ge=0, le=1, description="part of houses, trees and cars that is there")
+    mask_errors: float = Field(1.0, ge=0, description="size of the road mask's errors; 0 is a perfect mask")
+    wobble_m: float = Field(0.5, ge=0, description="root mean square offset of the mask's edges (m)")
+    dsm_noise_m: tuple[float, float] = Field(
+        (0.03, 0.1), description="least and greatest noise (standard deviation) of a tile's DSM (m)"
+    )
+    dtm_noise_m: float = Field(0.04, ge=0, description="noise (standard deviation) of the DTM (m)")
+
+    embankment_m: float = Field(
+        0.0, ge=0, le=5, description="root mean square height of streets over or under the hills (m)"
+    )
+    cross_slope: float = Field(0.0, ge=0, le=0.08, description="greatest one-sided fall of a street")
+    curb_m: float = Field(0.0, ge=0, le=0.3, description="height of pavements over the carriageway (m)")
+    medians: float = Field(0.0, ge=0, le=1, description="part of the main streets that are dual carriageways")
+    roundabouts: float = Field(
+        0.0, ge=0, le=1, description="part of the crossings of main streets that are roundabouts"
+    )
+    sunken_share: float = Field(
+        0.0, ge=0, le=1, description="part of the other gaps with a sunken road under bridges"
+    )
+
+    built: float = Field(1.0, ge=0, le=1, description="part of a stratum's houses that is there")
+    storeys: float = Field(1.0, gt=0, le=3, description="height of the eaves, of the stratum's")
+    towers: float = Field(0.0, ge=0, le=2, description="towers, chimneys and high-rises per street")
+    overhang_m: float = Field(0.0, ge=0, le=1.5, description="how far roofs reach beyond the walls (m)")
+    trees: float = Field(1.0, ge=0, le=20, description="number of trees away from the kerb, of the stratum's")
+    growth_m: float = Field(0.0, ge=0, le=2, description="mean height of hedges, brambles and crops (m)")
+    rails: float = Field(0.0, ge=0, le=1, description="part of the street sides with a guard rail")
+    wires: float = Field(0.0, ge=0, le=1, description="part of the streets with an overhead line")
+    mixed: float = Field(
+        0.0, ge=0, le=1, description="part of the cells at walls that lie between top and foot"
+    )
+
+    car_parks: float = Field(0.0, ge=0, le=5, description="car parks per street")
+    fields: float = Field(0.0, ge=0, le=5, description="bare fields per street that may pass for road")
+    false_roofs: float = Field(0.0, ge=0, le=1, description="part of the roofs taken for road")
+    scars_m: float = Field(0.0, ge=0, le=2, description="depth of the DTM's scars under houses (m)")
+
+
+DEFAULTS = SceneOptions()
