@@ -216,11 +216,12 @@ def catalog_synthetic(
     tiles: Annotated[int, typer.Option(min=1, help="Number of tiles.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same scenes.")] = 0,
     tile_size: Annotated[int, typer.Option(min=10, help="Size of a tile in m.")] = 250,
+    dop: Annotated[bool, typer.Option("--dop", help="Orthophotos of 0.5 m, too.")] = False,
 ) -> None:
     """Make scenes with known truth: rasters, truth and a catalog."""
     from pipeline.synthesis import write_scenes
 
-    path = write_scenes(output, tiles, seed, tile_size)
+    path = write_scenes(output, tiles, seed, tile_size, dop)
     _say(f"{tiles} tiles in {path}")
     _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(path))} --out RUN")
 

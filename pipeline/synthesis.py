@@ -11,6 +11,7 @@ from catalog.sources import prepared
 from pipeline.errors import ConfigError
 from pipeline.execute import DaskExecutor, Executor, SerialExecutor
 from tasks.synthetic import block, make_scene
+from tasks.synthetic.orthophoto import orthophoto
 
 WORTH_PROCESSES = 12
 """Tiles from which on starting worker processes pays."""
@@ -26,17 +27,18 @@ class SceneJob:
     tile_id: str
     grid: Grid
     seed: int
+    dop: bool
 
 
-def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250) -> Path:
-    """Make a block of tiles of ``size_m``; return the path of its catalog.
+def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250, dop: bool = False) -> Path:
+    """Make a block of tiles of ``size_m``, with orthophotos if asked; return the path of its catalog.
 
     Raises
     ------
     ConfigError
         If the folder cannot be written.
     """
-    jobs = [SceneJob(str(folder), tile_id, grid, seed) for tile_id, grid in block(tiles, size_m)]
+    jobs = [SceneJob(str(folder), tile_id, grid, seed, dop) for tile_id, grid in block(tiles, size_m)]
     executor: Executor = DaskExecutor() if tiles >= WORTH_PROCESSES else SerialExecutor()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -55,9 +57,8 @@ def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250) -> Path
 
 def _write_scene(job: SceneJob) -> str:
     scene = make_scene(job.grid, job.seed)
-    prepared.write_tile(
-        Path(job.folder), job.tile_id, job.grid, scene.layers, scene.stratum, MADE, _name(job)
-    )
+    layers = {**scene.layers, **({"dop": orthophoto(job.grid, job.seed)} if job.dop else {})}
+    prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, _name(job))
     return ""
 
 
