@@ -47,7 +47,7 @@ def longest_route(road: Bools) -> tuple[Floats, Floats]:
         way.append(before[way[-1]])
     middle_row, middle_col = (axis[way].astype(np.float64) for axis in np.nonzero(road))
     row, col = _smooth(*_to_the_right(middle_row, middle_col, SIDE * clear[road][way]))
-    return row.clip(0, road.shape[0] - 1), col.clip(0, road.shape[1] - 1)
+    return _inside(row, col, road.shape)
 
 
 def _steps(road: Bools, clear: Floats, number: np.ndarray) -> sparse.coo_array:
@@ -76,6 +76,14 @@ def _to_the_right(row: Floats, col: Floats, by: Floats) -> tuple[Floats, Floats]
     )
     length = np.maximum(np.hypot(south, east), 1e-9)
     return row + by * east / length, col - by * south / length
+
+
+def _inside(row: Floats, col: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Cut off the ends that lie beyond the tile, as on the right of a road that leaves it askew."""
+    last = shape[0] - 1, shape[1] - 1
+    inside = np.flatnonzero((row >= 0) & (row <= last[0]) & (col >= 0) & (col <= last[1]))
+    kept = slice(inside[0], inside[-1] + 1) if inside.size else slice(0)
+    return row[kept].clip(0, last[0]), col[kept].clip(0, last[1])
 
 
 def _smooth(row: Floats, col: Floats) -> tuple[Floats, Floats]:
