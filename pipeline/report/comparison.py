@@ -117,18 +117,17 @@ def _beside(name: str, rows: tuple[Row, ...], means: Means) -> Iterator[Section]
     for figures in GROUPS:
         table = pd.DataFrame({"variant": [row.label for row in rows]})
         for figure in figures:
+            label = FIGURES[figure]
             ours = [means.mean[row.variant, figure] for row in rows]
             intervals = [means.interval(row.variant, figure) for row in rows]
             paper = [row.value(figure) for row in rows]
-            table[f"{FIGURES[figure]}, paper"] = [_shown(v, figure) for v in paper]
-            table["ours" if len(figures) == 1 else f"{_short(figure)}, ours"] = [
+            table[f"{label}, paper"] = [_shown(v, figure) for v in paper]
+            table[f"{label}, ours"] = [
                 f"{_shown(v, figure)} [{_shown(low, figure)}, {_shown(high, figure)}]"
                 for v, (low, high) in zip(ours, intervals, strict=True)
             ]
-            table["difference" if len(figures) == 1 else f"{_short(figure)}, difference"] = [
-                _signed(a - b, figure) for a, b in zip(ours, paper, strict=True)
-            ]
-        yield Section(f"{name}: {_group(figures)}", table)
+            table[f"{label}, difference"] = [_signed(a - b, figure) for a, b in zip(ours, paper, strict=True)]
+        yield Section(f"{name}: {_short(figures[0]).split()[0]}", table)
 
 
 def _relative(rows: tuple[Row, ...], means: Means) -> Section:
@@ -206,10 +205,6 @@ def _claims(verdicts: dict[str, list[Verdict]]) -> pd.DataFrame:
     return table
 
 
-def _group(figures: tuple[str, ...]) -> str:
-    return _short(figures[0]).split()[0]
-
-
 def _short(figure: str) -> str:
     """Return a figure's name without its unit."""
     return FIGURES[figure].split(" (")[0]
@@ -224,4 +219,5 @@ def _shown(value: float, figure: str) -> str:
 def _signed(value: float, figure: str) -> str:
     if not math.isfinite(value):
         return "–"
-    return f"{value:+,.0f}" if figure == "triangles" else f"{value:+.3f}"
+    # Adding 0 makes a rounded -0.0 plain 0.0.
+    return f"{value:+,.0f}" if figure == "triangles" else f"{round(value, 3) + 0:+.3f}"

@@ -24,6 +24,8 @@ LATEX = {
     ">": "$>$",
 }
 """What pdflatex does not print, or not as the paper does."""
+NARROW = 25
+"""Characters a column of text may have before its lines are broken."""
 
 
 def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ...]:
@@ -99,8 +101,11 @@ def latex_page(found: Comparison) -> str:
 
 
 def _latex(table: pd.DataFrame, caption: str) -> str:
-    kinds = "".join("r" if number else "l" for number in are_numbers(table))
-    body = table.to_latex(index=False, escape=True, column_format=kinds)
+    kinds = "".join(
+        "r" if number else "l" if longest <= NARROW else "p{0.15\\linewidth}"
+        for number, longest in zip(are_numbers(table), _longest(table), strict=True)
+    )
+    body = _grouped(table).to_latex(index=False, escape=True, column_format=kinds, multicolumn_format="c")
     caption = caption.replace("_", r"\_").replace("%", r"\%")
     for plain, printed in LATEX.items():
         body, caption = body.replace(plain, printed), caption.replace(plain, printed)
@@ -108,3 +113,17 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
         "\\begin{table*}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
         f"\\caption{{{caption}}}\n{body}\\end{{table*}}"
     )
+
+
+def _longest(table: pd.DataFrame) -> list[int]:
+    """Return the length of each column's longest cell."""
+    return [max(map(len, column), default=0) for _, column in table.items()]
+
+
+def _grouped(table: pd.DataFrame) -> pd.DataFrame:
+    """Write "L2 road (m), paper" and "L2 road (m), ours" as two columns below one head."""
+    first, *others = [str(column).split(", ") for column in table.columns]
+    if any(len(parts) != 2 for parts in others):
+        return table
+    pairs = [("", *first), *((parts[0], parts[1]) for parts in others)]
+    return table.set_axis(pd.MultiIndex.from_tuples(pairs), axis="columns")
