@@ -24,8 +24,8 @@ LATEX = {
     ">": "$>$",
 }
 """What pdflatex does not print, or not as the paper does."""
-NARROW = 25
-"""Characters a column of text may have before its lines are broken."""
+NARROW, SENTENCE = 12, 25
+"""Characters of a column of text: fewer never need a second line, more always do."""
 
 
 def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ...]:
@@ -101,9 +101,12 @@ def latex_page(found: Comparison) -> str:
 
 
 def _latex(table: pd.DataFrame, caption: str) -> str:
+    lengths = [max(map(len, column), default=0) for _, column in table.items()]
+    # Sentences make a page too wide, unless all the columns of text give way.
+    widest = NARROW if max(lengths) > SENTENCE else SENTENCE
     kinds = "".join(
-        "r" if number else "l" if longest <= NARROW else "p{0.15\\linewidth}"
-        for number, longest in zip(are_numbers(table), _longest(table), strict=True)
+        "r" if number else "l" if length <= widest else "p{0.12\\linewidth}"
+        for number, length in zip(are_numbers(table), lengths, strict=True)
     )
     body = _grouped(table).to_latex(index=False, escape=True, column_format=kinds, multicolumn_format="c")
     caption = caption.replace("_", r"\_").replace("%", r"\%")
@@ -113,11 +116,6 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
         "\\begin{table*}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
         f"\\caption{{{caption}}}\n{body}\\end{{table*}}"
     )
-
-
-def _longest(table: pd.DataFrame) -> list[int]:
-    """Return the length of each column's longest cell."""
-    return [max(map(len, column), default=0) for _, column in table.items()]
 
 
 def _grouped(table: pd.DataFrame) -> pd.DataFrame:
