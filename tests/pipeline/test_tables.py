@@ -224,6 +224,7 @@ def test_latex_compiles(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
+        errors="replace",
         check=False,
     )
     assert done.returncode == 0, done.stdout[-2000:]
