@@ -86,7 +86,7 @@ def draw(
         _add_classes(plotter, whole, _edge_opacity(vertices, faces[~road]))
     else:
         # More ambient light than on plain colours: these are read against a colour bar.
-        plotter.add_mesh(whole, scalars="colours", rgb=True, smooth_shading=True, ambient=0.45, diffuse=0.6)
+        plotter.add_mesh(whole, scalars="colours", rgb=True, smooth_shading=True, ambient=0.6, diffuse=0.45)
     _look(plotter, whole.bounds, size[0])
     picture = Image.fromarray(plotter.screenshot(return_img=True))
     plotter.close()

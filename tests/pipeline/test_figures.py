@@ -15,6 +15,7 @@ from pipeline.config import compose, load_config
 from pipeline.errors import ConfigError
 from pipeline.execute import SerialExecutor
 from pipeline.report import figures
+from pipeline.report.evidence import collect
 from pipeline.report.figures import cast as casting
 from pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
 from pipeline.run import Run, execute
@@ -296,6 +297,7 @@ def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
             assert np.asarray(picture.convert("L")).std() > 10, f"{plate} is blank"
         assert (tmp_path / "one" / f"{plate}.pdf").read_bytes().startswith(b"%PDF")
         assert f"({plate}.png)" in page
+    assert page.splitlines()[0] == collect(run).line
     assert view.typical_tile(rows, "flexroad") in page
     for file in (tmp_path / "one").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes(), file.name
@@ -317,6 +319,19 @@ def test_a_run_without_variants_says_what_it_lacks(made_survey, tmp_path):
     assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(PLATES[:4])
     assert all("--config ablation" in note for note in notes)
     assert (tmp_path / "out" / "dataset.pdf").exists()
+
+
+def test_tiles_without_every_variant_are_left_out(made_survey, tmp_path):
+    part = finished(tmp_path / "run", BASE, made_survey)
+    table = read_metrics(part.path)
+    lost = table.tile_id.iloc[0]
+    table.loc[table.tile_id == lost, "status"] = "failed"
+    table.to_parquet(part.path / "metrics.parquet", index=False)
+    figures.write_figures(part, tmp_path / "out")
+    assert "The 3 tiles" in (tmp_path / "out" / "figures.md").read_text()
+    table.assign(status="failed").to_parquet(part.path / "metrics.parquet", index=False)
+    with pytest.raises(ConfigError, match="flexroad status"):
+        figures.write_figures(part, tmp_path / "out")
 
 
 def test_unknown_tiles_and_variants_are_named(run, tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib import rc_context
 
-from pipeline.errors import ConfigError
+from pipeline.report.evidence import collect
 from pipeline.report.figures import dataset, maps, profile, renders, trade_off
 from pipeline.report.figures.cast import Cast, cast_of
 from pipeline.report.figures.plate import STYLE, Plate, save
@@ -38,22 +38,23 @@ def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast
     Raises
     ------
     ConfigError
-        If the run has no finished tile, the tile is not finished or its results cannot be made again.
+        If no tile of the run has every variant, the run mixes data, or the tile's results cannot be made
+        again.
     CatalogError
         If the tile is unknown.
     """
     cast = cast or cast_of(run.config)
+    evidence = collect(run)
     rows = read_metrics(run.path)
-    done = rows[rows.status == "done"]
-    if done.empty:
-        raise ConfigError(f"{run.path} has no finished tile; see `flexroad status {run.path}`")
+    # The tiles of the tables: those with every variant.
+    done = rows[rows.tile_id.isin(evidence.tiles.index[evidence.tiles.complete])]
     with rc_context(STYLE):
         plates = _plates(run, cast, view_tile(run, tile_id or typical_tile(done, cast.full), cast), done)
         missing = [f"no figure {plate.name}: {plate.missing}" for plate in plates if plate.figure is None]
         for plate in plates:
             if plate.figure is not None:
                 save(plate.figure, folder, plate.name)
-    write_atomic(folder / "figures.md", _page(run, plates).encode())
+    write_atomic(folder / "figures.md", _page(evidence.line, plates).encode())
     return missing
 
 
@@ -67,11 +68,8 @@ def _plates(run: Run, cast: Cast, view: TileView, done: dataset.Table) -> list[P
     ]
 
 
-def _page(run: Run, plates: list[Plate]) -> str:
-    sources = sorted(
-        {tile.dataset or "a catalog that does not name its source" for tile in run.catalog.tiles}
-    )
-    parts = [f"# Figures: {run.config.name}", f"Data: {', '.join(sources)}."]
+def _page(data: str, plates: list[Plate]) -> str:
+    parts = [data, "# Figures"]
     for plate in plates:
         drawn = f"![{plate.name}]({plate.name}.png)\n\n{plate.caption}"
         parts.append(drawn if plate.figure is not None else f"No figure `{plate.name}`: {plate.missing}")
