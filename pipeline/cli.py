@@ -213,16 +213,22 @@ def _write_catalog(found: Indexed, output: Path) -> None:
 @catalogs.command("synthetic")
 def catalog_synthetic(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
-    tiles: Annotated[int, typer.Option(min=1, help="Number of tiles.")] = 4,
+    preset: Annotated[
+        str | None, typer.Option(help="gerod: independent tiles like the paper's 240; default: neighbours.")
+    ] = None,
+    tiles: Annotated[
+        int | None, typer.Option(min=1, help="Number of tiles; default: 4, or all of the preset.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same scenes.")] = 0,
-    tile_size: Annotated[int, typer.Option(min=10, help="Size of a tile in m.")] = 250,
+    tile_size: Annotated[int | None, typer.Option(min=10, help="Size of a tile in m; default: 250.")] = None,
     dop: Annotated[bool, typer.Option("--dop", help="Orthophotos of 0.5 m, too.")] = False,
 ) -> None:
     """Make scenes with known truth: rasters, truth and a catalog."""
+    from catalog import Catalog
     from pipeline.synthesis import write_scenes
 
-    path = write_scenes(output, tiles, seed, tile_size, dop)
-    _say(f"{tiles} tiles in {path}")
+    path = write_scenes(output, tiles, seed, tile_size, dop, preset)
+    _say(f"{len(Catalog.read(path).tiles)} tiles in {path}")
     _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(path))} --out RUN")
 
 

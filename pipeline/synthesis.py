@@ -10,11 +10,14 @@ from catalog import Catalog, Grid
 from catalog.sources import prepared
 from pipeline.errors import ConfigError
 from pipeline.execute import DaskExecutor, Executor, SerialExecutor
-from tasks.synthetic import block, make_scene
+from tasks.synthetic import SceneOptions, block, gerod, make_scene
 from tasks.synthetic.orthophoto import orthophoto
 
 WORTH_PROCESSES = 12
 """Tiles from which on starting worker processes pays."""
+PRESETS = ("gerod",)
+TILES, SIZE_M = 4, 250
+"""Number and side (m) of the tiles where nothing else is asked for."""
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
 """The made worlds' date: the same command gives the same files."""
 
@@ -27,19 +30,46 @@ class SceneJob:
     tile_id: str
     grid: Grid
     seed: int
+    stratum: str | None
+    """None for a mix of districts."""
+    options: SceneOptions
+    name: str
+    """What reports call the data."""
     dop: bool
 
 
-def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250, dop: bool = False) -> Path:
-    """Make a block of tiles of ``size_m``, with orthophotos if asked; return the path of its catalog.
+def write_scenes(
+    folder: Path,
+    tiles: int | None,
+    seed: int,
+    size_m: int | None = None,
+    dop: bool = False,
+    preset: str | None = None,
+) -> Path:
+    """Make tiles, a block of neighbours or those of a preset; return the path of their catalog.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they are written.
+    tiles : int, optional
+        How many; by default 4, or all of the preset.
+    seed : int
+        The world.
+    size_m : int, optional
+        Side of a tile (m); 250 by default, and for every preset.
+    dop : bool
+        Whether orthophotos are made, too.
+    preset : str, optional
+        One of `PRESETS`.
 
     Raises
     ------
     ConfigError
-        If the folder cannot be written.
+        If the folder cannot be written, or the preset is unknown or has tiles of another size.
     """
-    jobs = [SceneJob(str(folder), tile_id, grid, seed, dop) for tile_id, grid in block(tiles, size_m)]
-    executor: Executor = DaskExecutor() if tiles >= WORTH_PROCESSES else SerialExecutor()
+    jobs = _jobs(folder, tiles, seed, size_m, dop, preset)
+    executor: Executor = DaskExecutor() if len(jobs) >= WORTH_PROCESSES else SerialExecutor()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for error in executor.map(_write_scene, jobs, _lost):
@@ -55,16 +85,30 @@ def write_scenes(folder: Path, tiles: int, seed: int, size_m: int = 250, dop: bo
     return path
 
 
+def _jobs(
+    folder: Path, tiles: int | None, seed: int, size_m: int | None, dop: bool, preset: str | None
+) -> list[SceneJob]:
+    if preset is None:
+        name, plain = f"synthetic, seed {seed}", SceneOptions()
+        places = [(*place, None, plain) for place in block(tiles or TILES, size_m or SIZE_M)]
+        return [SceneJob(str(folder), t, grid, seed, s, o, name, dop) for t, grid, s, o in places]
+    if preset not in PRESETS:
+        raise ConfigError(f"--preset {preset}: there is {', '.join(PRESETS)}")
+    if size_m not in (None, gerod.SIZE_M):
+        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {gerod.SIZE_M} m; leave it out")
+    name = f"synthetic benchmark {preset}, seed {seed}"
+    return [
+        SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop)
+        for tile_id, grid, stratum, options in gerod.survey(tiles or gerod.TILES, seed)
+    ]
+
+
 def _write_scene(job: SceneJob) -> str:
-    scene = make_scene(job.grid, job.seed)
-    layers = {**scene.layers, **({"dop": orthophoto(job.grid, job.seed)} if job.dop else {})}
-    prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, _name(job))
+    asked = (job.grid, job.seed, job.stratum, job.options)
+    scene = make_scene(*asked)
+    layers = {**scene.layers, **({"dop": orthophoto(*asked)} if job.dop else {})}
+    prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, job.name)
     return ""
-
-
-def _name(job: SceneJob) -> str:
-    """Return what reports call the data."""
-    return f"synthetic, seed {job.seed}"
 
 
 def _lost(job: SceneJob, why: str) -> str:

@@ -36,13 +36,21 @@ class Objects:
     wires: Trace
 
 
-def populate(streets: Sequence[Street], seed: int, ground_at: GroundAt, options: SceneOptions) -> Objects:
+def populate(
+    streets: Sequence[Street],
+    farther: Sequence[Street],
+    seed: int,
+    ground_at: GroundAt,
+    options: SceneOptions,
+) -> Objects:
     """Return the objects of some streets.
 
     Parameters
     ----------
     streets : sequence of Street
         Whose objects are wanted.
+    farther : sequence of Street
+        These and more, whose areas houses keep off.
     seed : int
         The world.
     ground_at : callable
@@ -51,8 +59,8 @@ def populate(streets: Sequence[Street], seed: int, ground_at: GroundAt, options:
         How much of each there is.
     """
     density, errors = options.density, options.mask_errors
-    car_parks = areas.car_parks(streets, seed, ground_at, options.car_parks * density)
-    bare = areas.fields(streets, seed, ground_at, options.fields * errors)
+    car_parks = areas.car_parks(farther, seed, ground_at, options.car_parks * density)
+    bare = areas.fields(farther, seed, ground_at, options.fields * errors)
     built = houses(streets, seed, ground_at, density * options.built, options.storeys)
     built += towers(streets, seed, ground_at, options.towers * density)
     built = areas.off(built, (*car_parks, *bare))

@@ -20,7 +20,7 @@ from tasks.synthetic.options import DEFAULTS, SceneOptions
 from tasks.synthetic.plants import growth
 from tasks.synthetic.population import Objects, populate
 from tasks.synthetic.scars import scars
-from tasks.synthetic.spoilers import Canvas, Kind, segmentation, surface_model
+from tasks.synthetic.spoilers import BARE, Canvas, Kind, segmentation, surface_model
 from tasks.synthetic.strata import named
 from tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
 from tasks.types import Bools, Floats
@@ -99,7 +99,8 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     ground_at = _ground_near(canvas, options)
     here = ground_at(canvas.x, canvas.y)
     streets = plan.streets(_box(canvas, OBJECT_REACH_M))
-    objects = populate(streets, seed, ground_at, options)
+    farther = plan.streets(_box(canvas, 2 * OBJECT_REACH_M))
+    objects = populate(streets, farther, seed, ground_at, options)
     rng = generator(seed, "survey", *map(int, grid.origin))
     dsm, kind = _survey(canvas, here, objects, options, rng)
     wobble = _wobble(seed, options.wobble_m)
@@ -144,7 +145,7 @@ def _survey(
         kind[overgrown] = Kind.PLANTS
     if options.mixed > 0:
         dsm, chosen = mixed(dsm, here.height, options.mixed, rng)
-        kind[chosen & (kind == Kind.GROUND)] = Kind.MIXED
+        kind[chosen & np.isin(kind, BARE) & (dsm > here.height)] = Kind.MIXED
     return dsm, kind
 
 

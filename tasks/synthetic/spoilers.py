@@ -38,6 +38,8 @@ class Kind(IntEnum):
     """Bare ground that looks like a road from above."""
 
 
+BARE = (Kind.GROUND, Kind.DECK, Kind.PAVED, Kind.FIELD)
+"""What the surface model shows at its true height."""
 GAPS_IN_CROWNS = 0.06
 """Part of a crown's cells through which the scan reaches what is below."""
 RAIL_ECHOES, WIRE_ECHOES = 0.3, 0.06

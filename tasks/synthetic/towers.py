@@ -12,7 +12,7 @@ from tasks.synthetic.objects import GroundAt, House
 from tasks.types import Floats
 
 HALF_SIDE_M, HEIGHT_M = (1.5, 7.0), (22.0, 48.0)
-SETBACK_M = (10.0, 28.0)
+SETBACK_M = (10.0, 24.0)
 """From the carriageway's edge to the tower's middle."""
 
 
