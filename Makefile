@@ -26,11 +26,30 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 
-reproduce: $(STAMP) ## The paper's main comparison on synthetic tiles with known truth (TILES=24 SEED=1)
-	$(BIN)/flexroad catalog synthetic -o runs/synthetic-$(TILES)-$(SEED) --tiles $(TILES) --seed $(SEED)
-	$(BIN)/flexroad run --config paper --catalog runs/synthetic-$(TILES)-$(SEED)/catalog.parquet --out runs/reproduce-$(TILES)-$(SEED)
-	$(BIN)/flexroad report runs/reproduce-$(TILES)-$(SEED) --format html
-	$(BIN)/flexroad report runs/reproduce-$(TILES)-$(SEED) --format md
+ifdef GEROD_ROOT
+# The published dataset has no true road mask, and all of its tiles are taken.
+REPRODUCED := runs/gerod
+TRUE :=
+else
+REPRODUCED := runs/synthetic-$(TILES)-$(SEED)
+TRUE := $(REPRODUCED)/true
+endif
+SURVEY := $(REPRODUCED)/survey/catalog.parquet
+RESULTS ?= $(REPRODUCED)/results
+ABLATE = $(BIN)/flexroad run --catalog $(SURVEY) --store $(REPRODUCED)/store
+
+reproduce: $(SURVEY) ## The paper's tables and figures beside ours, on made tiles (TILES=24 SEED=1) or GEROD_ROOT=...
+	$(ABLATE) --config ablation --out $(REPRODUCED)/segmented
+	$(if $(TRUE),$(ABLATE) --config ablation_true --out $(TRUE))
+	$(BIN)/flexroad tables $(REPRODUCED)/segmented $(if $(TRUE),--true $(TRUE)) -o $(RESULTS)
+	$(BIN)/flexroad figures $(REPRODUCED)/segmented -o $(RESULTS)
+
+# Made once: rasters written anew have new times, and all that hangs on them would be computed again.
+runs/synthetic-$(TILES)-$(SEED)/survey/catalog.parquet: $(wildcard tasks/synthetic/*.py) | $(STAMP)
+	$(BIN)/flexroad catalog synthetic --preset gerod -o $(@D) --tiles $(TILES) --seed $(SEED)
+
+runs/gerod/survey/catalog.parquet: configs/gerod.yaml | $(STAMP)
+	$(BIN)/flexroad catalog gerod $(GEROD_ROOT) -o $@
 
 run: $(STAMP) ## Run a catalog: make run CONFIG=paper CATALOG=... OUT=...
 	@test -n "$(CATALOG)" || { echo "error: name a catalog: make run CATALOG=catalog.parquet [CONFIG=$(CONFIG)] [OUT=$(OUT)]" >&2; exit 2; }

@@ -1,0 +1,46 @@
+"""`make reproduce` does what README says of it, in made and in real data."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def commands(tmp_path, *words: str) -> list[list[str]]:
+    """Return the flexroad commands that make would run in a fresh checkout that is set up."""
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    (tmp_path / ".venv").mkdir()
+    for name in ("pyproject.toml", "constraints.txt", ".venv/.installed"):
+        (tmp_path / name).touch()
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "gerod.yaml").touch()
+    done = subprocess.run(
+        ["make", "-n", "reproduce", *words], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    lines = [line.split() for line in done.stdout.splitlines()]
+    return [line[1:] for line in lines if line[0].endswith("flexroad")]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_made_tiles_are_classed_by_both_masks(tmp_path):
+    catalog, first, second, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
+    assert catalog[:2] == ["catalog", "synthetic"]
+    assert {"--preset", "gerod", "--tiles", "3", "--seed", "5"} <= set(catalog)
+    stores = [line[line.index("--store") + 1] for line in (first, second)]
+    assert stores[0] == stores[1]
+    assert ("ablation" in first, "ablation_true" in second) == (True, True)
+    outs = [line[line.index("--out") + 1] for line in (first, second)]
+    assert tables[:4] == ["tables", outs[0], "--true", outs[1]]
+    assert figures[:2] == ["figures", outs[0]]
+    assert tables[-2:] == figures[-2:]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_real_tiles_take_the_place_of_made_ones(tmp_path):
+    catalog, run, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
+    assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
+    assert "ablation" in run
+    assert "--true" not in tables
