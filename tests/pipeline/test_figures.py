@@ -18,6 +18,7 @@ from pipeline.report import figures
 from pipeline.report.evidence import collect
 from pipeline.report.figures import cast as casting
 from pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
+from pipeline.report.figures.plate import DPI
 from pipeline.run import Run, execute
 from pipeline.tables import read_metrics
 
@@ -293,7 +294,7 @@ def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
     page = (tmp_path / "one" / "figures.md").read_text()
     for plate in PLATES:
         with Image.open(tmp_path / "one" / f"{plate}.png") as picture:
-            assert picture.width == 2100
+            assert picture.width == 7 * DPI
             assert np.asarray(picture.convert("L")).std() > 10, f"{plate} is blank"
         assert (tmp_path / "one" / f"{plate}.pdf").read_bytes().startswith(b"%PDF")
         assert f"({plate}.png)" in page

@@ -15,7 +15,7 @@ from pipeline.store import write_atomic
 
 WIDTH_IN = 7.0
 """Width of a page's text."""
-DPI = 300
+DPI = 220
 
 RAW, PLANE, FLEXROAD, TRUTH, PATH = "#f08c00", "#2f9e44", "#1c5fb8", "#8a8f98", "#d6293e"
 """Colours of the paper's Fig. 1: orange, green, blue, and the vehicle's path in red."""

@@ -92,9 +92,19 @@ def draw(means: pd.DataFrame, sweeps: Mapping[str, Mapping[str, str]], full: str
 
 def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str) -> None:
     axes.plot(means.mad_road_deg, means.l2_road_m, color=TRUTH, linewidth=0.8)
-    for variant, x, y in means.itertuples(name=None):
+    for i, (variant, x, y) in enumerate(means.itertuples(name=None)):
         colour = PATH if variant == full else FLEXROAD
         axes.plot(x, y, "o", color=colour, markersize=4, zorder=3)
-        axes.annotate(labels[variant], (x, y), (4, 3), textcoords="offset points", fontsize=6.5)
+        # Above and below in turn: neighbours on a flat stretch would write over each other.
+        up = bool(i % 2)
+        axes.annotate(
+            labels[variant],
+            (x, y),
+            (0, 5 if up else -5),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if up else "top",
+            fontsize=6.5,
+        )
     axes.margins(x=0.25, y=0.1)
     axes.set_xlim(left=0)
