@@ -34,7 +34,7 @@ class RasterFile:
     """What one opening of a file told."""
 
     name: str
-    """Relative to the folder, with forward slashes."""
+    """Relative to the folder, with forward slashes; absolute where it lies elsewhere."""
     crs: str
     """CRS in plan: ``EPSG:25832``, or WKT where there is no code."""
     has_crs: bool
@@ -110,7 +110,7 @@ def opened(
             try:
                 found.append(_open(root, path, crs))
             except _Skip as reason:
-                skipped[str(reason)].append(path.relative_to(root).as_posix())
+                skipped[str(reason)].append(_name(root, path))
     return found, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
 
 
@@ -144,6 +144,11 @@ def matching(root: Path, layer: str, pattern: str) -> list[Path]:
     return paths
 
 
+def _name(root: Path, path: Path) -> str:
+    """Return the path relative to the folder where it lies below it."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
+
 def _open(root: Path, path: Path, crs: str | None) -> RasterFile:
     try:
         with rasterio.open(path) as src:
@@ -156,7 +161,7 @@ def _open(root: Path, path: Path, crs: str | None) -> RasterFile:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")
     if transform.b or transform.d:
         raise _Skip("a rotated raster; turn it north up with gdalwarp")
-    name = path.relative_to(root).as_posix()
+    name = _name(root, path)
     if not wkt and crs is None:
         raise CatalogError(f"{name} carries no CRS; say which it is with --crs, e.g. --crs EPSG:25832")
     west, south, east, north = bounds

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from catalog.grid import Grid
 
-LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road")
+LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and
-terrain heights (m) incl. bridges, true road mask."""
+terrain heights (m) incl. bridges, true road mask, heights of bridge decks alone (m)."""
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ def catalog_nrw(
     min_cover: MinCover = 0.25,
     date: Date = None,
 ) -> None:
-    """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop) into tiles."""
+    """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
     from catalog.sources import nrw
 
     found = nrw.index(
@@ -161,6 +161,7 @@ def catalog_nrw(
         tile_size_m=tile_size,
         date=date.replace(tzinfo=UTC) if date else None,
         min_cover=min_cover,
+        derived=output.parent / f"{output.stem}_bridges",
     )
     _write_catalog(found, output)
 

@@ -24,7 +24,7 @@ from tasks.types import Bools, Floats, TileData
 
 VERSION = 1
 
-HEIGHTS = ("dsm", "dtm", "reference")
+HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
@@ -98,10 +98,20 @@ def load(tile: Tile, options: Options) -> TileData:
         dsm=found["dsm"].values,
         dtm=found["dtm"].values,
         road_mask=_road(tile, "road_mask", found),
-        reference=found["reference"].values if "reference" in found else None,
+        reference=_reference(found),
         reference_road=_road(tile, "reference_road", found),
         notes=tuple(note for mosaic in found.values() for note in mosaic.notes),
     )
+
+
+def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:
+    """Return the true heights: as given, else the paper's extended DTM where bridge decks are known."""
+    if "reference" in found:
+        return found["reference"].values
+    if "bridges" not in found:
+        return None
+    decks = found["bridges"].values
+    return np.where(np.isfinite(decks), decks, found["dtm"].values)
 
 
 def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:

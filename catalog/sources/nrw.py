@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from catalog.bridges import deck_raster
 from catalog.crs import short
 from catalog.cut import Indexed, cut
 from catalog.errors import CatalogError
@@ -65,6 +66,7 @@ def index(
     tile_size_m: float = 250,
     date: datetime | None = None,
     min_cover: float = 0.25,
+    derived: Path | None = None,
 ) -> Indexed:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one counts.
 
@@ -82,6 +84,9 @@ def index(
         When the data was taken; overrules names and tags.
     min_cover : float
         Tiles of which the surface model covers less than this share (0 to 1) are left out.
+    derived : Path, optional
+        Folder for rasters of the bridge points (class 17) of the point clouds, which with the terrain
+        model make the paper's extended DTM; without it the clouds are left unread, with a note.
 
     Raises
     ------
@@ -90,8 +95,10 @@ def index(
     """
     root = root.resolve()
     downloads = _downloads(root)
-    notes = _clouds(root, downloads)
     found: dict[str, list[RasterFile]] = {}
+    bridges, notes = _bridges(root, downloads, derived)
+    if bridges:
+        found["bridges"] = bridges
     for layer in LAYER_OF.values():
         named = [download for download in downloads if download.layer == layer]
         files, skipped = opened(root, layer, [download.path for download in named], CRS)
@@ -154,11 +161,26 @@ def _dated(file: RasterFile, year: int) -> RasterFile:
     return replace(file, taken=datetime(year, 1, 1, tzinfo=UTC))
 
 
-def _clouds(root: Path, downloads: Sequence[Download]) -> list[str]:
-    clouds = [download.path.relative_to(root).as_posix() for download in downloads if download.layer is None]
+def _bridges(
+    root: Path, downloads: Sequence[Download], derived: Path | None
+) -> tuple[list[RasterFile], list[str]]:
+    """Return rasters of the bridge decks in the point clouds, newest first, and notes."""
+    clouds = [download for download in downloads if download.layer is None]
+    names = [download.path.relative_to(root).as_posix() for download in clouds]
     if not clouds:
-        return []
-    return [f"point clouds are not read yet, so the terrain lacks the bridges in {some(clouds)}"]
+        return [], []
+    if derived is None:
+        return [], [f"point clouds are left unread, so the reference lacks the bridges in {some(names)}"]
+    targets, notes = [], []
+    for cloud in clouds:
+        target = derived.resolve() / f"{cloud.path.stem}_bridges.tif"
+        try:
+            if deck_raster(cloud.path, target, cloud.square, CRS):
+                targets.append(target)
+        except CatalogError as error:
+            notes.append(f"skipped {error}")
+    files, skipped = opened(root, "bridges", targets, CRS)
+    return files, [*notes, *skipped]
 
 
 def _without_terrain(tiles: Sequence[Tile]) -> list[str]:

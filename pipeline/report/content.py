@@ -125,7 +125,8 @@ def _reference(run: Run, done: set[str]) -> str:
         "Heights are measured against the catalog's reference surface"
         if truth == len(tiles)
         else f"Heights: {len(tiles) - truth} of {len(tiles)} tiles have no reference surface; "
-        "their DTM stands in, which also supports the fit, so their terrain figures are optimistic"
+        "their DTM stands in (with the bridge decks the catalog has), which also supports the fit, "
+        "so their terrain figures are optimistic"
     )
     segmented = any(chain["evaluate"].classes == "segmented" for chain in run.config.chains.values())
     classes = (

@@ -124,7 +124,7 @@ def test_what_does_not_help_is_said(tmp_path):
     (tmp_path / "3dm_32_356_5699_1_nw.laz").write_bytes(b"points")
     found = index(tmp_path)
     assert found.notes == (
-        "point clouds are not read yet, so the terrain lacks the bridges in 3dm_32_356_5699_1_nw.laz",
+        "point clouds are left unread, so the reference lacks the bridges in 3dm_32_356_5699_1_nw.laz",
         "skipped dom1_32_400_5699_1_nw_2020.tif (dsm): it lies at 356125 5699875 in EPSG:25832, "
         "not where its name says; download it again",
         "skipped dgm1_32_356_5699_1_nw_2020.tif (dtm): not a raster GDAL can read",
@@ -150,3 +150,54 @@ def test_a_folder_without_a_surface_model_is_named(tmp_path):
         index(tmp_path)
     with pytest.raises(CatalogError, match="nowhere does not exist"):
         index(tmp_path / "nowhere")
+
+
+def cloud(path: Path, x, y, z, classes) -> Path:
+    """A classified point cloud in centimetres, as the state packs it."""
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [0.01] * 3, [WEST, NORTH - 1000, 0]
+    points = laspy.LasData(header)
+    points.x, points.y, points.z = (np.asarray(axis) for axis in (x, y, z))
+    points.classification = np.asarray(classes, np.uint8)
+    points.write(path)
+    return path
+
+
+def test_bridge_points_make_the_extended_dtm(tmp_path):
+    """Class 17 alone, the mean per cell, over the DTM; and only as reference: the fit keeps the DTM."""
+    root, derived = tmp_path / "nrw", tmp_path / "derived"
+    dgm = heights(250, 250)
+    write(root / "dom1_32_356_5699_1_nw_2020.tif", dgm + 5, WEST, NORTH)
+    write(root / "dgm1_32_356_5699_1_nw_2020.tif", dgm, WEST, NORTH)
+    x = WEST + np.array([10.2, 10.8, 20.5, 30.5])
+    y = NORTH - np.array([5.5, 5.5, 7.5, 8.5])
+    cloud(root / "3dm_32_356_5699_1_nw.laz", x, y, [200.0, 201.0, 202.0, 203.0], [17, 17, 2, 17])
+    found = index(root, derived=derived)
+    assert found.notes == ()
+    (tile,) = found.tiles
+    made = derived / "3dm_32_356_5699_1_nw_bridges.tif"
+    assert tile.layer("bridges").files == (str(made),)
+    data = load(tile, Options())
+    truth = dgm.astype(np.float64)
+    truth[5, 10], truth[8, 30] = 200.5, 203.0
+    assert np.allclose(data.reference, truth, atol=1e-5)
+    assert np.array_equal(data.dtm, dgm)
+    before = made.stat().st_mtime_ns
+    index(root, derived=derived)
+    assert made.stat().st_mtime_ns == before
+
+
+def test_a_cloud_without_bridges_or_cut_short_costs_nothing(tmp_path):
+    write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
+    write(tmp_path / "dgm1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
+    cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0], [NORTH - 1.0], [100.0], [2])
+    bad = tmp_path / "3dm_32_356_5699_1_nw_2021.laz"
+    bad.write_bytes(b"points")
+    found = index(tmp_path, derived=tmp_path / "derived")
+    (note,) = found.notes
+    assert note.startswith(f"skipped {bad} cannot be read as a point cloud: ")
+    (tile,) = found.tiles
+    assert tile.layer("bridges") is None
+    assert load(tile, Options()).reference is None

@@ -1,0 +1,91 @@
+"""Bridge decks from classified point clouds: what a terrain model lacks of the road.
+
+A cloud is decoded once, in chunks; what is kept of it is a small raster of deck heights, beside the catalog.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+
+from catalog.errors import CatalogError
+from catalog.grid import Bounds
+
+Floats = NDArray[np.float64]
+
+DECK = 17
+"""Class of bridge decks (ASPRS LAS 1.4)."""
+CELL_M = 1.0
+CHUNK = 1_000_000
+"""Points decoded at a time: memory does not grow with the file."""
+
+
+def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
+    """Write the mean height of a cloud's bridge points per cell; tell whether there were any.
+
+    A target that is newer than the cloud is kept.
+
+    Parameters
+    ----------
+    cloud : Path
+        LAS or LAZ file, in ``crs`` and metres.
+    target : Path
+        GeoTIFF to write: float32, NaN where no bridge is.
+    square : Bounds
+        What the raster covers (m); points outside are left out.
+    crs : str
+        CRS of the cloud and the raster.
+
+    Raises
+    ------
+    CatalogError
+        If the cloud cannot be read; the line names it.
+    """
+    if target.exists() and target.stat().st_mtime_ns >= cloud.stat().st_mtime_ns:
+        with rasterio.open(target) as raster:
+            return bool(np.isfinite(raster.read(1)).any())
+    west, south, east, north = square
+    width, height = math.ceil((east - west) / CELL_M), math.ceil((north - south) / CELL_M)
+    total, count = np.zeros(width * height), np.zeros(width * height, np.int64)
+    for x, y, z in _decks(cloud):
+        col, row = np.floor((x - west) / CELL_M).astype(int), np.floor((north - y) / CELL_M).astype(int)
+        inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+        cell = row[inside] * width + col[inside]
+        total += np.bincount(cell, z[inside], minlength=total.size)
+        count += np.bincount(cell, minlength=count.size)
+    with np.errstate(invalid="ignore"):
+        heights = (total / count).reshape(height, width)
+    _write(target, heights, Affine(CELL_M, 0, west, 0, -CELL_M, north), crs)
+    return bool(count.any())
+
+
+def _decks(cloud: Path) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Yield easting, northing and height of the bridge points, chunk by chunk (m)."""
+    import laspy
+
+    try:
+        with laspy.open(cloud) as reader:
+            for points in reader.chunk_iterator(CHUNK):
+                deck = np.asarray(points.classification) == DECK
+                x, y, z = (np.asarray(axis)[deck] for axis in (points.x, points.y, points.z))
+                yield x, y, z
+    except (laspy.LaspyException, OSError, ValueError, RuntimeError) as error:
+        raise CatalogError(f"{cloud} cannot be read as a point cloud: {error}; download it again") from error
+
+
+def _write(target: Path, heights: Floats, transform: Affine, crs: str) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.tmp")
+    rows, cols = heights.shape
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "compress": "deflate", "nodata": np.nan}
+    with rasterio.open(
+        temporary, "w", width=cols, height=rows, transform=transform, crs=crs, **profile
+    ) as raster:
+        raster.write(heights.astype(np.float32), 1)
+    temporary.replace(target)
