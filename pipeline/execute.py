@@ -12,7 +12,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Protocol, TypeVar
 
 from pipeline import ONE_THREAD
@@ -69,6 +69,11 @@ class DaskExecutor:
         from distributed import as_completed
 
         queue = iter(jobs)
+        first = list(islice(queue, 1))
+        if not first:
+            # Nothing to do needs no workers.
+            return
+        queue = chain(first, queue)
         with self._client() as client:
             # Twice the threads keeps every worker busy while constant memory holds the rest back.
             window = max(2, 2 * sum(client.nthreads().values()))

@@ -177,17 +177,31 @@ def execute(
     """
     start = time.perf_counter()
     results: list[TileResult] = []
+
+    def note(result: TileResult) -> None:
+        run.log("tile", **_event(result))
+        watch(result)
+        # The marker keeps the rows of what is done; over a state they would fill the memory here.
+        results.append(result if result.failures else replace(result, rows=()))
+
+    def jobs() -> Iterator[Job]:
+        cold = True
+        # Unlike `Run.graphs`: who wants a tile done wants to know that its sources are gone.
+        for graph in tile_graphs(run.catalog, run.config, run.checksum):
+            if not only(graph):
+                continue
+            if not anew and run.folder(graph.tile.id).done(graph):
+                note(TileResult(graph.tile.id, "cached", ()))
+                continue
+            if cold:
+                warm(run.config)
+                cold = False
+            yield run.job(graph, anew)
+
     run.log("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
-    warm(run.config)
-    # Unlike `Run.graphs`: who wants a tile done wants to know that its sources are gone.
-    graphs = tile_graphs(run.catalog, run.config, run.checksum)
-    jobs = (run.job(graph, anew) for graph in graphs if only(graph))
     try:
-        for result in executor.map(do_tile, jobs, _lost):
-            run.log("tile", **_event(result))
-            watch(result)
-            # The marker keeps the rows of what is done; over a state they would fill the memory here.
-            results.append(result if result.failures else replace(result, rows=()))
+        for result in executor.map(do_tile, jobs(), _lost):
+            note(result)
     finally:
         # Also after an interruption: what is done is in the tables.
         write_tables(run.path, *outcome(run, results))

@@ -161,9 +161,6 @@ class Pull:
 def do_tile(job: Job) -> TileResult:
     """Bring one tile up to date with its graph; never raises for what is one tile's own fault."""
     graph, folder = job.graph, TileFolder.of(Path(job.run), job.graph.tile.id)
-    done = None if job.anew else folder.done(graph)
-    if done is not None:
-        return TileResult(graph.tile.id, "cached", tuple(done["properties"]["flexroad:rows"]))
     pull = Pull(graph, Store(Path(job.store)), job.anew, keep=True)
     rows, failures = [], []
     for variant in graph.variants:
