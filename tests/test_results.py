@@ -82,3 +82,18 @@ def test_figures_out_of_date_are_noticed(published):
 def test_a_number_from_nowhere_is_noticed(published):
     assert unfounded("FlexRoad 0.483 m, RGT 0.415 m, -76%, 0.55 of 24 tiles", published) == ["0.55"]
     assert unfounded("road L2 is 0.999 m", published) == ["0.999"]
+
+
+def test_the_causes_quote_the_figures_by_quarter():
+    import importlib.util
+
+    import pandas as pd
+
+    spec = importlib.util.spec_from_file_location("causes", ROOT / "tests" / "bench" / "bench_causes.py")
+    causes = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(causes)
+    table = causes.by_spoilage(pd.read_parquet(RESULTS / FILE)).grid_55
+    text = (ROOT / "docs" / "causes.md").read_text().replace("\n", " ")
+    for classes in ("segmented", "reference"):
+        *three, last = [f"{change:+.0%}" for change in table[classes]]
+        assert f"{', '.join(three)} and {last}" in text, classes
