@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -134,7 +134,7 @@ def catalog_rasters(
         {name: pattern for name, pattern in asked.items() if pattern is not None},
         road_values=tuple(road_value or ()),
         tile_size_m=tile_size,
-        date=date.replace(tzinfo=UTC) if date else None,
+        date=date,
         crs=crs,
         min_cover=min_cover,
     )
@@ -159,7 +159,7 @@ def catalog_nrw(
         road_mask=road_mask,
         road_values=tuple(road_value or ()),
         tile_size_m=tile_size,
-        date=date.replace(tzinfo=UTC) if date else None,
+        date=date,
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
     )
@@ -179,8 +179,7 @@ def catalog_gerod(
     from catalog.sources import gerod
     from pipeline.config import load_config
 
-    when = date.replace(tzinfo=UTC) if date else None
-    _write_catalog(gerod.index(root, load_config(layout).dataset, date=when), output)
+    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output)
 
 
 @catalogs.command("dsc3d")
@@ -196,8 +195,7 @@ def catalog_dsc3d(
     from catalog.sources import dsc3d
     from pipeline.config import load_config
 
-    when = date.replace(tzinfo=UTC) if date else None
-    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=when), output)
+    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
 
 
 def _write_catalog(found: Indexed, output: Path) -> None:

@@ -131,10 +131,6 @@ class TileFolder:
         (self.path / "item.json").unlink(missing_ok=True)
         write_atomic(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
 
-    def reopen(self) -> None:
-        """Take the marker away: the tile is looked at again."""
-        (self.path / "item.json").unlink(missing_ok=True)
-
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
             found = json.loads((self.path / name).read_bytes())
