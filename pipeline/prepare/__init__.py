@@ -1,0 +1,1 @@
+"""``flexroad prepare``: make rasters and their catalog from points, meshes and photographs."""
