@@ -1,0 +1,284 @@
+"""The rasters of one area: written block by block, published at once as COGs with their catalog.
+
+Until then everything lies in a hidden folder inside the output folder, so that an area that fails leaves
+nothing, and one that is made anew replaces the old one by renaming; the catalog comes last.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from rasterio.errors import CRSError, RasterioError
+from rasterio.windows import Window
+
+from catalog import LAYERS, Catalog, Grid, Layer, Tile
+from catalog.cut import assumed, cut
+from catalog.raster_files import opened, some, zoned
+from pipeline.errors import ConfigError
+from tasks.acquire.types import Photo
+
+HEIGHTS = ("dsm", "dtm", "reference", "bridges")
+PHOTO = "dop"
+BLOCK = 256
+"""Side of the files' inner tiles while they are written (cells)."""
+CATALOG = "catalog.parquet"
+HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
+MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
+PHOTO_PROFILE = {"dtype": "uint8", "nodata": None, "count": 3, "photometric": "RGB", "interleave": "pixel"}
+MIN_COVER = 0.25
+"""Tiles with heights in less than this share of their cells are left out: `load` would refuse them."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was made."""
+
+    catalog: Path
+    tiles: int
+    notes: tuple[str, ...] = ()
+    """What was left out or assumed, one line each."""
+
+    def noting(self, *notes: str) -> Published:
+        """Return the same with more notes in front."""
+        return replace(self, notes=(*notes, *self.notes))
+
+
+class Sheet:
+    """The rasters of one area, in the making; a context manager.
+
+    Parameters
+    ----------
+    out : Path
+        Folder to publish in; made if it is missing.
+    grid : Grid
+        All cells of the area.
+    dop_cell : float, optional
+        Pixel of the orthophoto (m), None if there is none to be.
+    facts : Mapping[str, str]
+        Tags of every file: what it was made from, and how.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    """
+
+    def __init__(self, out: Path, grid: Grid, dop_cell: float | None, facts: Mapping[str, str]) -> None:
+        self.out = out
+        self.grid = grid
+        self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
+        self.facts = dict(facts)
+        self._new = not out.exists()
+        self._open: dict[str, Any] = {}
+        self.scratch = out / f".prepare-{os.getpid()}"
+        """Folder for temporary files of whoever makes the rasters; it goes with the sheet."""
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            _sweep(out)
+            self.scratch.mkdir()
+        except OSError as error:
+            raise ConfigError(f"cannot write to {out}: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for raster in self._open.values():
+            with contextlib.suppress(RasterioError, OSError):
+                raster.close()
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        if error is not None and self._new:
+            with contextlib.suppress(OSError):
+                self.out.rmdir()
+
+    def write(self, layer: str, where: Grid, values: NDArray[Any]) -> None:
+        """Write a window of a layer: heights (m, NaN where unknown) or a mask, ``(H, W)``.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full.
+        CatalogError
+            If ``where`` is no window of the sheet.
+        """
+        heights = layer in HEIGHTS
+        with self._writing(layer):
+            raster = self._raster(layer, self.grid, HEIGHT_PROFILE if heights else MASK_PROFILE)
+            cells = values.astype(np.float32 if heights else np.uint8)
+            raster.write(cells, 1, window=_window(self.grid, where))
+
+    def write_photo(self, photo: Photo) -> None:
+        """Write a window of the orthophoto; pixels without a colour are masked.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full, or the sheet has no orthophoto.
+        CatalogError
+            If the photo's grid is no window of the sheet's pixels.
+        """
+        if self.photo_grid is None:
+            raise ConfigError(f"no orthophoto was asked for in {self.out}")
+        with self._writing(PHOTO), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            raster = self._raster(PHOTO, self.photo_grid, PHOTO_PROFILE)
+            window = _window(self.photo_grid, photo.grid)
+            raster.write(photo.colour, window=window)
+            raster.write_mask(photo.known, window=window)
+
+    def read(self, layer: str, where: Grid) -> NDArray[Any]:
+        """Return a window of a layer as written so far, ``(H, W)``: float64 heights or a bool mask."""
+        values: NDArray[Any] = self._open[layer].read(1, window=_window(self.grid, where))
+        return values.astype(np.float64) if layer in HEIGHTS else values.astype(bool)
+
+    def publish(self, tile_size_m: float = 250, date: datetime | None = None, dataset: str = "") -> Published:
+        """Turn what was written into COGs and a catalog, in place of what was there before.
+
+        Parameters
+        ----------
+        tile_size_m : float
+            Side of a tile (m). An area that fits into one is one tile of its own; a larger one is cut on
+            multiples of it.
+        date : datetime, optional
+            When the data was taken.
+        dataset : str
+            What reports call the data.
+
+        Raises
+        ------
+        ConfigError
+            If the disk is full, or no tile has enough heights.
+        """
+        names = [layer for layer in LAYERS if layer in self._open]
+        for layer in names:
+            with self._writing(layer):
+                self._open[layer].close()
+                _to_cog(self.scratch / f"{layer}.tmp.tif", self.scratch / f"{layer}.tif", layer)
+        tiles, notes = self._tiles(names, tile_size_m, date, dataset)
+        self._replace(names)
+        Catalog(tiles).write(self.out / CATALOG)
+        return Published(self.out / CATALOG, len(tiles), (*notes, *assumed(tiles)))
+
+    def _replace(self, names: list[str]) -> None:
+        # A catalog stands for finished rasters: the old one goes first, the new one comes last.
+        for old in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
+            (self.out / old).unlink(missing_ok=True)
+        for layer in names:
+            (self.scratch / f"{layer}.tif").replace(self.out / f"{layer}.tif")
+
+    def _tiles(
+        self, names: list[str], size_m: float, date: datetime | None, dataset: str
+    ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
+        """Return the tiles with heights enough, and notes on the others."""
+        if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
+            tiles, notes = (self._one_tile(names, date, dataset),), ()
+        else:
+            root = self.scratch.resolve()
+            found = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
+            indexed = cut(root, found, tile_size_m=size_m, date=date, dataset=dataset, min_cover=0)
+            tiles = tuple(replace(tile, root=str(self.out.resolve())) for tile in indexed.tiles)
+            # Whether a date is assumed is told once, of the tiles that stay.
+            notes = tuple(note for note in indexed.notes if "--date" not in note)
+        with rasterio.open(self.scratch / "dsm.tif") as dsm:
+            kept = tuple(tile for tile in tiles if _share(dsm, self.grid, tile.grid) >= MIN_COVER)
+        thin = [tile.id for tile in tiles if tile not in kept]
+        if not kept:
+            raise ConfigError(
+                f"no tile of {self.out} would have heights in {MIN_COVER:.0%} of its cells; "
+                "take larger cells (--cell) or smaller tiles (--tile-size)"
+            )
+        left_out = f"left out {some(thin)}: heights in less than {MIN_COVER:.0%} of the cells"
+        return kept, (*notes, left_out) if thin else notes
+
+    def _one_tile(self, names: list[str], date: datetime | None, dataset: str) -> Tile:
+        return Tile(
+            id=f"{self.grid.west:.0f}_{self.grid.south:.0f}",
+            grid=self.grid,
+            layers=tuple(Layer(name, (f"{name}.tif",)) for name in names),
+            root=str(self.out.resolve()),
+            datetime=zoned(date) if date else datetime.now(UTC),
+            datetime_assumed=date is None,
+            dataset=dataset,
+        )
+
+    def _raster(self, layer: str, grid: Grid, profile: Mapping[str, Any]) -> Any:
+        if layer not in self._open:
+            raster = rasterio.open(
+                self.scratch / f"{layer}.tmp.tif",
+                "w+",
+                driver="GTiff",
+                crs=grid.crs,
+                transform=grid.transform,
+                width=grid.width,
+                height=grid.height,
+                tiled=True,
+                blockxsize=BLOCK,
+                blockysize=BLOCK,
+                BIGTIFF="IF_SAFER",
+                **profile,
+            )
+            raster.update_tags(**self.facts, LAYER=layer)
+            self._open[layer] = raster
+        return self._open[layer]
+
+    @contextlib.contextmanager
+    def _writing(self, layer: str) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RasterioError, CRSError) as error:
+            # GDAL's own reason is the cause of rasterio's.
+            reason = error.__cause__ or error
+            raise ConfigError(
+                f"cannot write {self.out / layer}.tif: {reason}; make room and repeat"
+            ) from error
+
+
+def _to_cog(source: Path, target: Path, layer: str) -> None:
+    smooth = layer in HEIGHTS or layer == PHOTO
+    rasterio.shutil.copy(
+        source,
+        target,
+        driver="COG",
+        compress="deflate",
+        predictor="floating_point" if layer in HEIGHTS else "standard",
+        overview_resampling="average" if smooth else "mode",
+        statistics="yes",
+        bigtiff="if_safer",
+    )
+    source.unlink()
+
+
+def _window(whole: Grid, part: Grid) -> Window:
+    rows, cols = whole.window(part)
+    return Window.from_slices(rows, cols)
+
+
+def _share(dsm: Any, whole: Grid, tile: Grid) -> float:
+    """Return the share of a tile's cells that have a height; the tile may reach beyond the raster."""
+    row, col = round((whole.north - tile.north) / whole.cell), round((tile.west - whole.west) / whole.cell)
+    window = Window(col, row, tile.width, tile.height).intersection(Window(0, 0, whole.width, whole.height))
+    return float(np.isfinite(dsm.read(1, window=window)).sum()) / (tile.width * tile.height)
+
+
+def _sweep(out: Path) -> None:
+    """Remove what makers that were killed left behind."""
+    for left in out.glob(".prepare-*"):
+        try:
+            os.kill(int(left.name.rpartition("-")[2]), 0)
+        except (ProcessLookupError, ValueError):
+            shutil.rmtree(left, ignore_errors=True)
+        except PermissionError:
+            continue
