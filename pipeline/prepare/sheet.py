@@ -184,7 +184,8 @@ class Sheet:
     ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
         """Return the tiles with heights enough, and notes on the others."""
         if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
-            tiles, notes = (self._one_tile(names, date, dataset),), ()
+            tiles: tuple[Tile, ...] = (self._one_tile(names, date, dataset),)
+            notes: tuple[str, ...] = ()
         else:
             root = self.scratch.resolve()
             found = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
