@@ -1,0 +1,67 @@
+"""Which cell each point falls into, and the means of what fell into a cell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from catalog.grid import Grid
+from tasks.types import Floats
+
+Cells = NDArray[np.int64]
+"""Index of each point's cell in row-major order, ``(n,)``; -1 is outside the grid."""
+
+NUDGE = 1e-6
+"""Part of a cell that is more than the rounding error of its edge's coordinates."""
+
+
+def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
+    """Return the cell of each point, ``(n,)``, row-major; -1 outside the grid.
+
+    A point on the line between two cells belongs to the eastern or southern one, whatever the rounding:
+    grids on one lattice agree about it.
+    """
+    cells: Cells = _bins(
+        np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
+    )
+    return cells
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _bins(
+    easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
+) -> Cells:
+    cells = np.full(easting.size, -1, np.int64)
+    for i in range(easting.size):
+        col = math.floor((easting[i] - west) / cell + NUDGE)
+        row = math.floor((north - northing[i]) / cell + NUDGE)
+        if 0 <= row < rows and 0 <= col < cols:
+            cells[i] = row * cols + col
+    return cells
+
+
+def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
+    """Return the mean of each kind of value per cell, each ``(H, W)``; NaN in cells without points.
+
+    Sums run in the order of the points: another order changes the last digits only.
+
+    Parameters
+    ----------
+    cells : Cells
+        The points' cells, ``(n,)``; points outside are left out.
+    shape : tuple of int
+        Rows and columns.
+    *values : Floats
+        One value per point, ``(n,)``.
+    """
+    inside = cells >= 0
+    cells = cells[inside]
+    size = shape[0] * shape[1]
+    count = np.bincount(cells, minlength=size)
+    with np.errstate(invalid="ignore"):
+        return tuple(
+            (np.bincount(cells, value[inside], minlength=size) / count).reshape(shape) for value in values
+        )

@@ -1,0 +1,120 @@
+"""Rasters from a point cloud: surface, ground, bridge decks and orthophoto of a piece of ground.
+
+A cell's values depend on the points within `reach_m` of the piece alone, not on how land is cut into pieces,
+nor on the order of the points: but for the last digits of sums (heights to 1e-9 m).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from catalog.grid import Grid
+from tasks import options as base
+from tasks.acquire import ground as slope_filter
+from tasks.acquire import terrain, voids
+from tasks.acquire.bins import bins, means
+from tasks.acquire.topcolour import photo
+from tasks.acquire.tops import highest, spikes
+from tasks.acquire.types import Photo, Points, Rasters
+from tasks.types import Bools, Floats
+
+
+class Options(base.Options):
+    """How points become rasters."""
+
+    despike_m: float | None = Field(
+        None, gt=0, description="drop single points so far above all others around them (m); null keeps all"
+    )
+    fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
+    ground: Literal["classes", "filter"] = Field(
+        "classes",
+        description="classes: ground is what the points' classes say; filter: what the slope filter finds",
+    )
+    ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
+    bridge_classes: tuple[int, ...] = Field((17,), description="classes of bridge decks; never ground")
+    dtm: Literal["tin", "mean"] = Field(
+        "tin", description="tin: linear between the ground of the cells; mean: mean ground height per cell"
+    )
+    void_m: float = Field(50.0, ge=0, le=500, description="DTM voids up to this width are bridged (m)")
+    dop_fill_m: float = Field(
+        2.0, ge=0, le=20, description="pixels up to so far from one with a colour get it (m)"
+    )
+    filter: slope_filter.Options = Field(
+        slope_filter.Options(), description="the slope filter, used with ground: filter"
+    )
+
+
+def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
+    """Make the rasters of a piece of ground.
+
+    Parameters
+    ----------
+    points : Points
+        In the grid's CRS (m), with a rim of `reach_m` around the grid; those farther away change nothing.
+    grid : Grid
+        The cells.
+    options : Options
+        Voids, classes, methods.
+    dop_cell : float, optional
+        Pixel of the orthophoto (m); None makes no orthophoto.
+
+    Returns
+    -------
+    Rasters
+        All NaN where there are no points, or no ground among them; a photo if points have colours.
+    """
+    rim = grid.buffered(reach_m(options, grid.cell))
+    inner = rim.window(grid)
+    if options.despike_m is not None:
+        cells = bins(points.easting, points.northing, rim)
+        single = spikes(cells, points.height, rim.shape, options.despike_m)
+        points = points[np.setdiff1d(np.arange(len(points)), single, assume_unique=True)]
+    cells = bins(points.easting, points.northing, rim)
+    dsm = voids.fill(highest(cells, points.height, rim.shape), rim, options.fill_m)
+    decks = np.isin(points.kind, options.bridge_classes)
+    (bridges,) = means(cells[decks], rim.shape, points.height[decks])
+    dtm = _dtm(points[_is_ground(points, options) & ~decks], rim, options)
+    return Rasters(
+        grid,
+        dsm=dsm[inner],
+        dtm=dtm[inner],
+        bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
+        photo=_photo(points, grid, options, dop_cell),
+    )
+
+
+def reach_m(options: Options, cell: float) -> float:
+    """Return how far outside a grid of such cells points can change a value inside (m)."""
+    if options.dtm == "tin":
+        ground = terrain.reach_m(options.void_m, cell)
+    else:
+        ground = voids.reach_m(options.void_m, cell)
+    if options.ground == "filter":
+        ground += options.filter.radius_m
+        if options.filter.low_m is not None:
+            ground += options.filter.low_radius_m
+    farthest = max(ground, voids.reach_m(options.fill_m, cell), options.dop_fill_m)
+    # Whether a point is a spike is known from its own and the next cells.
+    return farthest if options.despike_m is None else farthest + 2 * cell
+
+
+def _is_ground(points: Points, options: Options) -> Bools:
+    if options.ground == "classes":
+        return np.isin(points.kind, options.ground_classes)
+    return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
+
+
+def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:
+    cells = bins(ground.easting, ground.northing, grid)
+    if options.dtm == "mean":
+        return terrain.averaged(cells, ground.height, grid, options.void_m)
+    return terrain.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
+
+
+def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Photo | None:
+    if points.colour is None or dop_cell is None:
+        return None
+    return photo(points, Grid.covering(grid.crs, grid.bounds, dop_cell), options.dop_fill_m)
