@@ -14,7 +14,7 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 
-from catalog.errors import CatalogError
+from catalog.clouds import chunks
 from catalog.grid import Bounds
 
 Floats = NDArray[np.float64]
@@ -22,8 +22,6 @@ Floats = NDArray[np.float64]
 DECK = 17
 """Class of bridge decks (ASPRS LAS 1.4)."""
 CELL_M = 1.0
-CHUNK = 1_000_000
-"""Points decoded at a time: memory does not grow with the file."""
 
 
 def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
@@ -67,16 +65,9 @@ def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
 
 def _decks(cloud: Path) -> Iterator[tuple[Floats, Floats, Floats]]:
     """Yield easting, northing and height of the bridge points, chunk by chunk (m)."""
-    import laspy
-
-    try:
-        with laspy.open(cloud) as reader:
-            for points in reader.chunk_iterator(CHUNK):
-                deck = np.asarray(points.classification) == DECK
-                x, y, z = (np.asarray(axis)[deck] for axis in (points.x, points.y, points.z))
-                yield x, y, z
-    except (laspy.LaspyException, OSError, ValueError, RuntimeError) as error:
-        raise CatalogError(f"{cloud} cannot be read as a point cloud: {error}; download it again") from error
+    for chunk in chunks(cloud):
+        deck = chunk.kind == DECK
+        yield chunk.x[deck], chunk.y[deck], chunk.z[deck]
 
 
 def _write(target: Path, heights: Floats, transform: Affine, crs: str) -> None:

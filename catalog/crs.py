@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from pyproj import CRS
+from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
+from pyproj.database import query_crs_info, query_utm_crs_info
+from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
 
 from catalog.errors import CatalogError
@@ -58,10 +59,19 @@ def plan_unit(text: str) -> Unit:
 
 def height_unit(text: str) -> Unit | None:
     """Return the unit of heights, or None if the CRS says nothing of heights."""
-    _, height = _parts(text)
-    if height is None or not height.axis_info:
-        return None
-    return height.axis_info[0].unit_name, height.axis_info[0].unit_conversion_factor
+    plan, height = _parts(text)
+    axes = plan.axis_info[2:3] if height is None else height.axis_info[:1]
+    return (axes[0].unit_name, axes[0].unit_conversion_factor) if axes else None
+
+
+def is_geographic(text: str) -> bool:
+    """Return whether eastings and northings are angles."""
+    return _parts(text)[0].is_geographic
+
+
+def is_projected(text: str) -> bool:
+    """Return whether eastings and northings are lengths in a map's plane."""
+    return _parts(text)[0].is_projected
 
 
 def short(text: str) -> str:
@@ -75,3 +85,54 @@ def utm_of(degrees: Bounds) -> str:
     east, north = (degrees[0] + degrees[2]) / 2, (degrees[1] + degrees[3]) / 2
     found = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north))
     return f"EPSG:{found[0].code}" if found else "EPSG:25832"
+
+
+@lru_cache(maxsize=256)
+def metric_twin(text: str, easting: float, northing: float) -> str:
+    """Return the same projection in metres: its code in the EPSG register if it has one, else WKT.
+
+    Parameters
+    ----------
+    text : str
+        A projected CRS in any unit.
+    easting, northing : float
+        Any place of the data, in units of ``text``: of the many CRSs in the register only those that are
+        made for this place are looked at.
+    """
+    plan = _parts(text)[0].to_2d()
+    if plan.to_epsg() and plan.axis_info[0].unit_conversion_factor == 1:
+        return in_plan(text)
+    described = plan.to_json_dict()
+    described.pop("id", None)
+    for axis in described["coordinate_system"]["axis"]:
+        axis["unit"] = "metre"
+    for parameter in described["conversion"]["parameters"]:
+        unit = parameter.get("unit")
+        if isinstance(unit, dict) and unit["type"] == "LinearUnit":
+            parameter.update(value=parameter["value"] * unit["conversion_factor"], unit="metre")
+    twin = CRS.from_json_dict(described)
+    return _registered(twin, *degrees(text, easting, northing)) or twin.to_wkt()
+
+
+def _registered(crs: CRS, longitude: float, latitude: float) -> str | None:
+    """Return the code of a projected CRS that is this one in all but name."""
+    place = AreaOfInterest(longitude, latitude, longitude, latitude)
+    method = crs.coordinate_operation.method_name if crs.coordinate_operation else ""
+    for info in query_crs_info("EPSG", PJType.PROJECTED_CRS, area_of_interest=place, contains=True):
+        if info.projection_method_name == method:
+            known = CRS.from_epsg(info.code)
+            if known.equals(crs, ignore_axis_order=True):
+                return f"EPSG:{info.code}"
+    return None
+
+
+def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
+    """Return longitude and latitude (WGS 84) of a place, infinite where the CRS has no such place."""
+    longitude, latitude = transformer(text, "EPSG:4326").transform(easting, northing)
+    return float(longitude), float(latitude)
+
+
+@lru_cache(maxsize=16)
+def transformer(source: str, target: str) -> Transformer:
+    """Return what takes eastings and northings (or longitudes and latitudes) from one CRS to another."""
+    return Transformer.from_crs(_parts(source)[0].to_2d(), _parts(target)[0].to_2d(), always_xy=True)

@@ -1,0 +1,200 @@
+"""Point clouds (LAS, LAZ, COPC): what their headers say, and their points in chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from catalog.errors import CatalogError
+from catalog.grid import Bounds
+
+T = TypeVar("T")
+Floats = NDArray[np.float64]
+
+SUFFIXES = (".las", ".laz")
+NOISE = (7, 18)
+"""Classes of low and high noise (ASPRS LAS 1.4)."""
+CHUNK = 1_000_000
+"""Points decoded at a time: memory does not grow with the file."""
+RGB = ("red", "green", "blue")
+DEGREES = 360.0
+SLACK = 0.01
+"""Points may lie beyond the bounds in the header by this part of their size, and by one unit."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """What the header of a point cloud says; plan and heights in the file's own units."""
+
+    path: Path
+    points: int
+    bounds: Bounds
+    """West, south, east, north."""
+    heights: tuple[float, float]
+    """Lowest and highest."""
+    crs: str | None
+    """As WKT, or None if the file carries none that can be understood."""
+    has_colours: bool
+    """Whether there is room for colours; they may all be zero."""
+    created: date | None
+    """When the file was written, not when the survey was flown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Some points, in the file's own units."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    kind: NDArray[np.uint8]
+    """Class by ASPRS, ``(n,)``."""
+    colour: NDArray[np.uint16] | None
+    """Red, green, blue as stored, ``(n, 3)``, or None if the file has none."""
+
+
+def find(inputs: Collection[Path]) -> tuple[Path, ...]:
+    """Return the clouds among files and folders, each once and in order of their paths.
+
+    Raises
+    ------
+    CatalogError
+        If a folder has none, or there is no such file or folder.
+    """
+    found: dict[Path, Path] = {}
+    for path in inputs:
+        inside = [path]
+        if path.is_dir():
+            inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+        elif not path.exists():
+            raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
+        if not inside:
+            raise CatalogError(f"no LAS or LAZ file in {path}; give the files, or the folder they lie in")
+        found.update({file.resolve(): file for file in inside})
+    return tuple(found[path] for path in sorted(found))
+
+
+def inspect(path: Path) -> Cloud:
+    """Return what the header of a cloud says.
+
+    Raises
+    ------
+    CatalogError
+        If the file is missing, no LAS or LAZ, cut short, or without points.
+    """
+    with _opened(path) as reader:
+        header = reader.header
+        west, south, low = map(float, header.mins)
+        east, north, high = map(float, header.maxs)
+        bounds = west, south, east, north
+        cloud = Cloud(
+            path,
+            header.point_count,
+            bounds,
+            (low, high),
+            _crs(header, bounds),
+            set(RGB) <= set(header.point_format.dimension_names),
+            header.creation_date,
+        )
+        needed = header.offset_to_point_data + cloud.points * header.point_format.size
+        plain = not header.are_points_compressed
+    if cloud.points == 0:
+        raise CatalogError(f"{path} has no points; leave it out, or write it again")
+    if plain and path.stat().st_size < needed:
+        raise CatalogError(
+            f"{path} is cut short: {path.stat().st_size:,} of {needed:,} bytes; download it again"
+        )
+    return cloud
+
+
+def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iterator[Chunk]:
+    """Yield the points of a cloud, decoded once; withheld ones count as deleted.
+
+    Parameters
+    ----------
+    path : Path
+        LAS, LAZ or COPC file.
+    size : int
+        Points decoded at a time.
+    drop : Collection[int]
+        Classes to leave out.
+
+    Raises
+    ------
+    CatalogError
+        If the file is missing, unreadable, cut short or damaged. LAZ has no checksum: points that lie
+        beyond the bounds in the header tell the damage.
+    """
+    with _opened(path) as reader:
+        header, done = reader.header, 0
+        low, high = np.asarray(header.mins), np.asarray(header.maxs)
+        slack = SLACK * (high - low) + 1
+        while done < header.point_count:
+            points = _attempt(path, lambda: reader.read_points(size), f" after {done:,} points")
+            if not len(points):
+                break
+            done += len(points)
+            yield _chunk(path, points, (low - slack, high + slack), drop)
+    if done != header.point_count:
+        raise CatalogError(
+            f"{path} is cut short: {done:,} of {header.point_count:,} points; download it again"
+        )
+
+
+def _chunk(path: Path, points: Any, limits: tuple[Floats, Floats], drop: Collection[int]) -> Chunk:
+    x, y, z = (np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z))
+    for axis, low, high in zip((x, y, z), *limits, strict=True):
+        if axis.min() < low or axis.max() > high:
+            raise CatalogError(
+                f"{path} is damaged: its header gives {low:.0f} to {high:.0f} where its points have "
+                f"{axis.min():.0f} to {axis.max():.0f}; download it again"
+            )
+    kind = np.asarray(points.classification, np.uint8)
+    colour = None
+    if set(RGB) <= set(points.point_format.dimension_names):
+        colour = np.stack([np.asarray(points[name], np.uint16) for name in RGB], axis=1)
+    kept = ~(np.asarray(points.withheld, bool) | np.isin(kind, list(drop)))
+    if kept.all():
+        return Chunk(x, y, z, kind, colour)
+    return Chunk(x[kept], y[kept], z[kept], kind[kept], None if colour is None else colour[kept])
+
+
+def _opened(path: Path) -> Any:
+    import laspy
+
+    if not path.is_file():
+        raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
+    backends = (laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs)
+    return _attempt(path, lambda: laspy.open(path, laz_backend=backends))
+
+
+def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
+    """Return what ``read`` returns; whatever the decoders may raise becomes one line."""
+    from laspy import LaspyException
+
+    try:
+        return read()
+    except (LaspyException, OSError, ValueError, RuntimeError, OverflowError, MemoryError) as error:
+        raise CatalogError(
+            f"{path} cannot be read as a point cloud{when}: {error}; download it again"
+        ) from error
+
+
+def _crs(header: Any, bounds: Bounds) -> str | None:
+    from pyproj.exceptions import CRSError
+
+    try:
+        crs = header.parse_crs()
+    except (CRSError, UnicodeDecodeError):
+        return None
+    # GeoTIFF keys of a plane of one's own name its geographic base as well: laspy then returns degrees.
+    if crs is None or (crs.is_geographic and max(map(abs, bounds)) > DEGREES):
+        return None
+    text: str = crs.to_wkt()
+    return text
