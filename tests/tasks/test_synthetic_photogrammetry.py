@@ -1,0 +1,142 @@
+"""The stand-in for DSC3D: its meshes show the scene, with the faults they say they have."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from catalog.grid import Grid
+from tasks.acquire.mesh import orthophoto as seen_from_above
+from tasks.acquire.mesh import tops
+from tasks.synthetic import Kind
+from tasks.synthetic.dsc3d import SITES, SIZE_M, survey
+from tasks.synthetic.orthophoto import orthophoto
+from tasks.synthetic.photogrammetry import GSD_M, photogrammetry
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def place():
+    return survey(len(SITES), SEED)[-1]
+
+
+@pytest.fixture(scope="module")
+def scene(place):
+    return photogrammetry(place, SEED)
+
+
+@pytest.fixture(scope="module")
+def height(scene):
+    """Height of the mesh at the nodes it was made from; NaN in open holes."""
+    return tops(scene.mesh, scene.surface.grid)
+
+
+def test_the_sites_span_what_the_paper_tells():
+    assert (min(s.triangles for s in SITES), max(s.triangles for s in SITES)) == (35_000, 101_000)
+    assert (min(s.rise_m for s in SITES), max(s.rise_m for s in SITES)) == (4.5, 33.9)
+    assert len({s.name for s in SITES}) == 5
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scenes_rise_as_their_site_says(seed):
+    from tasks.synthetic import make_scene
+
+    places = survey(seed=seed)
+    for place in places:
+        truth = make_scene(place.grid, seed, place.site.stratum, place.options)
+        assert np.ptp(truth.reference) == pytest.approx(place.site.rise_m, rel=0.05)
+        assert 0.1 < truth.reference_road.mean() < 0.4
+    assert survey(2, seed) == places[:2]
+
+
+def test_the_mesh_fills_its_square_with_so_many_triangles(scene, place):
+    assert scene.mesh.bounds == pytest.approx(place.grid.bounds, abs=1e-6)
+    assert place.grid.bounds[2] - place.grid.bounds[0] == SIZE_M
+    assert 0.99 * place.site.triangles < len(scene.mesh.faces) <= place.site.triangles
+
+
+def test_away_from_faults_the_mesh_is_the_surface_but_for_bumps(scene, place, height):
+    faults, surface, made = place.site.faults, scene.surface.dsm, scene.reconstruction
+    far = round(4 * faults.melt_m / scene.surface.grid.cell)
+    free = ndimage.maximum_filter(surface - scene.surface.reference, 2 * far + 1) < 0.05
+    sound = free & ~ndimage.binary_dilation(made.open | made.bridged, iterations=far)
+    off = (height - surface)[sound & np.isfinite(height)]
+    assert off.size > 5_000
+    # Nine in ten: a few fragments float above.
+    kept = np.sort(np.abs(off))[: int(0.9 * off.size)]
+    assert 0.3 * faults.bumps_m < np.sqrt(np.mean(kept**2)) < 1.2 * faults.bumps_m
+    assert abs(np.median(off)) < 0.02
+    # Bumps are longer than a cell, unlike noise.
+    bumps = np.where(sound, made.height - surface, 0.0)
+    both = sound[:, 1:] & sound[:, :-1]
+    assert np.corrcoef(bumps[:, 1:][both], bumps[:, :-1][both])[0, 1] > 0.6
+
+
+@pytest.mark.parametrize("kind", [Kind.BUILDING, Kind.PARKED_CAR, Kind.CROWN])
+def test_things_stand_on_the_ground_like_drops_of_wax(scene, height, kind):
+    truth, cell = scene.surface, scene.surface.grid.cell
+    there = (truth.kind == kind) & np.isfinite(height)
+    raised = (height - truth.reference)[there]
+    assert there.sum() > 200
+    assert np.median(raised) > 0.4 * np.median((truth.dsm - truth.reference)[there])
+    steepness = [
+        np.nanpercentile(np.hypot(*np.gradient(z, cell))[ndimage.binary_dilation(there, iterations=2)], 95)
+        for z in (height, truth.dsm)
+    ]
+    assert steepness[0] < 0.8 * steepness[1]
+
+
+def test_what_moved_leaves_a_ghost(scene):
+    truth, made = scene.surface, scene.reconstruction.height
+    moved = truth.kind == Kind.MOVING_CAR
+    assert moved.any()
+    assert np.mean((made - truth.reference)[moved]) < 0.5 * np.mean((truth.dsm - truth.reference)[moved])
+
+
+def test_holes_are_left_open_or_bridged(scene, height):
+    made = scene.reconstruction
+    assert 0.001 < made.open.mean() < 0.1
+    assert 0.005 < made.bridged.mean() < 0.15
+    assert not (made.open & made.bridged).any()
+    inside = ndimage.binary_erosion(made.open, iterations=2)
+    assert np.isnan(height[inside]).mean() > 0.95
+    assert np.isfinite(height[made.bridged]).mean() > 0.95
+    # The outermost nodes lie on the mesh's edge.
+    inner = np.s_[1:-1, 1:-1]
+    closed = ~ndimage.binary_dilation(made.open, iterations=2)[inner]
+    assert np.isfinite(height[inner][closed]).all()
+    # A sheet stays between the heights of its rim.
+    around = np.ones((3, 3))
+    holes, count = ndimage.label(made.bridged, around)
+    for hole in range(1, count + 1):
+        rim = ndimage.binary_dilation(holes == hole, around) & ~made.bridged
+        z, low, high = made.height[holes == hole], made.height[rim].min(), made.height[rim].max()
+        assert low - 0.01 <= z.min() <= z.max() <= high + 0.01
+
+
+def test_fragments_float_above_the_surface(scene, place):
+    pieces = place.site.faults.fragments
+    count = 8 * pieces
+    floating = scene.mesh.vertices[-count:].reshape(pieces, 8, 3)
+    cells = scene.surface.grid.cells(floating[:, 0, 0], floating[:, 0, 1])
+    assert (floating[:, 0, 2] > scene.reconstruction.height[cells] + 1.9).all()
+
+
+def test_the_texture_lies_the_right_way_round(scene, place):
+    photo = seen_from_above(scene.mesh, Grid.covering(place.grid.crs, place.grid.bounds, GSD_M))
+    made = orthophoto(place.grid, SEED, place.site.stratum, place.options, GSD_M).astype(float)
+    alike = [
+        np.corrcoef(photo.colour[:, photo.known].ravel(), turned[:, photo.known].ravel())[0, 1]
+        for turned in (made, made[:, ::-1], made[:, :, ::-1], made.transpose(0, 2, 1))
+    ]
+    assert alike[0] > 0.95
+    assert max(alike[1:]) < 0.7
+
+
+def test_equal_seeds_give_equal_scenes(scene, place):
+    again = photogrammetry(place, SEED)
+    for name in ("vertices", "faces", "uv"):
+        assert np.array_equal(getattr(again.mesh, name), getattr(scene.mesh, name)), name
+    assert np.array_equal(again.mesh.textures[0], scene.mesh.textures[0])
+    assert np.array_equal(again.truth.reference, scene.truth.reference)
+    assert survey(1, SEED + 1)[0].options != survey(1, SEED)[0].options
