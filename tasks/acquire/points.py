@@ -1,7 +1,7 @@
 """Rasters from a point cloud: surface, ground, bridge decks and orthophoto of a piece of ground.
 
 A cell's values depend on the points within `reach_m` of the piece alone, not on how land is cut into pieces,
-nor on the order of the points: but for the last digits of sums (heights to 1e-9 m).
+nor on the order of the points; heights agree to 1e-8 m, as sums and large coordinates are rounded.
 """
 
 from __future__ import annotations
@@ -99,6 +99,32 @@ def reach_m(options: Options, cell: float) -> float:
     farthest = max(ground, voids.reach_m(options.fill_m, cell), options.dop_fill_m)
     # Whether a point is a spike is known from its own and the next cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
+
+
+def facts(options: Options) -> dict[str, str]:
+    """Return how the rasters are made, by layer, for the tags of their files."""
+    spikes = (
+        ""
+        if options.despike_m is None
+        else f"; single points {options.despike_m:g} m above all around dropped"
+    )
+    if options.ground == "classes":
+        ground = f"points of {_classes(options.ground_classes)}"
+    else:
+        ground = (
+            f"slope-filtered points (radius {options.filter.radius_m:g} m, slope {options.filter.slope:g})"
+        )
+    kind = "TIN of the cells' centroids" if options.dtm == "tin" else "mean per cell"
+    return {
+        "DSM": f"highest point per cell{spikes}; voids up to {options.fill_m:g} m filled linearly",
+        "DTM": f"{kind} of {ground}; voids up to {options.void_m:g} m bridged linearly",
+        "BRIDGES": f"mean per cell of points of {_classes(options.bridge_classes)}",
+        "DOP": f"colour of the highest point; voids take the nearest within {options.dop_fill_m:g} m",
+    }
+
+
+def _classes(classes: tuple[int, ...]) -> str:
+    return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
 
 
 def _is_ground(points: Points, options: Options) -> Bools:

@@ -36,7 +36,7 @@ def triangulated(
     void_m : float
         The ground stays void where a disc of this diameter, and a little wider, has no node (m).
     """
-    east, north, mean = means(cells, grid.shape, easting - grid.origin[0], northing - grid.origin[1], height)
+    east, north, mean = means(cells, grid.shape, easting - grid.west, northing - grid.north, height)
     ground = tin(east, north, mean, grid, void_m + SPARSEST * grid.cell)
     return np.where(np.isnan(ground), mean, ground)
 

@@ -21,8 +21,8 @@ SNAP_M = 1e-12
 """Nodes closer than this would be taken for one."""
 WIDER = 1 + 1e-9
 """A circle exactly as wide as the limit counts, whatever the rounding."""
-GOLDEN = 0.6180339887
-"""Added before an edge is counted in whole cells from zero: no lattice lies off zero by the rest to one."""
+COUNTED_FROM = 0.6180339887
+"""Part of a cell added to an edge before its whole cells are counted: no lattice is likely to turn there."""
 
 
 def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float) -> Floats:
@@ -31,7 +31,7 @@ def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float
     Parameters
     ----------
     east, north : Floats
-        Place of a cell's node, from the grid's origin, ``(H, W)``, m.
+        Place of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
     height : Floats
         Height of a cell's node, ``(H, W)``, m; NaN where the cell has none.
     grid : Grid
@@ -48,7 +48,8 @@ def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float
     nodes = np.column_stack([east[row, col], north[row, col], height[row, col]])
     faces = _delaunay(nodes[:, :2] + JITTER * grid.cell * _noise(grid, row, col))
     faces = _ordered(faces[_widths(nodes[:, :2], faces) <= widest_m * WIDER], len(nodes))
-    return drape(Mesh(grid.crs, (*grid.origin, 0.0), nodes, faces, np.zeros(len(faces), bool)), grid)
+    corner = grid.west, grid.north, 0.0
+    return drape(Mesh(grid.crs, corner, nodes, faces, np.zeros(len(faces), bool)), grid)
 
 
 def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
@@ -57,8 +58,8 @@ def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
     Nodes on a lattice are full of cocircular fours; which of the two diagonals is drawn must not hang on
     the order of insertion, which changes with the block. Mixing as in SplitMix64 (Steele et al., 2014).
     """
-    east = col + int(np.floor(grid.west / grid.cell + GOLDEN))
-    south = row - int(np.floor(grid.north / grid.cell + GOLDEN))
+    east = col + int(np.floor(grid.west / grid.cell + COUNTED_FROM))
+    south = row - int(np.floor(grid.north / grid.cell + COUNTED_FROM))
     bits = east.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     for mixed_in, factor in ((south, 0xBF58476D1CE4E5B9), (0, 0x94D049BB133111EB)):
         bits = (bits ^ (bits >> np.uint64(30))) + np.asarray(mixed_in).astype(np.uint64)
@@ -94,7 +95,7 @@ def _widths(plan: Floats, faces: NDArray[np.int32]) -> Floats:
 
 
 def _ordered(faces: NDArray[np.int32], nodes: int) -> NDArray[np.int32]:
-    """Return the faces in the order of their nodes: a centre on an edge meets the same face first in any block."""
+    """Return the faces in the order of their nodes: a centre on an edge meets the same one in any block."""
     first = faces.argmin(axis=1)
     turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     # No two faces leave one node for the same next one.

@@ -27,9 +27,8 @@ def fill(heights: Floats, grid: Grid, size_m: float) -> Floats:
     """
     void = np.isnan(heights)
     around = ~void & ndimage.binary_dilation(void, np.ones((3, 3), bool))
-    east, north = np.broadcast_arrays(
-        grid.eastings - grid.origin[0], (grid.northings - grid.origin[1])[:, None]
-    )
+    row, col = np.indices(grid.shape, np.float64)
+    east, north = (col + 0.5) * grid.cell, -(row + 0.5) * grid.cell
     between = tin(east, north, np.where(around, heights, np.nan), grid, size_m + DIAGONAL * grid.cell)
     return np.where(void, between, heights)
 

@@ -1,0 +1,72 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from catalog.grid import Grid
+from tasks.acquire.bins import bins, means
+from tasks.acquire.tops import highest, spikes
+
+GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
+# Places in quarters of a cell, many of them on the lines; some are outside.
+clouds = st.lists(st.tuples(st.integers(-8, 36), st.integers(-8, 28), st.integers(0, 12)), max_size=60)
+
+
+def points(cloud):
+    x, y, z = np.array(cloud, float).reshape(-1, 3).T
+    return GRID.west + x / 8, GRID.north - y / 8, z / 4
+
+
+def by_cell(cloud) -> dict[tuple[int, int], list[float]]:
+    found: dict[tuple[int, int], list[float]] = {}
+    for x, y, z in cloud:
+        if 0 <= x < 4 * GRID.width and 0 <= y < 4 * GRID.height:
+            found.setdefault((y // 4, x // 4), []).append(z / 4)
+    return found
+
+
+def raster(values: dict[tuple[int, int], float]):
+    out = np.full(GRID.shape, np.nan)
+    for at, value in values.items():
+        out[at] = value
+    return out
+
+
+@given(clouds)
+@settings(deadline=None)
+def test_each_cell_has_its_highest_point_and_its_mean(cloud):
+    easting, northing, height = points(cloud)
+    cells = bins(easting, northing, GRID)
+    of = by_cell(cloud)
+    tops = highest(cells, height, GRID.shape)
+    np.testing.assert_array_equal(tops, raster({at: max(zs) for at, zs in of.items()}))
+    (mean,) = means(cells, GRID.shape, height)
+    np.testing.assert_allclose(mean, raster({at: sum(zs) / len(zs) for at, zs in of.items()}), rtol=1e-14)
+
+
+@given(clouds, st.sampled_from([0.25, 1.0]))
+@settings(deadline=None)
+def test_spikes_are_those_of_the_definition(cloud, despike_m):
+    of = by_cell(cloud)
+    expected = []
+    for (row, col), zs in of.items():
+        near = [(row + r, col + c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+        others = sorted(zs)[:-1] + [z for at in near for z in of.get(at, [])]
+        if others and max(zs) > max(others) + despike_m:
+            expected.append((row * GRID.width + col, max(zs)))
+    easting, northing, height = points(cloud)
+    cells = bins(easting, northing, GRID)
+    found = spikes(cells, height, GRID.shape, despike_m)
+    assert sorted(zip(cells[found], height[found], strict=True)) == sorted(expected)
+
+
+def test_grids_on_one_lattice_agree_about_points_on_its_lines():
+    lines = 295500 + np.arange(0, 400) * 0.2
+    other = Grid("EPSG:25832", 295500 - 13 * 0.2, 5629500 + 29 * 0.2, 0.2, 450, 450)
+    here = Grid("EPSG:25832", 295500.0, 5629500.0, 0.2, 400, 400)
+    northing = 5629500 - np.arange(0, 400) * 0.2
+    row, col = np.divmod(bins(lines, northing, here), 400)
+    np.testing.assert_array_equal(col, np.arange(400))
+    np.testing.assert_array_equal(row, np.arange(400))
+    row, col = np.divmod(bins(lines, northing, other), 450)
+    np.testing.assert_array_equal(col, np.arange(400) + 13)
+    np.testing.assert_array_equal(row, np.arange(400) + 29)

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from catalog.grid import Grid
+from tasks.acquire.voids import fill, reach_m
+
+CELL = 0.2
+
+
+def grid(cols, rows, west=295500.0, north=5629500.0):
+    return Grid("EPSG:25832", west, north, CELL, cols, rows)
+
+
+def plane(where: Grid):
+    return 100 + 0.3 * (where.eastings - 295500) + 0.2 * (where.northings - 5629500)[:, None]
+
+
+@pytest.mark.parametrize("cells", range(1, 9))
+@pytest.mark.parametrize("shape", ["square", "strip"])
+def test_voids_are_filled_up_to_the_stated_width(cells, shape):
+    where = grid(40, 40)
+    truth = plane(where)
+    holed = truth.copy()
+    holed[slice(20, 20 + cells), slice(10, 10 + cells) if shape == "square" else slice(5, 35)] = np.nan
+    np.testing.assert_allclose(fill(holed, where, cells * CELL), truth, atol=1e-9)
+    assert np.isnan(fill(holed, where, (cells - 1) * CELL)).any()
+
+
+def test_wide_voids_keep_their_shore_and_the_survey_its_border():
+    where = grid(60, 60)
+    row, col = np.indices(where.shape)
+    lake = np.hypot(row - 30, col - 30) < 12
+    beyond = col > 50
+    holed = np.where(lake | beyond, np.nan, plane(where))
+    filled = np.isfinite(fill(holed, where, 5 * CELL))
+    shore = ndimage.binary_erosion(lake)
+    assert not filled[shore].any()
+    assert not filled[beyond].any()
+
+
+def test_what_is_known_stays_and_nothing_comes_of_nothing():
+    where = grid(9, 9)
+    np.testing.assert_array_equal(fill(plane(where), where, 5), plane(where))
+    assert np.isnan(fill(np.full(where.shape, np.nan), where, 5)).all()
+
+
+@pytest.mark.parametrize("size_m", [0.0, 0.4, 0.7, 1.3])
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_cells_beyond_the_reach_change_nothing(size_m, share):
+    rng = np.random.default_rng(2)
+    whole = grid(70, 60)
+    heights = np.where(rng.random(whole.shape) < share, rng.uniform(100, 110, whole.shape), np.nan)
+    expected = fill(heights, whole, size_m)
+    n = round(reach_m(size_m, CELL) / CELL)
+    for row, col in ((17, 19), (30, 41), (22, 33)):
+        core = slice(row, row + 7), slice(col, col + 9)
+        rim = slice(row - n, row + 7 + n), slice(col - n, col + 9 + n)
+        part = grid(9 + 2 * n, 7 + 2 * n, whole.west + (col - n) * CELL, whole.north - (row - n) * CELL)
+        found = fill(heights[rim], part, size_m)[n : n + 7, n : n + 9]
+        np.testing.assert_allclose(found, expected[core], rtol=0, atol=1e-9)
