@@ -40,7 +40,7 @@ class Frame:
     target: str
     """Projected CRS in metres."""
     plan_m: float | None
-    """Metres per unit in plan if the twin in metres is the target: exact. None where the plan is reprojected."""
+    """Metres per unit in plan where the target is the twin in metres; None where the plan is reprojected."""
     height_m: float
     """Metres per unit of height; heights are not moved to another datum."""
     notes: tuple[str, ...] = ()
@@ -142,8 +142,7 @@ def _target(source: str, place: tuple[float, float]) -> str:
 def _asked(to_crs: str) -> str:
     if not is_projected(to_crs) or plan_unit(to_crs)[1] != 1:
         raise CatalogError(
-            f"--to-crs {to_crs} is in {plan_unit(to_crs)[0]}s; "
-            "give a projected CRS in metres, such as EPSG:25832"
+            f"--to-crs {to_crs} is in {_units(to_crs)}; give a projected CRS in metres, such as EPSG:25832"
         )
     return in_plan(to_crs)
 
@@ -165,8 +164,8 @@ def _heights(source: str, unit: str | None) -> tuple[float, tuple[str, ...]]:
     implied = _implied(source)
     if is_geographic(source) or implied == 1:
         return implied, ()
-    name = plan_unit(source)[0]
-    return implied, (f"heights are taken to be in {name}, like the plan; --height-unit metre otherwise",)
+    unit = _units(source)
+    return implied, (f"heights are taken to be in {unit}, like the plan; --height-unit metre otherwise",)
 
 
 def _implied(crs: str) -> float:
@@ -175,6 +174,12 @@ def _implied(crs: str) -> float:
     if told:
         return told[1]
     return 1.0 if is_geographic(crs) else plan_unit(crs)[1]
+
+
+def _units(crs: str) -> str:
+    """Return the unit in plan, in the plural."""
+    unit = plan_unit(crs)[0]
+    return unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
 
 
 def _equal(a: float, b: float) -> bool:

@@ -1,0 +1,195 @@
+"""``flexroad prepare points``: surface, ground, bridges and orthophoto from point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Literal
+
+from catalog import CatalogError
+from catalog.clouds import Cloud, find, inspect
+from catalog.crs import short
+from catalog.frame import Frame, agreed
+from catalog.raster_files import some
+from pipeline.errors import ConfigError
+from pipeline.execute import Executor
+from pipeline.prepare.asked import Asked
+from pipeline.prepare.blocks import fill, sheet_grid
+from pipeline.prepare.roads import add_roads
+from pipeline.prepare.sheet import Published, Sheet
+from pipeline.prepare.spool import Spooled, edge_m, scratch, spool
+from tasks.acquire.points import Options, reach_m
+
+Ground = Literal["auto", "classes", "filter"]
+MIN_GROUND = 0.01
+"""A file with a smaller share of ground among its points counts as not classified."""
+MAX_CELLS = 10**10
+"""100 km x 100 km at 1 m: a larger sheet means that a point lies astray."""
+
+
+def prepare_points(
+    files: Sequence[Path],
+    out: Path,
+    asked: Asked,
+    options: Options,
+    executor: Executor,
+    say: Callable[[str], None],
+    ground: Ground = "auto",
+) -> Published:
+    """Make the rasters and the catalog of an area from point clouds.
+
+    Every file is decoded once. Memory holds one chunk of a file, or one block per worker: it grows neither
+    with the files nor with the area. The disk holds 16 bytes per point meanwhile.
+
+    Parameters
+    ----------
+    files : Sequence[Path]
+        LAS, LAZ or COPC files, and folders of them.
+    out : Path
+        Folder to publish in.
+    asked : Asked
+        What all commands share.
+    options : Options
+        How points become rasters; its ``ground`` gives way to the parameter.
+    executor : Executor
+        Makes the blocks.
+    say : Callable[[str], None]
+        Told what is being done, a line each.
+    ground : str
+        What finds the ground: ``classes``, ``filter``, or ``auto``: classes if in every file at least
+        `MIN_GROUND` of the points, but not all points, are of a ground class.
+
+    Raises
+    ------
+    CatalogError
+        If a file is missing, unreadable, empty or cut short, the files' CRSs differ or are unknown, or
+        classes were asked for that no point has.
+    ConfigError
+        If the folder cannot be written, the disk is full, or cells and pixels do not fit.
+    """
+    step = _step(asked)
+    clouds = tuple(inspect(path) for path in find(files))
+    frame = _frame(clouds, asked)
+    with scratch(out) as folder:
+        farthest = max(reach_m(_with(options, method), asked.cell_m) for method in ("classes", "filter"))
+        spooled = spool(clouds, frame, folder, edge_m(clouds, frame, farthest, step), say)
+        method, notes = _ground(clouds, spooled, options, ground)
+        options = _with(options, method)
+        grid = sheet_grid(spooled, frame.target, asked.cell_m, step)
+        if grid.width * grid.height > MAX_CELLS:
+            raise CatalogError(_astray(clouds))
+        black = [cloud.path.name for cloud, seen in zip(clouds, spooled.colours, strict=True) if not seen]
+        notes = (*frame.notes, *notes, *_left_out(spooled, black))
+        facts = _facts(clouds, frame, spooled, options)
+        with Sheet(out, grid, None if black else asked.dop_cell_m, facts) as sheet:
+            fill(sheet, spooled, options, executor, say)
+            add_roads(sheet, asked)
+            dataset = asked.dataset or _name(files)
+            return sheet.publish(asked.tile_size_m, asked.date, dataset).noting(*notes)
+
+
+def _step(asked: Asked) -> float:
+    """Return the larger of cell and pixel (m), a whole number of the smaller."""
+    small, large = sorted((asked.cell_m, asked.dop_cell_m))
+    if not small > 0:
+        raise ConfigError(f"--cell {asked.cell_m:g} --dop-cell {asked.dop_cell_m:g}: both must be above 0 m")
+    if abs(large / small - round(large / small)) > 1e-9:
+        raise ConfigError(
+            f"--cell {asked.cell_m:g} --dop-cell {asked.dop_cell_m:g}: one must be a whole number of the "
+            f"other; take --dop-cell {asked.cell_m / max(1, round(asked.cell_m / asked.dop_cell_m)):g}"
+        )
+    return large
+
+
+def _frame(clouds: Sequence[Cloud], asked: Asked) -> Frame:
+    crs = agreed([(str(cloud.path), cloud.crs) for cloud in clouds], asked.crs)
+    west, south, east, north = clouds[0].bounds
+    return Frame.of(crs, ((west + east) / 2, (south + north) / 2), asked.to_crs, asked.height_unit)
+
+
+def _with(options: Options, method: str) -> Options:
+    return options.model_copy(update={"ground": method})
+
+
+def _ground(
+    clouds: Sequence[Cloud], spooled: Spooled, options: Options, asked: Ground
+) -> tuple[str, tuple[str, ...]]:
+    """Return what finds the ground, and why if that was not to be expected."""
+    classes = list(options.ground_classes)
+    share = [kinds[classes].sum() / max(1, kinds.sum()) for kinds in spooled.kinds]
+    named = _classes(classes)
+    if asked == "filter":
+        return "filter", ()
+    if asked == "classes":
+        if not any(share):
+            raise CatalogError(
+                f"no point of {named} in {some([str(cloud.path) for cloud in clouds])}; "
+                "leave --ground classes out, or name the ground with --ground-class"
+            )
+        return "classes", ()
+    alike = [c.path.name for c, kinds in zip(clouds, spooled.kinds, strict=True) if (kinds > 0).sum() == 1]
+    if alike:
+        return "filter", (f"all points of {some(alike)} are of one class: the slope filter finds the ground",)
+    bare = [c.path.name for c, ground in zip(clouds, share, strict=True) if ground < MIN_GROUND]
+    if bare:
+        few = f"less than {MIN_GROUND:.0%} of the points of {some(bare)} are ground ({named})"
+        return "filter", (f"{few}: the slope filter finds the ground; --ground classes takes the classes",)
+    return "classes", ()
+
+
+def _classes(classes: Collection[int]) -> str:
+    return "class " + ", ".join(map(str, classes))
+
+
+def _left_out(spooled: Spooled, black: Sequence[str]) -> tuple[str, ...]:
+    """Return notes on what did not become part of the rasters."""
+    notes = []
+    if spooled.beyond:
+        notes.append(
+            f"left out {spooled.beyond:,} points with heights beyond -500..9000 m; is --height-unit right?"
+        )
+    if black:
+        notes.append(f"no orthophoto: no colours in {some(black)}")
+    return tuple(notes)
+
+
+def _astray(clouds: Sequence[Cloud]) -> str:
+    def size(cloud: Cloud) -> float:
+        west, south, east, north = cloud.bounds
+        return max(east - west, north - south)
+
+    widest = max(clouds, key=size)
+    return (
+        f"the points lie too far apart for one area; {widest.path} alone spans {size(widest):.0f} of its "
+        "units: cut off what lies astray, prepare distant files apart, or take larger cells (--cell)"
+    )
+
+
+def _facts(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Options) -> dict[str, str]:
+    """Return the tags that tell how the rasters were made."""
+    filling = f"filled up to {options.void_m:g} m"
+    surface = f"linear (TIN), {filling}" if options.dtm == "tin" else f"mean per cell, {filling}"
+    found = {
+        "classes": f"points of {_classes(options.ground_classes)}",
+        "filter": f"slope filter (Vosselman 2000): {options.filter!r}",
+    }[options.ground]
+    return {
+        "SOURCE": some([cloud.path.name for cloud in clouds]),
+        "POINTS": str(spooled.points),
+        "SOURCE_CRS": short(frame.source),
+        "SOURCE_UNITS": f"{frame.plan_m or 'reprojected'} m in plan, {frame.height_m} m in height",
+        "DSM": f"highest point per cell, voids filled up to {options.fill_m:g} m",
+        "DSM_DESPIKED": f"single points {options.despike_m:g} m above their neighbours"
+        if options.despike_m
+        else "no",
+        "DTM": f"{found}; {surface}",
+        "BRIDGES": f"mean of {_classes(options.bridge_classes)} per cell",
+        "DOP": f"colour of the highest point per pixel, voids filled up to {options.dop_fill_m:g} m",
+        "LEFT_OUT": "noise (classes 7, 18) and withheld points",
+    }
+
+
+def _name(files: Sequence[Path]) -> str:
+    """Return what reports call the data: the folder, or the only file."""
+    first = files[0].resolve()
+    return first.name.split(".")[0] if len(files) == 1 else first.parent.name
