@@ -1,0 +1,237 @@
+"""The ground filter beside CSF and PDAL's PMF and SMRF, all at their defaults, on real and made clouds.
+
+Real clouds come from the folder named by FLEXROAD_REAL_DATA; PDAL is used if it is on the path; what is not
+there is left out. Ground is class 2. Noise (class 7) is taken out first; class 1 takes part but is not
+scored, as nobody said what it is; all other classes are objects. Made clouds are the cells of the benchmark's surface
+models: bridges are objects, plants and mixed echoes within 0.3 m of the ground are not scored.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+
+from tasks.acquire.ground import Options, ground, ground_cells
+from tasks.synthetic import Scene, gerod, make_scene
+from tasks.synthetic.spoilers import BARE, Kind
+from tasks.types import Bools, Floats
+
+SEED, TILES = 2, 24
+SIDE_M = 500
+CHOSEN_ON, PER_STRATUM = 1, 3
+"""Another seed, from which the default slope was chosen."""
+VAGUE_M = 0.3
+UNCLASSIFIED, GROUND, NOISE = 1, 2, 7
+LOW_SHARE, LOW_M = 0.0005, (1.0, 8.0)
+"""Low points added to a cloud: how many, how far below."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A cloud whose ground is known."""
+
+    name: str
+    points: Floats
+    """``(n, 3)``."""
+    truth: Bools
+    scored: Bools
+
+
+Filter = Callable[[Floats], Bools]
+
+
+def main() -> None:
+    cases = [*real(), *made()]
+    peers = {"FlexRoad": ours(Options()), **csf(), **pdal("pmf"), **pdal("smrf")}
+    ours(Options())(cases[-1].points)
+    print(f"{'':22} {'':9} {'type I':>7} {'type II':>7} {'total':>7} {'kappa':>6} {'s per M':>8}")
+    for case in cases:
+        for name, classify in peers.items():
+            show(case, name, classify)
+        if case.name.endswith("low points"):
+            show(case, "low kept", ours(Options(low_m=None)))
+    sensitivity([case for case in cases if not case.name.endswith("low points")])
+    choice()
+    noise()
+
+
+def show(case: Case, name: str, classify: Filter) -> None:
+    start = time.perf_counter()
+    found = classify(case.points)
+    took = (time.perf_counter() - start) / len(case.points) * 1e6
+    first, second, total, kappa = errors(found, case)
+    print(
+        f"{case.name:22} {name:9} {first:7.2%} {second:7.2%} {total:7.2%} {kappa:6.3f} {took:8.2f}",
+        flush=True,
+    )
+
+
+def errors(found: Bools, case: Case) -> tuple[float, float, float, float]:
+    """Return ground rejected, objects accepted, all errors (shares), and Cohen's kappa."""
+    found, truth = found[case.scored], case.truth[case.scored]
+    total = np.mean(found != truth)
+    by_chance = np.mean(found) * np.mean(truth) + np.mean(~found) * np.mean(~truth)
+    kappa = (1 - total - by_chance) / (1 - by_chance)
+    return float(np.mean(~found[truth])), float(np.mean(found[~truth])), float(total), float(kappa)
+
+
+def sensitivity(cases: list[Case]) -> None:
+    """Print our errors over slope and radius: type I / type II."""
+    for case in cases:
+        print(f"\n{case.name}: type I / type II by slope (down) and radius")
+        radii = (10.0, 20.0, 30.0, 50.0)
+        print(f"{'':6}" + "".join(f"{radius:14.0f} m" for radius in radii))
+        for slope in (0.15, 0.2, 0.3, 0.35, 0.4, 0.5):
+            found = [ours(Options(slope=slope, radius_m=radius))(case.points) for radius in radii]
+            pairs = [errors(one, case)[:2] for one in found]
+            print(f"{slope:<6}" + "".join(f"{first:8.2%} {second:7.2%}" for first, second in pairs))
+
+
+def choice() -> None:
+    """Print what a terrain model of the ground is off by, over the slope: what the default was chosen by."""
+    places = gerod.survey(TILES, CHOSEN_ON)
+    tiles = [place for name in gerod.STRATA for place in [p for p in places if p[2] == name][:PER_STRATUM]]
+    scenes = [make_scene(grid, CHOSEN_ON, name, options) for _, grid, name, options in tiles]
+    print(f"\nmean |TIN of the ground - truth| (m) of {len(scenes)} made tiles, seed {CHOSEN_ON}")
+    print(f"{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}")
+    for slope, confidence in ((0.2, 1.65), (0.3, 1.65), (0.35, 1.65), (0.4, 1.65), (0.5, 1.65), (0.35, 3.0)):
+        options = Options(slope=slope, confidence=confidence)
+        off = np.mean([terrain_error(scene, options) for scene in scenes], axis=0)
+        print(f"{slope:6} {confidence:10} {off[0]:7.3f} {off[1]:7.3f}", flush=True)
+
+
+def terrain_error(scene: Scene, options: Options) -> tuple[float, float]:
+    """Return the mean vertical distance over all cells and over roads, bridges left out (m)."""
+    found = ground_cells(scene.dsm, scene.grid.cell, options)
+    tin = LinearNDInterpolator(np.argwhere(found), scene.dsm[found])
+    off = np.abs(tin(*np.indices(found.shape)) - scene.reference)
+    known = np.isfinite(off) & (scene.kind != Kind.DECK)
+    return float(off[known].mean()), float(off[known & scene.reference_road].mean())
+
+
+def noise() -> None:
+    """Print what the least of many noisy neighbours costs on a plane: the tolerance is for one pair."""
+    print("\na level plane with noise: ground kept and its offset in noise_m, by confidence (across)")
+    rng = np.random.default_rng(SEED)
+    confidences = (1.65, 2.3, 3.0)
+    print(f"{'':12}" + "".join(f"{confidence:15.2f}" for confidence in confidences))
+    for density in (1, 10, 30, 100, 240):
+        n = 50_000
+        x, y = rng.uniform(0, np.sqrt(n / density), (2, n))
+        z = rng.normal(0, Options().noise_m, n)
+        found = [ground(x, y, z, Options(confidence=confidence)) for confidence in confidences]
+        row = "".join(f"{is_.mean():8.1%} {z[is_].mean() / Options().noise_m:+6.2f}" for is_ in found)
+        print(f"{density:4} per m2 {row}")
+
+
+def ours(options: Options) -> Filter:
+    return lambda points: ground(*np.ascontiguousarray(points.T), options)
+
+
+def csf() -> dict[str, Filter]:
+    try:
+        import CSF
+    except ImportError:
+        return {}
+
+    def classify(points: Floats) -> Bools:
+        cloth = CSF.CSF()
+        cloth.setPointCloud(points)
+        is_ground, others = CSF.VecInt(), CSF.VecInt()
+        with Quiet():
+            cloth.do_filtering(is_ground, others, False)
+        out = np.zeros(len(points), bool)
+        out[np.array(is_ground, dtype=int)] = True
+        return out
+
+    return {"CSF": classify}
+
+
+class Quiet:
+    """Nothing is printed, by compiled code neither."""
+
+    def __enter__(self) -> None:
+        self.kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.close(nowhere)
+
+    def __exit__(self, *error: object) -> None:
+        os.dup2(self.kept, 1)
+        os.close(self.kept)
+
+
+def pdal(name: str) -> dict[str, Filter]:
+    if not shutil.which("pdal"):
+        return {}
+
+    def classify(points: Floats) -> Bools:
+        with tempfile.TemporaryDirectory() as folder:
+            source, target = Path(folder) / "in.las", Path(folder) / "out.las"
+            las = laspy.create(point_format=6, file_version="1.4")
+            las.header.scales, las.header.offsets = [1e-4] * 3, np.floor(points.min(axis=0))
+            las.xyz = points
+            # Filters ask for returns; these clouds count as first and only ones.
+            las.return_number[:] = las.number_of_returns[:] = 1
+            las.write(source)
+            subprocess.run(["pdal", "translate", source, target, name], check=True)
+            return np.asarray(laspy.read(target).classification) == GROUND
+
+    return {name.upper(): classify}
+
+
+def real() -> Iterator[Case]:
+    folder = os.environ.get("FLEXROAD_REAL_DATA")
+    if not folder:
+        print("FLEXROAD_REAL_DATA is not set: no real clouds")
+        return
+    for name, pattern in (("IGN", "l93_770500_6277500/*.laz"), ("St-Barth", "stbarth/*.laz")):
+        clouds = [laspy.read(path) for path in sorted((Path(folder) / "ign_crops").glob(pattern))]
+        points = np.concatenate([cloud.xyz for cloud in clouds])
+        kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
+        points, kind = points[kind != NOISE], kind[kind != NOISE]
+        case = Case(name, points, kind == GROUND, kind != UNCLASSIFIED)
+        yield case
+        yield with_low_points(case)
+
+
+def with_low_points(case: Case) -> Case:
+    """Add some points below others, as echoes with a detour give them; they are not scored."""
+    rng = np.random.default_rng(SEED)
+    low = case.points[rng.choice(len(case.points), round(LOW_SHARE * len(case.points)), replace=False)]
+    low = low - np.column_stack([np.zeros((len(low), 2)), rng.uniform(*LOW_M, len(low))])
+    none = np.zeros(len(low), bool)
+    return replace(
+        case,
+        name=f"{case.name}, low points",
+        points=np.vstack([case.points, low]),
+        truth=np.concatenate([case.truth, none]),
+        scored=np.concatenate([case.scored, none]),
+    )
+
+
+def made() -> Iterator[Case]:
+    """Yield a square of the benchmark's world per stratum."""
+    places = gerod.survey(TILES, SEED)
+    for stratum in gerod.STRATA:
+        grid, options = next((grid, options) for _, grid, name, options in places if name == stratum)
+        grid = replace(grid, width=SIDE_M, height=SIDE_M)
+        scene = make_scene(grid, SEED, stratum, options)
+        easting, northing = np.meshgrid(grid.eastings, grid.northings)
+        points = np.column_stack([easting.ravel(), northing.ravel(), scene.dsm.ravel()])
+        truth = np.isin(scene.kind, BARE) & (scene.kind != Kind.DECK)
+        vague = np.isin(scene.kind, (Kind.PLANTS, Kind.MIXED)) & (abs(scene.dsm - scene.reference) < VAGUE_M)
+        yield Case(f"made, {stratum}", points, truth.ravel(), ~vague.ravel())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The ground filter as the rule is written: every pair of points compared."""
+
+import numpy as np
+
+OUTNUMBERED = 20
+
+
+def ground(easting, northing, height, options):
+    """Return which points are ground, ``(n,)``; for small clouds."""
+    out = np.zeros(height.size, bool)
+    known = np.flatnonzero(np.isfinite(easting + northing + height))
+    if options.low_m is not None:
+        low = lows(easting[known], northing[known], height[known], options)
+        known = known[~low]
+    tolerance = options.confidence * np.sqrt(2) * options.noise_m
+    for p in known:
+        for q in known:
+            d = np.sqrt((easting[p] - easting[q]) ** 2 + (northing[p] - northing[q]) ** 2)
+            if d <= options.radius_m and height[p] - height[q] > options.slope * d + tolerance:
+                break
+        else:
+            out[p] = True
+    return out
+
+
+def lows(easting, northing, height, options):
+    """Return which points are low outliers, ``(n,)``."""
+    out = np.zeros(height.size, bool)
+    for p in range(height.size):
+        near = np.sqrt((easting - easting[p]) ** 2 + (northing - northing[p]) ** 2) <= options.low_radius_m
+        as_low = np.count_nonzero(near & (height - height[p] <= options.low_m))
+        above = np.count_nonzero(near) - as_low
+        out[p] = as_low <= options.low_companions + 1 and above >= OUTNUMBERED * as_low
+    return out
