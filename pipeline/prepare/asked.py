@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from pipeline.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Asked:
@@ -33,3 +35,25 @@ class Asked:
     """When the data was taken; overrules the files."""
     dataset: str | None = None
     """What reports call the data; by default the name of the source."""
+
+    @property
+    def step_m(self) -> float:
+        """The larger of cell and pixel (m), a whole number of the smaller: areas begin at multiples of it.
+
+        Raises
+        ------
+        ConfigError
+            If neither is a whole number of the other.
+        """
+        small, large = sorted((self.cell_m, self.dop_cell_m))
+        pair = f"--cell {self.cell_m:g} --dop-cell {self.dop_cell_m:g}"
+        if not small > 0:
+            raise ConfigError(
+                f"--cell {self.cell_m:g} --dop-cell {self.dop_cell_m:g}: both must be above 0 m"
+            )
+        if abs(large / small - round(large / small)) > 1e-9:
+            raise ConfigError(
+                f"{pair}: one must be a whole number of the other; "
+                f"take --dop-cell {self.cell_m / max(1, round(self.cell_m / self.dop_cell_m)):g}"
+            )
+        return large

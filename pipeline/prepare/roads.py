@@ -13,6 +13,7 @@ from rasterio.warp import Resampling, reproject
 
 from catalog import Grid
 from catalog.crs import short
+from catalog.frame import Frame
 from pipeline.errors import ConfigError
 from pipeline.prepare.asked import Asked
 from pipeline.prepare.sheet import Sheet
@@ -71,10 +72,11 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools:
 
 
 def _mesh(path: Path, grid: Grid) -> Bools:
-    from tasks.acquire.mesh import cover
+    from tasks.acquire.mesh import cover, in_metres
     from tasks.acquire.mesh_files import read_mesh
 
-    return cover(read_mesh(path), grid)
+    mesh = read_mesh(path, colours=False)
+    return cover(in_metres(mesh, Frame.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
 
 
 def _raster(path: Path, grid: Grid) -> Bools | None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from catalog.frame import Frame
 from catalog.grid import Bounds, Grid
 from tasks.acquire.types import Photo, Points
 from tasks.types import Bools, Floats
@@ -67,6 +68,22 @@ class TexturedMesh:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         normals: Floats = np.cross(b - a, c - a)
         return normals
+
+    @property
+    def area(self) -> float:
+        """Area of the surface."""
+        return float(np.linalg.norm(self.normals, axis=1).sum() / 2)
+
+
+def in_metres(mesh: TexturedMesh, frame: Frame) -> TexturedMesh:
+    """Return the mesh in the frame's CRS, in metres.
+
+    Raises
+    ------
+    CatalogError
+        If the mesh lies where that CRS has no coordinates.
+    """
+    return replace(mesh, crs=frame.target, vertices=np.column_stack(frame.metres(*mesh.vertices.T)))
 
 
 def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
