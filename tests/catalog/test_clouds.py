@@ -1,0 +1,135 @@
+import laspy
+import numpy as np
+import pytest
+from laspy.vlrs.known import GeoKeyDirectoryVlr
+
+from catalog import CatalogError
+from catalog.clouds import chunks, find, inspect
+from catalog.crs import in_plan
+from tests.make_clouds import write_cloud
+
+N = 120_000
+"""More than one chunk of a LAZ file (50,000 points)."""
+
+
+def some_points(n=N):
+    rng = np.random.default_rng(5)
+    return np.round(rng.uniform([636000, 848000, 400], [639000, 853000, 600], (n, 3)), 2)
+
+
+def joined(path, **how):
+    parts = list(chunks(path, **how))
+    xyz = np.concatenate([np.stack([part.x, part.y, part.z], axis=1) for part in parts])
+    colour = None if parts[0].colour is None else np.concatenate([part.colour for part in parts])
+    return xyz, np.concatenate([part.kind for part in parts]), colour
+
+
+def test_a_header_tells_what_there_is(tmp_path):
+    xyz = some_points(500)
+    path = write_cloud(tmp_path / "a.laz", xyz, crs="EPSG:2994", colour=np.full((500, 3), 9))
+    told = inspect(path)
+    assert (told.points, told.has_colours, in_plan(told.crs)) == (500, True, "EPSG:2994")
+    assert told.bounds == pytest.approx((*xyz.min(axis=0)[:2], *xyz.max(axis=0)[:2]), abs=1e-6)
+    assert told.heights == pytest.approx((xyz[:, 2].min(), xyz[:, 2].max()), abs=1e-6)
+    plain = inspect(write_cloud(tmp_path / "b.las", xyz))
+    assert (plain.has_colours, plain.crs) == (False, None)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("size", [N, 50_000, 7919])
+def test_any_chunk_gives_the_same_points(tmp_path, suffix, size):
+    rng = np.random.default_rng(6)
+    xyz, kind, colour = some_points(), rng.integers(0, 7, N), rng.integers(0, 65536, (N, 3))
+    got = joined(write_cloud(tmp_path / f"a.{suffix}", xyz, kind, colour=colour), size=size)
+    assert np.abs(got[0] - xyz).max() < 1e-6
+    assert np.array_equal(got[1], kind)
+    assert np.array_equal(got[2], colour)
+
+
+def test_noise_and_withheld_points_stay_out(tmp_path):
+    kind, withheld = [1, 7, 18, 2, 17], [False, False, False, True, False]
+    path = write_cloud(tmp_path / "a.laz", some_points(5), kind, withheld=withheld)
+    assert list(joined(path)[1]) == [1, 17]
+    assert list(joined(path, drop=())[1]) == [1, 7, 18, 17]
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("part", [0.0, 0.0001, 0.3, 0.7, 0.999])
+def test_a_file_cut_anywhere_is_one_clear_line(tmp_path, suffix, part):
+    path = write_cloud(tmp_path / f"a.{suffix}", some_points())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * part)])
+    with pytest.raises(CatalogError) as error:
+        list(chunks(inspect(path).path))
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert str(error.value).endswith("download it again")
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.8])
+def test_damage_within_a_file_is_seen(tmp_path, part):
+    """LAZ has no checksum: spoiled bytes end too early, or decode to points far away."""
+    rng = np.random.default_rng(3)
+    walk = np.cumsum(rng.integers(-5, 6, (N, 3)), axis=0) / 100 + [636000, 848000, 400]
+    path = write_cloud(tmp_path / "a.laz", walk)
+    spoiled = bytearray(path.read_bytes())
+    at = int(len(spoiled) * part)
+    spoiled[at : at + 2000] = bytes(2000)
+    path.write_bytes(spoiled)
+    assert inspect(path).points == N
+    with pytest.raises(CatalogError, match=r"a\.laz (is damaged|cannot be read).*; download it again"):
+        list(chunks(path))
+
+
+def test_points_beyond_the_header_are_damage(tmp_path):
+    xyz = some_points(100)
+    path = write_cloud(tmp_path / "a.las", xyz)
+    spoiled = bytearray(path.read_bytes())
+    east = 179
+    spoiled[east : east + 8] = np.float64(xyz[:, 0].max() - 200).tobytes()
+    path.write_bytes(spoiled)
+    with pytest.raises(CatalogError, match=r"a\.las is damaged: its header gives .* download it again"):
+        list(chunks(path))
+
+
+def test_what_is_no_cloud_is_named(tmp_path):
+    with pytest.raises(CatalogError, match="none.laz does not exist; give LAS or LAZ files"):
+        inspect(tmp_path / "none.laz")
+    text = tmp_path / "a.laz"
+    text.write_text("points " * 100)
+    with pytest.raises(CatalogError, match="a.laz cannot be read as a point cloud: .*; download it again"):
+        inspect(text)
+    with pytest.raises(CatalogError, match="empty.laz has no points; leave it out"):
+        inspect(write_cloud(tmp_path / "empty.laz", np.zeros((0, 3))))
+
+
+def test_keys_of_a_plane_without_a_code_are_not_taken_for_degrees(tmp_path):
+    def with_keys(name, xyz):
+        header = laspy.LasHeader(point_format=1, version="1.2")
+        header.scales, header.offsets = [1e-4] * 3, xyz[0]
+        points = laspy.LasData(header)
+        points.x, points.y, points.z = xyz.T
+        keys = GeoKeyDirectoryVlr()
+        # Version; then model type, geographic base NAD83(HARN), plane of one's own: key, place, count, value.
+        values = [1, 1, 0, 3, 1024, 0, 1, 1, 2048, 0, 1, 4152, 3072, 0, 1, 32767]
+        keys.parse_record_data(np.array(values, "<u2").tobytes())
+        points.header.vlrs.append(keys)
+        points.write(tmp_path / name)
+        return inspect(tmp_path / name).crs
+
+    assert with_keys("feet.las", some_points(10)) is None
+    assert in_plan(with_keys("degrees.las", some_points(10) / [-5200, 20000, 1])) == "EPSG:4152"
+
+
+def test_folders_are_searched_and_each_file_counts_once(tmp_path):
+    xyz = some_points(3)
+    folder = tmp_path / "clouds"
+    paths = [write_cloud(folder / name, xyz) for name in ("b.laz", "c.copc.laz")]
+    paths.append((folder / "b.laz").rename(folder / "A.LAZ"))
+    (folder / "notes.txt").write_text("none of ours")
+    assert [path.name for path in find([folder / "c.copc.laz", folder])] == ["A.LAZ", "c.copc.laz"]
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(CatalogError, match="no LAS or LAZ file in .*bare; give the files"):
+        find([tmp_path / "bare"])
+    with pytest.raises(CatalogError, match="gone.laz does not exist"):
+        find([tmp_path / "gone.laz"])

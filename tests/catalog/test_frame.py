@@ -1,0 +1,142 @@
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from catalog import CatalogError
+from catalog.clouds import inspect
+from catalog.crs import in_plan, metric_twin, plan_unit
+from catalog.frame import Frame, agreed
+
+OREGON = (637000.0, 852000.0)
+COLOGNE = (6.95, 50.94)
+
+
+def nameless(code: str, shift: float = 0) -> str:
+    """The same CRS without names and codes that a register could know it by; its plane moved."""
+    told = CRS(code).to_json_dict()
+    told["name"], told["conversion"]["name"] = "mine", "mine"
+    told.pop("id")
+    told["conversion"]["parameters"][-1]["value"] += shift
+    return CRS.from_json_dict(told).to_wkt()
+
+
+@pytest.mark.parametrize(
+    ("feet", "metres", "place"),
+    [
+        ("EPSG:2994", "EPSG:2993", OREGON),
+        (nameless("EPSG:2994"), "EPSG:2993", OREGON),
+        ("EPSG:2263", "EPSG:32118", (1e6, 2e5)),
+        ("EPSG:2227+6360", "EPSG:26943", (6e6, 2.1e6)),
+        ("EPSG:25832", "EPSG:25832", (356000, 5700000)),
+        (nameless("EPSG:25832"), "EPSG:25832", (356000, 5700000)),
+    ],
+)
+def test_a_plane_in_feet_has_its_twin_in_metres(feet, metres, place):
+    assert Frame.of(feet, place).target == metres
+
+
+def test_a_twin_that_no_register_knows_is_described():
+    twin = metric_twin(nameless("EPSG:2994", shift=1000), *OREGON)
+    assert plan_unit(twin)[1] == 1
+    there = Transformer.from_crs(twin, "EPSG:2993", always_xy=True).transform(200000, 260000)
+    assert there == pytest.approx((200000, 260000 - 304.8), abs=1e-5)
+
+
+def test_feet_become_metres_by_multiplication_alone():
+    """And PROJ agrees, up to the digits that the register has of the twins' false eastings."""
+    frame = Frame.of("EPSG:2994", OREGON)
+    x, y, z = np.array([635652.69, 639003.73]), np.array([851377.98, 853537.66]), np.array([407.81, 598.15])
+    got = frame.metres(x, y, z)
+    assert np.array_equal(got, [x * 0.3048, y * 0.3048, z * 0.3048])
+    proj = Transformer.from_crs("EPSG:2994", "EPSG:2993", always_xy=True).transform(x, y)
+    assert np.abs(np.array(got[:2]) - proj).max() < 1e-5
+
+
+def test_the_two_feet_are_kept_apart():
+    """2 ppm: 4 m in 6.5 million feet of California."""
+    x, zero = np.array([6.5e6]), np.zeros(1)
+    survey = Frame.of("EPSG:2227", (6.5e6, 2.1e6)).metres(x, zero, x)
+    assert survey[0][0] == pytest.approx(6.5e6 * 1200 / 3937, abs=1e-6)
+    assert survey[2][0] == pytest.approx(6.5e6 * 1200 / 3937, abs=1e-6)
+    assert Frame.of("EPSG:2994", OREGON).metres(x, zero, x)[0][0] == 6.5e6 * 0.3048
+    assert abs(6.5e6 * 1200 / 3937 - 6.5e6 * 0.3048) > 3.9
+
+
+@pytest.mark.parametrize(
+    ("crs", "unit", "metres", "notes"),
+    [
+        ("EPSG:2994", None, 0.3048, 1),
+        ("EPSG:2994", "metre", 1.0, 0),
+        ("EPSG:2994", "us-foot", 1200 / 3937, 0),
+        ("EPSG:2994+5703", None, 1.0, 0),
+        ("EPSG:2263+6360", "us-foot", 1200 / 3937, 0),
+        ("EPSG:25832", None, 1.0, 0),
+        ("EPSG:25832", "foot", 0.3048, 0),
+    ],
+)
+def test_heights_have_a_unit_of_their_own(crs, unit, metres, notes):
+    frame = Frame.of(crs, OREGON, unit=unit)
+    assert frame.height_m == pytest.approx(metres, rel=1e-12)
+    assert len(frame.notes) == notes
+    assert all("taken to be in feet, like the plan; --height-unit" in note for note in frame.notes)
+
+
+def test_degrees_go_to_the_zone_of_the_place():
+    frame = Frame.of("EPSG:4326", COLOGNE)
+    assert (frame.target, frame.height_m, frame.notes) == ("EPSG:32632", 1.0, ())
+    east, north = np.array([COLOGNE[0], 6.96]), np.array([COLOGNE[1], 50.95])
+    got = frame.metres(east, north, np.array([50.0, 60.0]))
+    want = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform(east, north)
+    assert np.array_equal(got[:2], want)
+    assert np.array_equal(got[2], [50.0, 60.0])
+
+
+def test_another_crs_may_be_asked_for():
+    frame = Frame.of("EPSG:2994", OREGON, to_crs="EPSG:32610")
+    x, y = np.array([OREGON[0]]), np.array([OREGON[1]])
+    want = Transformer.from_crs("EPSG:2994", "EPSG:32610", always_xy=True).transform(x, y)
+    assert np.array_equal(frame.metres(x, y, x)[:2], want)
+    assert Frame.of("EPSG:2994", OREGON, to_crs="EPSG:2993").plan_m == 0.3048
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"to_crs": "EPSG:2994"}, "--to-crs EPSG:2994 is in feet; give a projected CRS in metres"),
+        ({"to_crs": "EPSG:4326"}, "--to-crs EPSG:4326 is in degrees; give a projected CRS in metres"),
+        ({"to_crs": "EPSG:0"}, "unknown CRS 'EPSG:0'"),
+        ({"unit": "yard"}, "--height-unit yard: there is metre, foot, us-foot"),
+        ({"source": "EPSG:2994+5703", "unit": "foot"}, "--height-unit foot, but heights of .* are in metre;"),
+        ({"source": "EPSG:4978"}, "neither projected nor geographic; reproject"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(how, message):
+    with pytest.raises(CatalogError, match=message):
+        Frame.of(**{"source": "EPSG:2994", "place": OREGON, **how})
+
+
+def test_a_place_that_the_target_does_not_have_is_an_error():
+    frame = Frame.of("EPSG:4326", COLOGNE, to_crs="EPSG:25832")
+    with pytest.raises(CatalogError, match="in EPSG:4326 lie nowhere in EPSG:25832; .* --to-crs"):
+        frame.metres(np.array([7.0]), np.array([95.0]), np.zeros(1))
+
+
+def test_files_of_a_set_share_one_crs():
+    feet = CRS("EPSG:2994").to_wkt()
+    assert in_plan(agreed([("a", feet), ("b", None)], "EPSG:2994")) == "EPSG:2994"
+    assert agreed([("a", None), ("b", None)], "EPSG:25832") == "EPSG:25832"
+    with pytest.raises(CatalogError, match="b.laz carries no CRS; give it with --crs"):
+        agreed([("a.laz", feet), ("b.laz", None)], None)
+    with pytest.raises(CatalogError, match="mixed CRS: a.laz is in EPSG:2994, b.laz in EPSG:25832; .* apart"):
+        agreed([("a.laz", feet), ("b.laz", "EPSG:25832")], None)
+    with pytest.raises(CatalogError, match="mixed CRS: .* b.laz in EPSG:2994 with heights in metre"):
+        agreed([("a.laz", feet), ("b.laz", "EPSG:2994+5703")], None)
+    with pytest.raises(CatalogError, match="mixed CRS: a.laz is in EPSG:2994, --crs in EPSG:25832; leave"):
+        agreed([("a.laz", feet)], "EPSG:25832")
+
+
+@pytest.mark.real
+def test_the_survey_without_a_code_gets_one(real_data):
+    cloud = inspect(real_data / "autzen" / "autzen_north.laz")
+    assert Frame.of(cloud.crs, cloud.bounds[:2]).target == "EPSG:2993"
+    assert inspect(real_data / "autzen" / "autzen-thin.las").crs is None
