@@ -69,9 +69,7 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     rim = grid.buffered(reach_m(options, grid.cell))
     inner = rim.window(grid)
     if options.despike_m is not None:
-        cells = bins(points.easting, points.northing, rim)
-        single = spikes(cells, points.height, rim.shape, options.despike_m)
-        points = points[np.setdiff1d(np.arange(len(points)), single, assume_unique=True)]
+        points = _without_spikes(points, rim, options.despike_m)
     cells = bins(points.easting, points.northing, rim)
     dsm = voids.fill(highest(cells, points.height, rim.shape), rim, options.fill_m)
     decks = np.isin(points.kind, options.bridge_classes)
@@ -125,6 +123,13 @@ def facts(options: Options) -> dict[str, str]:
 
 def _classes(classes: tuple[int, ...]) -> str:
     return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
+
+
+def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
+    cells = bins(points.easting, points.northing, grid)
+    kept = np.ones(len(points), bool)
+    kept[spikes(cells, points.height, grid.shape, despike_m)] = False
+    return points[kept]
 
 
 def _is_ground(points: Points, options: Options) -> Bools:

@@ -3,7 +3,7 @@ import pytest
 
 from catalog.grid import Grid
 from tasks.acquire.bins import bins
-from tasks.acquire.terrain import averaged, triangulated
+from tasks.acquire.terrain import averaged, reach_m, triangulated
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 
@@ -67,3 +67,16 @@ def test_one_point_and_points_in_a_line_are_ground_of_their_cells_alone():
         found = tin(*(axis[:count] for axis in line))
         assert np.isfinite(found).sum() == count
         np.testing.assert_array_equal(np.diag(found)[: 3 * count : 3], line[2][:count])
+
+
+def test_a_triangle_can_be_as_long_as_the_reach():
+    """A cell that takes its height from points in the outermost cells of the reach."""
+    reach = reach_m(6, GRID.cell)
+    centre = GRID.west + 30.5, GRID.north - 25.5
+    east = np.array([0.2, -reach + 0.45, -reach + 0.45])
+    points = centre[0] + east, centre[1] + np.array([0, 0.6, -0.6]), 100 + east
+    found = tin(*points, void_m=6)
+    assert found[25, 30] == pytest.approx(100, abs=1e-6)
+    assert np.isfinite(found[[24, 26], 30 - round(reach)]).all()
+    assert np.isfinite(found[25, 29])
+    assert np.isnan(tin(*points, void_m=5.9)[25, 29])
