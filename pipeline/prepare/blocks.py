@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from catalog import Grid
+from catalog.grid import Bounds
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
 from pipeline.prepare.sheet import Sheet
@@ -31,9 +32,9 @@ class BlockJob:
     """Where the rasters go, ``.npz``."""
 
 
-def sheet_grid(spooled: Spooled, crs: str, cell: float, step: float) -> Grid:
-    """Return the smallest grid on multiples of ``step`` (m) that covers the points."""
-    west, south, east, north = (side / step for side in spooled.bounds)
+def sheet_grid(bounds: Bounds, crs: str, cell: float, step: float) -> Grid:
+    """Return the smallest grid on multiples of ``step`` (m) that covers the bounds."""
+    west, south, east, north = (side / step for side in bounds)
     west, south = math.floor(west) * step, math.floor(south) * step
     east, north = math.ceil(east) * step, math.ceil(north) * step
     return Grid.covering(crs, (west, south, max(east, west + step), max(north, south + step)), cell)
@@ -71,7 +72,8 @@ def fill(
 def _jobs(sheet: Sheet, spooled: Spooled, options: Options) -> Iterator[BlockJob]:
     """Yield the blocks on the sheet that points can reach."""
     blocks, reach = spooled.blocks, reach_m(options, sheet.grid.cell)
-    dop_cell = sheet.photo_grid.cell if sheet.photo_grid else None
+    # Points of a mesh have no colours: its texture is drawn instead.
+    dop_cell = sheet.photo_grid.cell if sheet.photo_grid and any(spooled.colours) else None
     for place in blocks.over(sheet.grid):
         grid = _on_sheet(sheet.grid, blocks.edge, place)
         if grid and not spooled.places.isdisjoint(blocks.over(grid, reach)):

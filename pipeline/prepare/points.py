@@ -11,7 +11,6 @@ from catalog.clouds import Cloud, find, inspect
 from catalog.crs import short
 from catalog.frame import Frame, agreed
 from catalog.raster_files import some
-from pipeline.errors import ConfigError
 from pipeline.execute import Executor
 from pipeline.prepare.asked import Asked
 from pipeline.prepare.blocks import fill, sheet_grid
@@ -67,7 +66,7 @@ def prepare_points(
     ConfigError
         If the folder cannot be written, the disk is full, or cells and pixels do not fit.
     """
-    step = _step(asked)
+    step = asked.step_m
     clouds = tuple(inspect(path) for path in find(files))
     frame = _frame(clouds, asked)
     with scratch(out) as folder:
@@ -75,7 +74,7 @@ def prepare_points(
         spooled = spool(clouds, frame, folder, edge_m(clouds, frame, farthest, step), say)
         method, notes = _ground(clouds, spooled, options, ground)
         options = _with(options, method)
-        grid = sheet_grid(spooled, frame.target, asked.cell_m, step)
+        grid = sheet_grid(spooled.bounds, frame.target, asked.cell_m, step)
         if grid.width * grid.height > MAX_CELLS:
             raise CatalogError(_astray(clouds))
         black = [cloud.path.name for cloud, seen in zip(clouds, spooled.colours, strict=True) if not seen]
@@ -86,19 +85,6 @@ def prepare_points(
             add_roads(sheet, asked)
             dataset = asked.dataset or _name(files)
             return sheet.publish(asked.tile_size_m, asked.date, dataset).noting(*notes)
-
-
-def _step(asked: Asked) -> float:
-    """Return the larger of cell and pixel (m), a whole number of the smaller."""
-    small, large = sorted((asked.cell_m, asked.dop_cell_m))
-    if not small > 0:
-        raise ConfigError(f"--cell {asked.cell_m:g} --dop-cell {asked.dop_cell_m:g}: both must be above 0 m")
-    if abs(large / small - round(large / small)) > 1e-9:
-        raise ConfigError(
-            f"--cell {asked.cell_m:g} --dop-cell {asked.dop_cell_m:g}: one must be a whole number of the "
-            f"other; take --dop-cell {asked.cell_m / max(1, round(asked.cell_m / asked.dop_cell_m)):g}"
-        )
-    return large
 
 
 def _frame(clouds: Sequence[Cloud], asked: Asked) -> Frame:

@@ -48,6 +48,11 @@ def edge_m(clouds: Sequence[Cloud], frame: Frame, reach_m: float, step: float) -
         west, south, east, north = cloud.bounds
         x, y, _ = frame.metres(np.array([west, east]), np.array([south, north]), np.zeros(2))
         area += max(float(abs((x[1] - x[0]) * (y[1] - y[0]))), 1.0)
+    return edge_for(points, area, reach_m, step)
+
+
+def edge_for(points: float, area: float, reach_m: float, step: float) -> float:
+    """Return the edge of blocks where so many points lie on so much ground (m2), in whole steps (m)."""
     fitting = math.sqrt(POINTS_PER_BLOCK * area / points) - 2 * reach_m
     edge = LONGEST_EDGE_M if points <= POINTS_PER_BLOCK else np.clip(fitting, SHORTEST_EDGE_M, LONGEST_EDGE_M)
     return max(1, math.floor(edge / step)) * step
