@@ -2,8 +2,8 @@
 
 Real clouds come from the folder named by FLEXROAD_REAL_DATA; PDAL is used if it is on the path; what is not
 there is left out. Ground is class 2. Noise (class 7) is taken out first; class 1 takes part but is not
-scored, as nobody said what it is; all other classes are objects. Made clouds are the cells of the benchmark's surface
-models: bridges are objects, plants and mixed echoes within 0.3 m of the ground are not scored.
+scored, as nobody said what it is; all other classes are objects. Made clouds are the cells of the benchmark's
+surface models: bridges are objects, plants and mixed echoes within 0.3 m of the ground are not scored.
 """
 
 from __future__ import annotations
