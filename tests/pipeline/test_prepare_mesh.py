@@ -90,7 +90,10 @@ def test_rasters_are_those_of_the_mesh(box, tmp_path, executor):
     rise = (dsm - ground(x, y))[~beside]
     assert rise.min() > 0
     assert rise.max() < 0.035 + 1e-3
-    assert np.array_equal(np.moveaxis(read(tmp_path / "out" / "dop.tif"), 0, -1)[::2, ::2], texture())
+    colour = np.moveaxis(read(tmp_path / "out" / "dop.tif"), 0, -1)[::2, ::2]
+    # Next to a change of colour the texture is read between two texels.
+    rows, cols = np.delete(np.arange(SIDE), [19, 20]), np.delete(np.arange(SIDE), [39, 40])
+    assert np.array_equal(colour[np.ix_(rows, cols)], texture()[np.ix_(rows, cols)])
 
 
 def test_blocks_change_nothing(box, tmp_path, monkeypatch):
