@@ -8,9 +8,10 @@ from pathlib import Path
 
 from catalog.grid import Grid
 
-LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges")
+LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and
-terrain heights (m) incl. bridges, true road mask, heights of bridge decks alone (m)."""
+terrain heights (m) incl. bridges, true road mask, heights of bridge decks alone (m), roads as lines or
+areas (vectors)."""
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,11 @@ Read `STAGES` and then the files it names, in that order, and you have read the 
 
     Tile -> load -> segment -> ecsrc -> fit -> sample -> evaluate -> row
 
-A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; a source layer counts
-by (path relative to the catalog, size, mtime), or by its bytes. Variants that agree up to a stage share its
-node, so it is computed once; a node whose artefact lies in the store is not computed at all.
+A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``. A source layer counts
+by (path relative to the catalog, size, mtime), or by its bytes, for the stages whose module names it in
+`READS`; a file that only the options name (a model), told by the module's `files`, counts by its bytes.
+Variants that agree up to a stage share its node, so it is computed once; a node whose artefact lies in the
+store is not computed at all.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -123,16 +127,13 @@ def tile_graph(
     sources = [_layer(tile, layer, checksum) for layer in tile.layers]
     if any(size is None for _, files, *_ in sources for _, size, *_ in files):
         sources = _as_they_were(sources, recorded())
-    source = [asdict(tile.grid), sources]
     nodes: dict[str, Node] = {}
     variants: dict[str, dict[str, str]] = {}
     for variant, chain in config.chains.items():
         made: dict[str, str] = {}
         for stage in STAGES:
             inputs = tuple(made[name] for name in stage.inputs)
-            node = _node(
-                stage, chain[stage.name], inputs, source, keep_mesh=variant in config.export.variants
-            )
+            node = _node(stage, chain[stage.name], inputs, tile, sources, variant in config.export.variants)
             known = nodes.get(node.fingerprint)
             if known is None or (node.stored and not known.stored):
                 nodes[node.fingerprint] = node
@@ -148,7 +149,12 @@ def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
 
 
 def _node(
-    stage: Stage, options: Options, inputs: tuple[str, ...], source: list[Any], keep_mesh: bool
+    stage: Stage,
+    options: Options,
+    inputs: tuple[str, ...],
+    tile: Tile,
+    sources: list[Any],
+    keep_mesh: bool,
 ) -> Node:
     module = stage_module(options)
     made_of = [
@@ -156,10 +162,32 @@ def _node(
         module.__name__,
         module.VERSION,
         options.model_dump(mode="json"),
-        list(inputs) if stage.inputs else source,
+        # The first stage takes the tile itself.
+        list(inputs) if stage.inputs else asdict(tile.grid),
+        [source for source in sources if source[0] in getattr(module, "READS", ())],
+        [_bytes(path) for path in getattr(module, "files", _none)(options)],
     ]
     stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
     return Node(digest(made_of), stage.name, options, inputs, stored)
+
+
+def _none(options: Options) -> tuple[Path, ...]:
+    return ()
+
+
+def _bytes(path: Path) -> str | None:
+    try:
+        stat = path.stat()
+    except OSError:
+        # A missing file is its stage's to report; when it comes back the name changes.
+        return None
+    return _digest_of(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _as_they_were(sources: list[Any], recorded: list[Any] | None) -> list[Any]:

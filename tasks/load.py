@@ -20,12 +20,14 @@ from catalog.raster_files import quiet
 from tasks import options
 from tasks.errors import TaskError
 from tasks.patch import Patch, Unreadable, misfit, onto, read
-from tasks.types import Bools, Floats, TileData
+from tasks.types import Bools, Floats, Source, TileData
 
 VERSION = 1
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")
+READS = HEIGHTS + CLASSES
+"""Layers the result depends on; the others are only named to who reads them."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights beyond these are nodata that nobody declared."""
@@ -84,9 +86,7 @@ def load(tile: Tile, options: Options) -> TileData:
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")
     grid = tile.grid.buffered(options.halo_m)
     with quiet():
-        found = {
-            layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in HEIGHTS + CLASSES
-        }
+        found = {layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in READS}
     _check_units([patch for name in HEIGHTS if name in found for patch in found[name].patches])
     core = grid.window(tile.grid)
     _check_valid(found["dsm"], core, options.min_valid)
@@ -101,7 +101,14 @@ def load(tile: Tile, options: Options) -> TileData:
         reference=_reference(found),
         reference_road=_road(tile, "reference_road", found),
         notes=tuple(note for mosaic in found.values() for note in mosaic.notes),
+        dop=_source(tile, "dop"),
+        roads=_source(tile, "roads"),
     )
+
+
+def _source(tile: Tile, name: str) -> Source | None:
+    layer = tile.layer(name)
+    return layer and Source(name, tile.paths(layer), layer.crs)
 
 
 def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -12,6 +13,18 @@ from catalog.grid import Bounds, Grid
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A layer that is read where it is used, at its own resolution."""
+
+    name: str
+    """One of `catalog.LAYERS`."""
+    paths: tuple[Path, ...]
+    """Files that reach the tile; of those that overlap, the first with a value wins."""
+    crs: str | None = None
+    """CRS of files that carry none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +48,10 @@ class TileData:
     """True road cells, ``(H, W)``, or None: the raw segmented mask then stands in."""
     notes: tuple[str, ...] = ()
     """What had to be done to the input (resampling, cut heights), one line each."""
+    dop: Source | None = None
+    """The orthophoto, or None if the tile has none."""
+    roads: Source | None = None
+    """Roads as vectors, or None if the tile has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +67,10 @@ class RoadMask:
     Meshes end there; voids inside are bridged."""
     probability: NDArray[np.float32] | None = None
     """Probability of road, ``(H, W)``, 0 to 1, where the method gives one."""
+    bridge: Bools | None = None
+    """Cells of the mask that lie on bridges, ``(H, W)``, where the method knows them."""
+    notes: tuple[str, ...] = ()
+    """What to know about the mask (a photo off the heights), one line each."""
 
 
 @dataclass(frozen=True, eq=False)

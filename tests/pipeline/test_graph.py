@@ -2,13 +2,15 @@
 
 import os
 import shutil
+from dataclasses import replace
 
 import pytest
 
-from catalog import Catalog
+from catalog import Catalog, Layer
 from pipeline.config import compose
 from pipeline.graph import STAGE_NAMES, tile_graph
 from tasks import ecsrc
+from tasks.segment import mask
 
 PAPER = {
     "variants": {
@@ -89,3 +91,35 @@ def test_sources_count_by_size_and_time_or_by_bytes(survey):
     path.unlink()
     missing = names(survey)
     assert changed(plain, missing) == list(STAGE_NAMES)
+
+
+def test_a_layer_changes_the_stages_that_read_it(survey, tmp_path, monkeypatch):
+    (tile, *_) = Catalog.read(survey).tiles
+    photo = tmp_path / "dop.tif"
+    photo.write_bytes(b"old")
+    tile = replace(tile, layers=(*tile.layers, Layer("dop", (str(photo),))))
+
+    def made():
+        return tile_graph(tile, compose(PAPER, "x")).variants["flexroad"]
+
+    unread = made()
+    photo.write_bytes(b"newer")
+    assert made() == unread
+    monkeypatch.setattr(mask, "READS", ("dop",), raising=False)
+    read = made()
+    assert changed(unread, read) == list(STAGE_NAMES[1:])
+    photo.write_bytes(b"newest of all")
+    assert changed(read, made()) == list(STAGE_NAMES[1:])
+
+
+def test_files_that_options_name_count_by_their_bytes(survey, tmp_path, monkeypatch):
+    model = tmp_path / "model"
+    monkeypatch.setattr(mask, "files", lambda options: (model,), raising=False)
+    missing = names(survey)
+    model.write_bytes(b"one")
+    first = names(survey)
+    assert changed(missing, first) == list(STAGE_NAMES[1:])
+    os.utime(model, (0, 0))
+    assert names(survey) == first
+    model.write_bytes(b"two")
+    assert changed(first, names(survey)) == list(STAGE_NAMES[1:])
