@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from catalog.errors import CatalogError
+from pipeline.cli_prepare import prepare
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,9 +35,10 @@ app = typer.Typer(
 catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
 configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
 app.add_typer(catalogs, name="catalog")
+app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
 
-SEVERAL = ("--tile", "--road-value")
+SEVERAL = ("--tile", "--road-value", "--ground-class", "--bridge-class")
 """Options that take several values in a row."""
 FOLDER_FIRST = ("rerun", "figures", "rasters", "nrw")
 """Commands with a folder of their own, which must come first for that."""
@@ -213,7 +215,10 @@ def _write_catalog(found: Indexed, output: Path) -> None:
 def catalog_synthetic(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     preset: Annotated[
-        str | None, typer.Option(help="gerod: independent tiles like the paper's 240; default: neighbours.")
+        str | None,
+        typer.Option(
+            help="gerod: independent tiles like the paper's 240; dsc3d: five meshes; default: neighbours."
+        ),
     ] = None,
     tiles: Annotated[
         int | None, typer.Option(min=1, help="Number of tiles; default: 4, or all of the preset.")
@@ -420,12 +425,21 @@ def tables(
     true: Annotated[
         Path | None, typer.Option(metavar="RUN", help="The same run classed by the true mask.")
     ] = None,
+    dsc3d: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="A run for the rows of DSC3D: its scenes, or the stand-in's."),
+    ] = None,
+    dsc3d_true: Annotated[
+        Path | None,
+        typer.Option("--dsc3d-true", metavar="RUN", help="The same scenes with the true reference."),
+    ] = None,
 ) -> None:
     """Write the paper's tables and claims with a run's figures beside them: Markdown, LaTeX, CSV, HTML."""
     from pipeline.report.tables import write_comparison
     from pipeline.run import Run
 
-    for written in write_comparison(Run.open(path), Run.open(true) if true else None, output):
+    others = [Run.open(other) if other else None for other in (true, dsc3d, dsc3d_true)]
+    for written in write_comparison(Run.open(path), others[0], output, *others[1:]):
         _say(str(written))
 
 

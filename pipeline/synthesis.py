@@ -10,12 +10,13 @@ from catalog import Catalog, Grid
 from catalog.sources import prepared
 from pipeline.errors import ConfigError
 from pipeline.execute import DaskExecutor, Executor, SerialExecutor
-from tasks.synthetic import SceneOptions, block, gerod, make_scene
+from pipeline.standin import write_stand_in
+from tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from tasks.synthetic.orthophoto import orthophoto
 
 WORTH_PROCESSES = 12
 """Tiles from which on starting worker processes pays."""
-PRESETS = ("gerod",)
+PRESETS = ("gerod", "dsc3d")
 TILES, SIZE_M = 4, 250
 """Number and side (m) of the tiles where nothing else is asked for."""
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
@@ -57,9 +58,9 @@ def write_scenes(
     seed : int
         The world.
     size_m : int, optional
-        Side of a tile (m); 250 by default, and for every preset.
+        Side of a tile (m); 250 by default. A preset's tiles have their own.
     dop : bool
-        Whether orthophotos are made, too.
+        Whether orthophotos are made, too; the preset dsc3d always has them.
     preset : str, optional
         One of `PRESETS`.
 
@@ -68,6 +69,8 @@ def write_scenes(
     ConfigError
         If the folder cannot be written, or the preset is unknown or has tiles of another size.
     """
+    if preset == "dsc3d" and size_m in (None, dsc3d.SIZE_M):
+        return write_stand_in(folder, tiles, seed)
     jobs = _jobs(folder, tiles, seed, size_m, dop, preset)
     executor: Executor = DaskExecutor() if len(jobs) >= WORTH_PROCESSES else SerialExecutor()
     try:
@@ -94,8 +97,9 @@ def _jobs(
         return [SceneJob(str(folder), t, grid, seed, s, o, name, dop) for t, grid, s, o in places]
     if preset not in PRESETS:
         raise ConfigError(f"--preset {preset}: there is {', '.join(PRESETS)}")
-    if size_m not in (None, gerod.SIZE_M):
-        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {gerod.SIZE_M} m; leave it out")
+    own_m = {"gerod": gerod.SIZE_M, "dsc3d": dsc3d.SIZE_M}[preset]
+    if size_m not in (None, own_m):
+        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave it out")
     name = f"synthetic benchmark {preset}, seed {seed}"
     return [
         SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop)

@@ -26,7 +26,7 @@ def commands(tmp_path, *words: str) -> list[list[str]]:
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_made_tiles_are_classed_by_both_masks(tmp_path):
-    catalog, first, second, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
+    catalog, _, first, second, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
     assert catalog[:2] == ["catalog", "synthetic"]
     assert {"--preset", "gerod", "--tiles", "3", "--seed", "5"} <= set(catalog)
     stores = [line[line.index("--store") + 1] for line in (first, second)]
@@ -40,7 +40,23 @@ def test_made_tiles_are_classed_by_both_masks(tmp_path):
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_real_tiles_take_the_place_of_made_ones(tmp_path):
-    catalog, run, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
+    catalog, _, run, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
     assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
     assert "ablation" in run
     assert "--true" not in tables
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize("words", [["SEED=5"], ["SEED=5", "GEROD_ROOT=/data/gerod"]])
+def test_made_scenes_stand_in_for_dsc3d_by_both_references(tmp_path, words):
+    _, scenes, *_, circular, true, tables, _ = commands(tmp_path, *words)
+    assert scenes[:4] == ["catalog", "synthetic", "--preset", "dsc3d"]
+    assert scenes[-2:] == ["--seed", "5"]
+    folder = Path(scenes[scenes.index("-o") + 1])
+    for run, name, option in (
+        (circular, "catalog.parquet", "--dsc3d"),
+        (true, "catalog_true.parquet", "--dsc3d-true"),
+    ):
+        assert run[run.index("--config") + 1] == "dsc3d"
+        assert run[run.index("--catalog") + 1] == str(folder / name)
+        assert tables[tables.index(option) + 1] == run[run.index("--out") + 1]

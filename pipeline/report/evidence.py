@@ -15,7 +15,7 @@ from pipeline.run import Run
 from pipeline.store import write_atomic
 from pipeline.tables import read_metrics
 
-FILE = "metrics.parquet"
+FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
 KEPT: Final = "float32"
 """Type of the figures kept: they are what is printed from, so that the small file alone gives the pages."""
@@ -24,11 +24,13 @@ UNNAMED = "rasters whose catalog does not name them"
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The rows of one run, or of two that differ in how road is told from terrain."""
+    """The rows of one run, or of two that differ in how road is told from terrain, and what stands beside."""
 
     rows: pd.DataFrame
     """`KEYS` and the paper's figures, one row per classes, tile and variant; figures of failed tiles
     are NaN."""
+    dsc3d: tuple[Evidence, ...] = ()
+    """Runs for the rows of DSC3D, one for each reference: the paper's kind first."""
 
     @property
     def dataset(self) -> str:
@@ -64,17 +66,35 @@ class Evidence:
         return rows.set_index(["tile_id", "variant"])[list(FIGURES)].astype("float64").sort_index()
 
 
-def collect(run: Run, true: Run | None = None) -> Evidence:
-    """Return the figures of a run and, if given, of the same tiles classed by the true mask.
+def collect(
+    run: Run, true: Run | None = None, dsc3d: Run | None = None, dsc3d_true: Run | None = None
+) -> Evidence:
+    """Return the figures of a run and, if given, of those that stand beside it.
+
+    Parameters
+    ----------
+    run : Run
+        The main one.
+    true : Run, optional
+        The same tiles classed by the true mask.
+    dsc3d : Run, optional
+        Scenes of DSC3D, or what stands in for them, against the reference that the paper describes.
+    dsc3d_true : Run, optional
+        The same scenes against the truth.
 
     Raises
     ------
     ConfigError
-        If a run has no rows yet, mixes data, or the second is not about the same tiles and variants.
+        If a run has no rows yet, mixes data, or is not about the same tiles and variants as its twin.
     """
+    if dsc3d is None and dsc3d_true is not None:
+        raise ConfigError(f"--dsc3d-true {dsc3d_true.path} is nothing without --dsc3d: name that run, too")
+    beside = tuple(_sound(_rows(other), other.path) for other in (dsc3d, dsc3d_true) if other is not None)
+    if dsc3d and dsc3d_true:
+        _check_twins(dsc3d, dsc3d_true, *(evidence.rows for evidence in beside))
     first = _rows(run)
     if true is None:
-        return _sound(first, run.path)
+        return _sound(first, run.path, beside)
     second = _rows(true)
     if not any(tile.layer("reference_road") for tile in true.catalog.tiles):
         raise ConfigError(f"{true.path} has no true road mask in its catalog; leave out --true")
@@ -83,26 +103,56 @@ def collect(run: Run, true: Run | None = None) -> Evidence:
             f"{run.path} and {true.path} both class by the {first.classes.iloc[0]} mask; "
             "--true wants a run with evaluate.classes: reference"
         )
-    about = [{*zip(rows.dataset, rows.tile_id, rows.variant, strict=True)} for rows in (first, second)]
-    if about[0] != about[1]:
+    if _about(first) != _about(second) or {*first.dataset} != {*second.dataset}:
         raise ConfigError(
             f"{true.path} is not about the data, tiles and variants of {run.path}; run both over one catalog"
         )
-    return _sound(pd.concat([first, second], ignore_index=True), run.path)
+    return _sound(pd.concat([first, second], ignore_index=True), run.path, beside)
+
+
+def _check_twins(run: Run, true: Run, first: pd.DataFrame, second: pd.DataFrame) -> None:
+    if _about(first) != _about(second):
+        raise ConfigError(
+            f"{true.path} is not about the tiles and variants of {run.path}; "
+            "--dsc3d-true wants the same scenes with the true reference"
+        )
+    if {*first.dataset} == {*second.dataset}:
+        raise ConfigError(
+            f"{true.path} is about the same data as {run.path}: {first.dataset.iloc[0]}; "
+            "--dsc3d-true wants the same scenes with the true reference"
+        )
+
+
+def _about(rows: pd.DataFrame) -> set[tuple[str, str]]:
+    return {*zip(rows.tile_id, rows.variant, strict=True)}
 
 
 def write_evidence(evidence: Evidence, folder: Path) -> None:
-    """Write the figures."""
-    buffer = io.BytesIO()
-    kept = evidence.rows.astype(dict.fromkeys(KEYS, "category") | dict.fromkeys(FIGURES, KEPT))
-    kept.to_parquet(buffer, index=False, compression="zstd")
-    write_atomic(folder / FILE, buffer.getvalue())
+    """Write the figures; those for DSC3D to a file of their own, if there are any."""
+    write_atomic(folder / FILE, _kept(evidence.rows))
+    if evidence.dsc3d:
+        rows = pd.concat([beside.rows for beside in evidence.dsc3d], ignore_index=True)
+        write_atomic(folder / DSC3D_FILE, _kept(rows))
+    else:
+        (folder / DSC3D_FILE).unlink(missing_ok=True)
 
 
 def read_evidence(folder: Path) -> Evidence:
     """Read what `write_evidence` wrote."""
-    rows = pd.read_parquet(folder / FILE)
-    return Evidence(rows.astype(dict.fromkeys(KEYS, "str")))
+    beside = _read(folder / DSC3D_FILE) if (folder / DSC3D_FILE).exists() else pd.DataFrame({"dataset": []})
+    parts = [rows for _, rows in beside.groupby("dataset", sort=False)]
+    return Evidence(_read(folder / FILE), tuple(Evidence(rows.reset_index(drop=True)) for rows in parts))
+
+
+def _kept(rows: pd.DataFrame) -> bytes:
+    buffer = io.BytesIO()
+    kept = rows.astype(dict.fromkeys(KEYS, "category") | dict.fromkeys(FIGURES, KEPT))
+    kept.to_parquet(buffer, index=False, compression="zstd")
+    return buffer.getvalue()
+
+
+def _read(path: Path) -> pd.DataFrame:
+    return pd.read_parquet(path).astype(dict.fromkeys(KEYS, "str"))
 
 
 def _rows(run: Run) -> pd.DataFrame:
@@ -120,8 +170,8 @@ def _rows(run: Run) -> pd.DataFrame:
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
 
 
-def _sound(rows: pd.DataFrame, run: Path) -> Evidence:
-    evidence = Evidence(rows)
+def _sound(rows: pd.DataFrame, run: Path, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
+    evidence = Evidence(rows, dsc3d)
     if not evidence.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")
     return evidence

@@ -46,8 +46,9 @@ def csv_page(content: Content) -> str:
 
 def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
     """Return one self-contained page."""
+    sections = [(title, table, "") for title, table in _sections(content)]
     return template("page.html.j2").render(
-        title=content.title, content=content, sections=list(_sections(content)), tiles=tiles
+        title=content.title, content=content, sections=sections, tiles=tiles
     )
 
 

@@ -28,7 +28,9 @@ NARROW, SENTENCE = 12, 25
 """Characters of a column of text: fewer never need a second line, more always do."""
 
 
-def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ...]:
+def write_comparison(
+    run: Run, true: Run | None, folder: Path, dsc3d: Run | None = None, dsc3d_true: Run | None = None
+) -> tuple[Path, ...]:
     """Write the tables of a run beside the paper's; return the files.
 
     Parameters
@@ -39,6 +41,10 @@ def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ..
         The same with ``evaluate.classes: reference``.
     folder : Path
         Where to.
+    dsc3d : Run, optional
+        For the rows of DSC3D: its scenes, or what stands in for them.
+    dsc3d_true : Run, optional
+        The same scenes against the truth.
 
     Raises
     ------
@@ -46,7 +52,7 @@ def write_comparison(run: Run, true: Run | None, folder: Path) -> tuple[Path, ..
         If a run has no figures, mixes data or is about other tiles than the other, or the folder cannot be
         written.
     """
-    evidence = collect(run, true)
+    evidence = collect(run, true, dsc3d, dsc3d_true)
     made = pages(evidence)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +80,7 @@ def markdown_page(found: Comparison) -> str:
     """Return the comparison as Markdown; the data comes first."""
     parts = [found.line, f"# {TITLE}", *found.notes]
     for section in found.sections:
-        parts += [f"## {section.title}", markdown(section.table)]
+        parts += [f"## {section.title}", *([section.line] if section.line else []), markdown(section.table)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -85,7 +91,7 @@ def csv_page(table: pd.DataFrame, line: str) -> str:
 
 def html_page(found: Comparison) -> str:
     """Return one self-contained page."""
-    sections = [(section.title, section.table) for section in found.sections]
+    sections = [(section.title, section.table, section.line) for section in found.sections]
     page = template("tables.html.j2").render(
         title=TITLE, line=found.line, notes=found.notes, sections=sections
     )
@@ -96,7 +102,7 @@ def latex_page(found: Comparison) -> str:
     r"""Return tables to ``\input`` into a document with the package booktabs."""
     parts = [f"% {found.line}", *(f"% {note}" for note in found.notes)]
     for section in found.sections:
-        parts.append(_latex(section.table, f"{section.title}. {found.line}"))
+        parts.append(_latex(section.table, f"{section.title}. {section.line or found.line}"))
     return "\n".join(parts) + "\n"
 
 

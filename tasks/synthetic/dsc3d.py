@@ -28,6 +28,8 @@ APART_M = 3000
 """Between scenes, as in the benchmark: farther than the hills' longest wave."""
 STEEPEST = 0.2
 """Greatest root mean square slope of a scene's hills."""
+HUMPS, BANKS = 0.12, 0.12
+"""Root mean square height of a scene's humps and of its embankments, of its rise."""
 COARSE_M = 3.0
 """Cells in which a place is looked at before a scene is laid there."""
 
@@ -43,32 +45,32 @@ class Site:
     triangles: int
     """Of its mesh."""
     options: SceneOptions
-    """Slope and direction are found for the place."""
+    """Slope, humps, embankments and direction follow from the rise and the place."""
     faults: Faults
 
 
 TOWN = SceneOptions(
     block_m=75,
-    density=0.9,
-    roughness_m=0.25,
+    density=0.7,
     stream_share=0.0,
     dsm_noise_m=(0.0, 0.0),
     cross_slope=0.02,
     curb_m=0.12,
-    built=0.6,
+    built=0.8,
     storeys=0.8,
     overhang_m=0.4,
-    growth_m=0.3,
+    trees=1.5,
+    growth_m=1.0,
     car_parks=0.1,
 )
-SUBURB = TOWN.model_copy(update={"block_m": 80, "built": 0.8, "storeys": 1.0, "trees": 1.2, "growth_m": 0.5})
+SUBURB = TOWN.model_copy(update={"block_m": 80, "built": 1.0, "storeys": 1.0})
 
 SITES = (
     Site("boulevard", "urban", 4.5, 101_000, TOWN.model_copy(update={"block_m": 90.0}), Faults()),
-    Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 0.8}), Faults(hidden=0.45)),
-    Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, Faults(bumps_m=0.05)),
-    Site("hillside", "suburban", 23.0, 46_000, SUBURB, Faults(bumps_m=0.05)),
-    Site("steep_quarter", "urban", 33.9, 60_000, TOWN, Faults(bumps_m=0.05, blank=0.06)),
+    Site("courtyards", "urban", 8.0, 78_000, TOWN.model_copy(update={"built": 1.0}), Faults(hidden=0.45)),
+    Site("garden_suburb", "suburban", 14.0, 35_000, SUBURB, Faults()),
+    Site("hillside", "suburban", 23.0, 46_000, SUBURB, Faults()),
+    Site("steep_quarter", "urban", 33.9, 60_000, TOWN, Faults(blank=0.06)),
 )
 """Ends of the ranges are the paper's; what lies between, and which scene is what, are guesses."""
 
@@ -102,7 +104,10 @@ def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
 def _settle(row: int, site: Site, seed: int) -> Place:
     for number in count():
         west, south = WEST_M + number * APART_M, SOUTH_M - (row + 1) * APART_M
-        turned = _with(site.options, turn_deg=generator(seed, "dsc3d", row, number).uniform(0, 90))
+        turn = generator(seed, "dsc3d", row, number).uniform(0, 90)
+        turned = _with(
+            site.options, turn_deg=turn, roughness_m=HUMPS * site.rise_m, embankment_m=BANKS * site.rise_m
+        )
         excess = partial(_excess, site, turned, _square(west, south, COARSE_M), seed)
         if excess(0.0) < 0 < excess(STEEPEST):
             slope = brentq(excess, 0.0, STEEPEST, xtol=1e-4)

@@ -37,7 +37,7 @@ GHOST = 0.25
 class Faults(base.Options):
     """How badly a surface is reconstructed."""
 
-    melt_m: float = Field(0.5, ge=0, le=3, description="Gaussian smoothing of all edges (m)")
+    melt_m: float = Field(0.6, ge=0, le=3, description="Gaussian smoothing of all edges (m)")
     bumps_m: float = Field(0.04, ge=0, le=1, description="root mean square height of bumps (m)")
     blank: float = Field(0.04, ge=0, lt=1, description="part of the plain surfaces without a match")
     hidden: float = Field(0.3, ge=0, lt=1, description="part of the ground at walls that no photograph shows")

@@ -1,13 +1,16 @@
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 
 from catalog import Catalog
+from catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
 from pipeline.errors import ConfigError
 from pipeline.synthesis import write_scenes
 from tasks.synthetic import make_scene
+from tasks.synthetic.dsc3d import survey as survey_of_scenes
 from tasks.synthetic.gerod import survey
 
 
@@ -35,8 +38,73 @@ def test_the_preset_s_files_hold_its_scenes(benchmark):
 
 
 def test_what_a_preset_cannot_do_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=re.escape("--preset paper: there is gerod")):
+    with pytest.raises(ConfigError, match=re.escape("--preset paper: there is gerod, dsc3d")):
         write_scenes(tmp_path, 1, seed=0, preset="paper")
     with pytest.raises(ConfigError, match="--tile-size 60: tiles of gerod have 250 m; leave it out"):
         write_scenes(tmp_path, 1, seed=0, size_m=60, preset="gerod")
+    with pytest.raises(ConfigError, match="--tile-size 60: tiles of dsc3d have 150 m; leave it out"):
+        write_scenes(tmp_path, 1, seed=0, size_m=60, preset="dsc3d")
+    with pytest.raises(ConfigError, match="--tiles 6: dsc3d has 5 scenes; leave it out for all"):
+        write_scenes(tmp_path, 6, seed=0, preset="dsc3d")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Catalogs of one scene of the stand-in, by the paper's reference and by the truth."""
+    path = write_scenes(tmp_path_factory.mktemp("dsc3d"), 1, seed=4, preset="dsc3d")
+    (circular,) = Catalog.read(path).tiles
+    (true,) = Catalog.read(path.with_name("catalog_true.parquet")).tiles
+    return circular, true
+
+
+def read(tile, name):
+    (path,) = tile.paths(tile.layer(name))
+    with rasterio.open(path) as file:
+        return file.read(1)
+
+
+def test_a_scene_is_what_prepare_mesh_makes_of_its_mesh(scene):
+    circular, true = scene
+    assert circular.id == true.id == survey_of_scenes(1, 4)[0].site.name
+    assert circular.grid == true.grid == survey_of_scenes(1, 4)[0].grid
+    assert {layer.name for layer in circular.layers} == {*HEIGHTS, *MASKS, PHOTO}
+    kind = "synthetic photogrammetry, stand-in for DSC3D, seed 4; "
+    assert circular.dataset == kind + "reference by ECSRC itself (circular)"
+    assert true.dataset == kind + "true reference"
+    for name in ("dsm", "dtm", "dop", "road_mask"):
+        assert circular.paths(circular.layer(name)) == true.paths(true.layer(name))
+
+
+def test_both_references_are_what_they_are_called(scene):
+    circular, true = scene
+    place = survey_of_scenes(1, 4)[0]
+    made = make_scene(place.grid, 4, place.site.stratum, place.options)
+    assert np.array_equal(read(true, "reference"), made.reference.astype(np.float32))
+    assert np.array_equal(read(true, "reference_road") != 0, made.reference_road)
+    assert np.array_equal(read(circular, "road_mask") != 0, made.road_mask)
+    kept = read(circular, "reference_road") != 0
+    assert kept.any()
+    assert not (kept & ~made.road_mask).any()
+    reference, dsm, dtm = (read(circular, name) for name in ("reference", "dsm", "dtm"))
+    assert np.array_equal(reference[kept], dsm[kept])
+    assert np.array_equal(reference[~kept], dtm[~kept], equal_nan=True)
+    # The DTM is the bare ground, but for what photogrammetry and its filter leave.
+    assert np.nanmedian(np.abs(dtm - made.reference)) < 0.3
+    assert np.isfinite(dsm).mean() > 0.97
+
+
+def test_a_scene_s_mesh_can_be_prepared_by_hand(scene, tmp_path):
+    from pipeline.execute import SerialExecutor
+    from pipeline.prepare.asked import Asked
+    from pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+
+    circular, _ = scene
+    mesh = Path(circular.root) / circular.id / "mesh.glb"
+    published = prepare_mesh(
+        mesh, tmp_path / "out", Asked(), MeshAsked(dop=False), POINTS, SerialExecutor(), lambda _: None
+    )
+    (tile,) = Catalog.read(published.catalog).tiles
+    assert tile.grid == circular.grid
+    for name in ("dsm", "dtm"):
+        assert np.array_equal(read(tile, name), read(circular, name), equal_nan=True)

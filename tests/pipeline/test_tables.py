@@ -20,7 +20,7 @@ from pipeline.report.claims import HELD, NOT_HELD, NOT_TESTED, STRONGER, WEAKER,
 from pipeline.report.comparison import compare
 from pipeline.report.content import FIGURES
 from pipeline.report.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
-from pipeline.report.published import TABLE_II, published
+from pipeline.report.published import TABLE_I_DSC3D, TABLE_II, published
 from pipeline.report.tables import pages, write_comparison
 from pipeline.run import Run
 from pipeline.store import write_atomic
@@ -287,3 +287,74 @@ def test_no_true_mask_no_true_run(tmp_path):
     true = made_run(tmp_path / "true", "ablation_true", layers=("dsm", "dtm"))
     with pytest.raises(ConfigError, match="has no true road mask in its catalog; leave out --true"):
         collect(ours, true)
+
+
+STAND_IN = "synthetic photogrammetry, stand-in for DSC3D; "
+CIRCULAR, TRUTH = STAND_IN + "circular", STAND_IN + "true"
+
+
+def stand_in(dataset: str, factor: float = 1.0) -> Evidence:
+    """Scenes whose every figure is the paper's on DSC3D, but for FlexRoad's roads."""
+    rows = [
+        (dataset, "segmented", f"s{i}", "urban", row.variant, *map(row.value, FIGURES))
+        for i in range(3)
+        for row in TABLE_I_DSC3D
+    ]
+    made = pd.DataFrame(rows, columns=["dataset", "classes", "tile_id", "stratum", "variant", *FIGURES])
+    made.loc[made.variant == "flexroad", "l2_road_m"] *= factor
+    return Evidence(made.astype(dict.fromkeys(FIGURES, KEPT)))
+
+
+def test_what_stands_in_for_dsc3d_has_tables_and_claims_of_its_own():
+    evidence = replace(as_published(), dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH, factor=3.0)))
+    found = compare(evidence)
+    sections = {section.title: section for section in found.sections}
+    table = sections["Table I, DSC3D rows (synthetic stand-in): L2"].table.set_index("variant")
+    assert table.at["FlexRoad", "L2 road (m), ours (circular)"].startswith("0.106 [")
+    assert table.at["FlexRoad", "L2 road (m), ours (true)"].startswith("0.318 [")
+    claims = sections["What the paper claims of DSC3D (synthetic stand-in)"]
+    assert list(claims.table.verdict) == [HELD] * 3
+    assert list(claims.table["verdict, ours (true)"]) == [NOT_HELD, HELD, HELD]
+    assert CIRCULAR in claims.line
+    assert TRUTH in claims.line
+    # The main claims are GeRoD's, and none of them waits for other data.
+    assert "35 claims about GeRoD: 35 held" in " ".join(found.notes)
+    assert not (found.claims.verdict == NOT_TESTED).any()
+    assert found.claims.groupby("data").size().to_dict() == {"made": 35, CIRCULAR: 3, TRUTH: 3}
+    assert found.numbers.groupby("data").size()[TRUTH] == 3 * len(FIGURES)
+
+
+def test_every_page_says_that_the_rows_of_dsc3d_are_a_stand_in(tmp_path):
+    main = Evidence(as_published().rows.astype(dict.fromkeys(FIGURES, KEPT)))
+    evidence = replace(main, dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH)))
+    made = pages(evidence)
+    for name, text in made.items():
+        assert CIRCULAR in text, name
+        assert TRUTH in text, name
+        assert evidence.line in text.splitlines()[0], name
+    # A table's caption names its own data.
+    captions = re.findall(r"\\caption{(.*)}", made["tables.tex"])
+    assert [CIRCULAR in caption for caption in captions] == ["DSC3D" in caption for caption in captions]
+    write_evidence(evidence, tmp_path)
+    assert pages(read_evidence(tmp_path)) == made
+    write_evidence(main, tmp_path)
+    assert pages(read_evidence(tmp_path)) == pages(main)
+
+
+def test_dsc3d_itself_is_no_stand_in():
+    found = compare(replace(as_published(), dsc3d=(stand_in("DSC3D"),)))
+    titles = [section.title for section in found.sections]
+    assert "Table I, DSC3D rows: L2" in titles
+    assert not any("stand-in" in text for text in (*titles, *found.notes))
+
+
+def test_runs_for_dsc3d_are_twins(tmp_path):
+    ours = made_run(tmp_path / "ours")
+    circular = made_run(tmp_path / "circular", "dsc3d", dataset=(CIRCULAR,))
+    true = made_run(tmp_path / "true", "dsc3d", dataset=(TRUTH,), factor=2)
+    evidence = collect(ours, None, circular, true)
+    assert [beside.dataset for beside in evidence.dsc3d] == [CIRCULAR, TRUTH]
+    with pytest.raises(ConfigError, match="is nothing without --dsc3d"):
+        collect(ours, None, None, true)
+    with pytest.raises(ConfigError, match="is about the same data as"):
+        collect(ours, None, circular, circular)

@@ -79,11 +79,12 @@ def test_things_stand_on_the_ground_like_drops_of_wax(scene, height, kind):
     raised = (height - truth.reference)[there]
     assert there.sum() > 200
     assert np.median(raised) > 0.4 * np.median((truth.dsm - truth.reference)[there])
-    steepness = [
-        np.nanpercentile(np.hypot(*np.gradient(z, cell))[ndimage.binary_dilation(there, iterations=2)], 95)
-        for z in (height, truth.dsm)
-    ]
-    assert steepness[0] < 0.8 * steepness[1]
+    # Their walls have become slopes: where it was steepest, it is far less steep.
+    before = np.hypot(*np.gradient(truth.dsm, cell))
+    after = np.hypot(*np.gradient(scene.reconstruction.height, cell))
+    around = ndimage.binary_dilation(there, iterations=2) & ~scene.reconstruction.bridged
+    walls = around & (before > np.percentile(before[around], 90))
+    assert np.median(after[walls]) < 0.8 * np.median(before[walls])
 
 
 def test_what_moved_leaves_a_ghost(scene):
