@@ -1,0 +1,135 @@
+"""``prepare points`` on a real survey: points per second and peak memory, next to the cost of decoding alone.
+
+Every row is a process of its own. Four files are the same survey four times, side by side: memory is not
+to grow with them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+SURVEY = Path("autzen") / "autzen_north.laz"
+THIN = Path("autzen") / "autzen-thin.las"
+OFFSET_EAST, MAX_EAST, MIN_EAST = 155, 179, 187
+"""Where the header of a LAS file has them: moving these moves the cloud."""
+STEP_FEET = 3400.0
+TASKS = ("decode", "serial", "dask")
+EVERY_S = 0.1
+"""How often the memory of workers is looked at."""
+
+
+def main() -> None:
+    folder = os.environ.get("FLEXROAD_REAL_DATA")
+    if not folder:
+        print("FLEXROAD_REAL_DATA is not set: nothing to measure")
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        files = side_by_side(Path(folder) / SURVEY, Path(scratch), 4)
+        print(f"\n{SURVEY}: {files[0].stat().st_size / 1e6:.0f} MB, {os.cpu_count()} cores")
+        print("  task     files     points  seconds  points/s   peak MB  largest worker MB")
+        for task in TASKS:
+            for some in (files[:1], files):
+                run = measure(task, some, Path(folder) / THIN, Path(scratch))
+                print(
+                    f"  {task:8}{len(some):6}{run['points']:12,}{run['seconds']:9.1f}"
+                    f"{run['points'] / run['seconds']:10,.0f}{run['peak']:10.0f}{run['worker']:19.0f}"
+                )
+
+
+def side_by_side(survey: Path, folder: Path, number: int) -> list[Path]:
+    """Copies of a cloud, each east of the one before."""
+    paths = []
+    for index in range(number):
+        raw = bytearray(survey.read_bytes())
+        for at in (OFFSET_EAST, MAX_EAST, MIN_EAST):
+            struct.pack_into("<d", raw, at, struct.unpack_from("<d", raw, at)[0] + index * STEP_FEET)
+        paths.append(folder / f"{index}.laz")
+        paths[-1].write_bytes(raw)
+    return paths
+
+
+def measure(task: str, files: list[Path], thin: Path, folder: Path) -> dict[str, float]:
+    out = tempfile.mkdtemp(dir=folder)
+    call = [sys.executable, __file__, task, out, str(thin), *map(str, files)]
+    root = str(Path(__file__).parents[2])
+    done = subprocess.run(
+        call, check=True, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": root}
+    )
+    result: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def one(task: str, out: Path, thin: Path, files: list[Path]) -> None:
+    """What a process of its own does."""
+    if task == "decode":
+        work = decode
+    else:
+        work = prepare
+        # Compiled code is loaded before the clock starts.
+        prepare("serial", [thin], out / "warm", cell=20)
+    worker = [0.0]
+    threading.Thread(target=watch, args=(worker,), daemon=True).start()
+    start = time.perf_counter()
+    work(task, files, out / "out")
+    seconds = time.perf_counter() - start
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    points = sum(map(header_points, files))
+    print(json.dumps({"seconds": seconds, "points": points, "peak": own, "worker": worker[0]}))
+
+
+def watch(worker: list[float]) -> None:
+    """Keep the largest memory of a child process (MB): the system's own figure starts with its parent's."""
+    import psutil
+
+    while True:
+        for child in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                worker[0] = max(worker[0], child.memory_info().rss / 2**20)
+        time.sleep(EVERY_S)
+
+
+def header_points(path: Path) -> int:
+    import laspy
+
+    with laspy.open(path) as reader:
+        return int(reader.header.point_count)
+
+
+def decode(task: str, files: list[Path], out: Path) -> None:
+    """Nothing but the coordinates, by laspy, in parallel."""
+    import laspy
+    import numpy as np
+
+    for path in files:
+        with laspy.open(path, laz_backend=laspy.LazBackend.LazrsParallel) as reader:
+            for points in reader.chunk_iterator(1_000_000):
+                for axis in (points.x, points.y, points.z):
+                    np.asarray(axis)
+
+
+def prepare(task: str, files: list[Path], out: Path, cell: float = 1) -> None:
+    from pipeline.execute import DaskExecutor, SerialExecutor
+    from pipeline.prepare.asked import Asked
+    from pipeline.prepare.points import prepare_points
+    from tasks.acquire.points import Options
+
+    executor = DaskExecutor() if task == "dask" else SerialExecutor()
+    asked = Asked(crs="EPSG:2994", cell_m=cell, tile_size_m=500)
+    prepare_points(files, out, asked, Options(), executor, lambda _: None)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        one(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), [Path(name) for name in sys.argv[4:]])
+    else:
+        main()
