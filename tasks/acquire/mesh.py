@@ -169,7 +169,9 @@ def _band(mesh: TexturedMesh, grid: Grid, rows: slice, rays: int) -> tuple[NDArr
     row, col = np.nonzero(owner >= 0)
     face = owner[row, col]
     colour = np.zeros((*fine.shape, 3), np.float32)
-    colour[row, col] = _colour(mesh, face, _weights(mesh, face, fine.eastings[col], fine.northings[row]))
+    weights = np.empty((len(face), 3))
+    _weights(mesh.vertices, mesh.faces[face], fine.eastings[col], fine.northings[row], weights)
+    colour[row, col] = _colour(mesh, face, weights)
     pixels = height, rays, grid.width, rays
     hits = (owner >= 0).reshape(pixels).sum(axis=(1, 3))
     mean = colour.reshape(*pixels, 3).sum(axis=(1, 3)) / np.maximum(hits, 1)[..., None]
@@ -189,15 +191,19 @@ def _rays(mesh: TexturedMesh, pixel: float) -> int:
     return int(np.clip(math.ceil(pixel / max(float(np.median(size)), 1e-9) - 0.01), 1, MOST_RAYS))
 
 
-def _weights(mesh: TexturedMesh, face: Faces, easting: Floats, northing: Floats) -> Floats:
-    """Return how much each corner of a face counts at a place in plan, ``(n, 3)``."""
-    corners = mesh.vertices[mesh.faces[face], :2] - np.stack([easting, northing], axis=1)[:, None]
-    (ax, ay), (bx, by), (cx, cy) = np.moveaxis(corners, 0, -1)
-    weights = np.stack([bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx], axis=1)
-    # A ray just outside has a weight just below zero.
-    weights = np.clip(weights / weights.sum(axis=1, keepdims=True), 0, 1)
-    inside: Floats = weights / weights.sum(axis=1, keepdims=True)
-    return inside
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _weights(vertices: Floats, corners: Faces, east: Floats, north: Floats, weights: Floats) -> None:
+    """Find how much each corner of a face, ``(n, 3)``, counts at a place in plan."""
+    for n in range(corners.shape[0]):
+        a, b, c = vertices[corners[n, 0]], vertices[corners[n, 1]], vertices[corners[n, 2]]
+        ax, ay, bx, by = a[0] - east[n], a[1] - north[n], b[0] - east[n], b[1] - north[n]
+        cx, cy = c[0] - east[n], c[1] - north[n]
+        of_a, of_b, of_c = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+        side = 1.0 if of_a + of_b + of_c > 0 else -1.0
+        # A ray just outside has a weight just below zero.
+        of_a, of_b, of_c = max(side * of_a, 0.0), max(side * of_b, 0.0), max(side * of_c, 0.0)
+        whole = of_a + of_b + of_c
+        weights[n, 0], weights[n, 1], weights[n, 2] = of_a / whole, of_b / whole, of_c / whole
 
 
 def _colour(mesh: TexturedMesh, face: Faces | NDArray[np.intp], weights: Floats) -> NDArray[np.float32]:
@@ -209,25 +215,41 @@ def _colour(mesh: TexturedMesh, face: Faces | NDArray[np.intp], weights: Floats)
         return colour
     which = mesh.texture[face]
     for index, texture in enumerate(mesh.textures):
-        here = which == index
-        colour[here] = _texels(texture, np.einsum("nk,nkd->nd", weights[here], mesh.uv[face[here]]))
+        here = np.flatnonzero(which == index)
+        _texels(texture, mesh.uv, face, weights, here, colour)
     return colour
 
 
-def _texels(texture: NDArray[np.uint8], uv: Floats) -> NDArray[np.float32]:
-    """Read a texture between its texels' centres (bilinear), ``(n, 3)``; outside 0 to 1 it repeats."""
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _texels(
+    texture: NDArray[np.uint8],
+    uv: NDArray[np.float32],
+    face: NDArray[np.int64],
+    weights: Floats,
+    here: NDArray[np.int64],
+    colour: NDArray[np.float32],
+) -> None:
+    """Read a texture at some of the places, between texels (bilinear); outside 0 to 1 it repeats."""
     height, width = texture.shape[:2]
-    uv = np.where((uv < 0) | (uv > 1), uv % 1, uv)
-    # v counts from below, rows from above.
-    col, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, upper = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
-    east = (col - left).astype(np.float32)[:, None]
-    south = (row - upper).astype(np.float32)[:, None]
-    cols = [np.clip(left + step, 0, width - 1) for step in (0, 1)]
-    rows = [np.clip(upper + step, 0, height - 1) for step in (0, 1)]
-    above, below = (texture[r, cols[0]] * (1 - east) + texture[r, cols[1]] * east for r in rows)
-    mixed: NDArray[np.float32] = above * (1 - south) + below * south
-    return mixed
+    for n in here:
+        u = v = 0.0
+        for corner in range(3):
+            u += weights[n, corner] * uv[face[n], corner, 0]
+            v += weights[n, corner] * uv[face[n], corner, 1]
+        if u < 0 or u > 1:
+            u %= 1
+        if v < 0 or v > 1:
+            v %= 1
+        # v counts from below, rows from above.
+        col, row = u * width - 0.5, (1 - v) * height - 0.5
+        left, upper = math.floor(col), math.floor(row)
+        east, south = col - left, row - upper
+        right, lower = min(left + 1, width - 1), min(upper + 1, height - 1)
+        left, upper = max(left, 0), max(upper, 0)
+        for band in range(3):
+            above = texture[upper, left, band] * (1 - east) + texture[upper, right, band] * east
+            below = texture[lower, left, band] * (1 - east) + texture[lower, right, band] * east
+            colour[n, band] = above * (1 - south) + below * south
 
 
 def _look_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
