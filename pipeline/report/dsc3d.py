@@ -15,8 +15,8 @@ from pipeline.report.sections import Section, beside, numbers, verdicts_table
 
 NAME = "Table I, DSC3D rows"
 ABOUT = tuple(claim for claim in CLAIMS if claim.dataset == DSC3D)
-OURS = ("ours (circular)", "ours (true)")
-"""Names of the figures by the reference that ECSRC made, the paper's kind, and by the truth."""
+REFERENCES = ("circular", "true")
+"""What the references are called where there are both: the paper's kind, which ECSRC made, and the truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ def of_dsc3d(runs: tuple[Evidence, ...]) -> Beside:
     if not runs:
         return Beside((), (), (), ())
     title = f"{NAME}{_standing_in(runs[0])}"
-    calls = OURS if len(runs) == len(OURS) else ("ours",)
+    calls = REFERENCES if len(runs) == len(REFERENCES) else ("",)
     means = {called: bootstrap(run.part(run.classes[0])) for called, run in zip(calls, runs, strict=True)}
     shared = frozenset.intersection(*(made.variants for made in means.values()))
     rows = tuple(row for row in TABLE_I_DSC3D if row.variant in shared)
@@ -43,7 +43,7 @@ def of_dsc3d(runs: tuple[Evidence, ...]) -> Beside:
     line = _line(dict(zip(calls, runs, strict=True)))
     return Beside(
         sections=(
-            *beside(title, rows, means, line),
+            *beside(title, rows, {_ours(called): made for called, made in means.items()}, line),
             Section(f"What the paper claims of DSC3D{_standing_in(runs[0])}", verdicts_table(verdicts), line),
         ),
         notes=_notes(runs),
@@ -65,10 +65,14 @@ def _standing_in(run: Evidence) -> str:
     return " (synthetic stand-in)" if run.dataset.startswith("synthetic") else " (stand-in)"
 
 
+def _ours(called: str) -> str:
+    return f"ours ({called})" if called else "ours"
+
+
 def _line(runs: Mapping[str, Evidence]) -> str:
-    if len(runs) == 1:
-        return "".join(run.line for run in runs.values())
-    return " ".join(f"{called[0].upper()}{called[1:]}: {run.line}" for called, run in runs.items())
+    return " ".join(
+        f"{called.capitalize()}: {run.line}" if called else run.line for called, run in runs.items()
+    )
 
 
 def _notes(runs: tuple[Evidence, ...]) -> tuple[str, ...]:

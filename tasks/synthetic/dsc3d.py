@@ -28,7 +28,7 @@ APART_M = 3000
 """Between scenes, as in the benchmark: farther than the hills' longest wave."""
 STEEPEST = 0.2
 """Greatest root mean square slope of a scene's hills."""
-HUMPS, BANKS = 0.12, 0.12
+HUMPS, BANKS = 0.1, 0.05
 """Root mean square height of a scene's humps and of its embankments, of its rise."""
 COARSE_M = 3.0
 """Cells in which a place is looked at before a scene is laid there."""
@@ -60,7 +60,7 @@ TOWN = SceneOptions(
     storeys=0.8,
     overhang_m=0.4,
     trees=1.5,
-    growth_m=1.0,
+    growth_m=0.7,
     car_parks=0.1,
 )
 SUBURB = TOWN.model_copy(update={"block_m": 80, "built": 1.0, "storeys": 1.0})

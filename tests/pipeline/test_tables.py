@@ -314,7 +314,7 @@ def test_what_stands_in_for_dsc3d_has_tables_and_claims_of_its_own():
     assert table.at["FlexRoad", "L2 road (m), ours (true)"].startswith("0.318 [")
     claims = sections["What the paper claims of DSC3D (synthetic stand-in)"]
     assert list(claims.table.verdict) == [HELD] * 3
-    assert list(claims.table["verdict, ours (true)"]) == [NOT_HELD, HELD, HELD]
+    assert list(claims.table["verdict, true"]) == [NOT_HELD, HELD, HELD]
     assert CIRCULAR in claims.line
     assert TRUTH in claims.line
     # The main claims are GeRoD's, and none of them waits for other data.
