@@ -100,12 +100,14 @@ def inspect(path: Path) -> Cloud:
             (low, high),
             _crs(header, bounds),
             set(RGB) <= set(header.point_format.dimension_names),
-            header.creation_date,
+            header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
         )
         needed = header.offset_to_point_data + cloud.points * header.point_format.size
         plain = not header.are_points_compressed
     if cloud.points == 0:
         raise CatalogError(f"{path} has no points; leave it out, or write it again")
+    if not np.isfinite((*cloud.bounds, *cloud.heights)).all():
+        raise CatalogError(f"{path} is damaged: its header gives no bounds; download it again")
     if plain and path.stat().st_size < needed:
         raise CatalogError(
             f"{path} is cut short: {path.stat().st_size:,} of {needed:,} bytes; download it again"

@@ -102,7 +102,7 @@ def _make(job: BlockJob) -> BlockJob:
     arrays = {name: heights.astype(np.float32) for name, heights in layers.items()}
     photo = {"colour": rasters.photo.colour, "known": rasters.photo.known} if rasters.photo else {}
     with room(job.target.parent.parent):
-        np.savez(job.target, **arrays, **photo)
+        np.savez(job.target, allow_pickle=False, **arrays, **photo)
     return job
 
 

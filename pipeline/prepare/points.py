@@ -161,6 +161,8 @@ def _facts(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Opt
     }[options.ground]
     return {
         "SOURCE": some([cloud.path.name for cloud in clouds]),
+        "SOURCE_CREATED": some(sorted({str(cloud.created) for cloud in clouds if cloud.created}))
+        or "unknown",
         "POINTS": str(spooled.points),
         "SOURCE_CRS": short(frame.source),
         "SOURCE_UNITS": f"{frame.plan_m or 'reprojected'} m in plan, {frame.height_m} m in height",

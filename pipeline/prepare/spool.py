@@ -207,7 +207,7 @@ def spool(
             counts += np.bincount(records["kind"], minlength=256)
             low, high = np.minimum(low, plan.min(axis=1)), np.maximum(high, plan.max(axis=1))
             with room(folder.parent):
-                places |= blocks.append(*plan, records)
+                places |= blocks.append(plan[0], plan[1], records)
         kinds.append(counts)
         colours.append(colour.seen)
     if not places:
@@ -232,7 +232,8 @@ class _Colours:
     def bytes(self, colour: NDArray[np.uint16]) -> NDArray[np.uint8]:
         if self._shift is None and colour.any():
             self._shift = 8 if colour.max() > BYTE else 0
-        return np.minimum(colour >> (self._shift or 0), BYTE).astype(np.uint8)
+        scaled: NDArray[np.uint16] = np.minimum(colour >> (self._shift or 0), BYTE)
+        return scaled.astype(np.uint8)
 
 
 def _records(chunk: Chunk, frame: Frame, colours: _Colours) -> tuple[Integers, NDArray[np.void]]:
@@ -276,6 +277,7 @@ def scratch(out: Path) -> Iterator[Path]:
     """
     # Named like a sheet's own, which sweeps those of makers that were killed.
     folder, new = out / f".prepare-points-{os.getpid()}", not out.exists()
+    shutil.rmtree(folder, ignore_errors=True)
     with room(out):
         folder.mkdir(parents=True)
     try:

@@ -84,12 +84,18 @@ def test_damage_within_a_file_is_seen(tmp_path, part):
 def test_points_beyond_the_header_are_damage(tmp_path):
     xyz = some_points(100)
     path = write_cloud(tmp_path / "a.las", xyz)
-    spoiled = bytearray(path.read_bytes())
-    east = 179
-    spoiled[east : east + 8] = np.float64(xyz[:, 0].max() - 200).tobytes()
-    path.write_bytes(spoiled)
+
+    def spoil(value):
+        spoiled, east = bytearray(path.read_bytes()), 179
+        spoiled[east : east + 8] = np.float64(value).tobytes()
+        path.write_bytes(spoiled)
+
+    spoil(xyz[:, 0].max() - 200)
     with pytest.raises(CatalogError, match=r"a\.las is damaged: its header gives .* download it again"):
         list(chunks(path))
+    spoil(np.nan)
+    with pytest.raises(CatalogError, match=r"a\.las is damaged: its header gives no bounds"):
+        inspect(path)
 
 
 def test_what_is_no_cloud_is_named(tmp_path):
