@@ -6,14 +6,16 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from catalog import Grid
 from catalog.grid import Bounds
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
-from pipeline.prepare.sheet import Sheet
+from pipeline.prepare.sheet import GROUND, Sheet
 from pipeline.prepare.spool import Blocks, Place, Spooled, room
 from tasks.acquire.points import Options, rasterise, reach_m
 from tasks.acquire.types import Photo
@@ -99,7 +101,8 @@ def _make(job: BlockJob) -> BlockJob:
     layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
     if rasters.bridges is not None:
         layers["bridges"] = rasters.bridges
-    arrays = {name: heights.astype(np.float32) for name, heights in layers.items()}
+    arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
+    arrays[GROUND] = rasters.ground
     photo = {"colour": rasters.photo.colour, "known": rasters.photo.known} if rasters.photo else {}
     with room(job.target.parent.parent):
         np.savez(job.target, allow_pickle=False, **arrays, **photo)
@@ -112,7 +115,7 @@ def _lost(job: BlockJob, why: str) -> BlockJob:
 
 def _enter(sheet: Sheet, job: BlockJob) -> None:
     with np.load(job.target) as made:
-        for layer in ("dsm", "dtm", "bridges"):
+        for layer in ("dsm", "dtm", "bridges", GROUND):
             if layer in made:
                 sheet.write(layer, job.grid, made[layer])
         if "colour" in made and job.dop_cell:

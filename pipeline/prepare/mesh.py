@@ -16,7 +16,7 @@ from pipeline.execute import Executor
 from pipeline.prepare.asked import Asked
 from pipeline.prepare.blocks import fill, sheet_grid
 from pipeline.prepare.roads import add_roads
-from pipeline.prepare.sheet import Published, Sheet
+from pipeline.prepare.sheet import GROUND, Published, Sheet
 from pipeline.prepare.spool import PER_METRE, RECORD, Blocks, Place, Spooled, edge_for, room
 from tasks.acquire import points, refine
 from tasks.acquire.mesh import TexturedMesh, in_metres, orthophoto, sample
@@ -104,7 +104,8 @@ def publish_mesh(
         fill(sheet, _spooled(sheet, mesh, mesh_asked, options, asked.step_m), options, executor, say)
         if mesh_asked.refine:
             say("refining the terrain")
-            dtm = refine.refine(sheet.read("dtm", grid), grid, options.void_m)
+            dtm, ground = sheet.read("dtm", grid), sheet.read(GROUND, grid)
+            dtm = refine.refine(dtm, ground, grid, options.void_m)
             sheet.write("dtm", grid, dtm)
         if mesh_asked.dop:
             say("drawing the orthophoto")

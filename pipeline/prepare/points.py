@@ -22,6 +22,8 @@ from tasks.acquire.points import Options, reach_m
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01
 """A file with a smaller share of ground among its points counts as not classified."""
+DENSE, DENSE_CONFIDENCE = 50.0, 3.0
+"""Points per m2 from where on the slope filter has to be surer, and how sure: docs/ground.md."""
 MAX_CELLS = 10**10
 """100 km x 100 km at 1 m: a larger sheet means that a point lies astray."""
 
@@ -73,12 +75,12 @@ def prepare_points(
         farthest = max(reach_m(_with(options, method), asked.cell_m) for method in ("classes", "filter"))
         spooled = spool(clouds, frame, folder, edge_m(clouds, frame, farthest, step), say)
         method, notes = _ground(clouds, spooled, options, ground)
-        options = _with(options, method)
+        options, dense = _for_density(_with(options, method), spooled)
         grid = sheet_grid(spooled.bounds, frame.target, asked.cell_m, step)
         if grid.width * grid.height > MAX_CELLS:
             raise CatalogError(_astray(clouds))
         black = [cloud.path.name for cloud, seen in zip(clouds, spooled.colours, strict=True) if not seen]
-        notes = (*frame.notes, *notes, *_left_out(spooled, black))
+        notes = (*frame.notes, *notes, *dense, *_left_out(spooled, black))
         facts = _facts(clouds, frame, spooled, options)
         with Sheet(out, grid, None if black else asked.dop_cell_m, facts) as sheet:
             fill(sheet, spooled, options, executor, say)
@@ -121,6 +123,17 @@ def _ground(
         few = f"less than {MIN_GROUND:.0%} of the points of {some(bare)} are ground ({named})"
         return "filter", (f"{few}: the slope filter finds the ground; --ground classes takes the classes",)
     return "classes", ()
+
+
+def _for_density(options: Options, spooled: Spooled) -> tuple[Options, tuple[str, ...]]:
+    """Return the options for so many points per m2: of very many near by, one lies low by noise alone."""
+    density = spooled.points / (len(spooled.places) * spooled.blocks.edge**2)
+    told = "confidence" in options.filter.model_fields_set
+    if options.ground != "filter" or density <= DENSE or told:
+        return options, ()
+    surer = options.filter.model_copy(update={"confidence": DENSE_CONFIDENCE})
+    note = f"{density:.0f} points per m2: the slope filter allows for {DENSE_CONFIDENCE:g} times their noise"
+    return options.model_copy(update={"filter": surer}), (note,)
 
 
 def _classes(classes: Collection[int]) -> str:

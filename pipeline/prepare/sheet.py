@@ -31,6 +31,8 @@ from tasks.acquire.types import Photo
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"
+GROUND = "ground"
+"""Cells with points on the ground: for the maker, not published."""
 BLOCK = 256
 """Side of the files' inner tiles while they are written (cells)."""
 CATALOG = "catalog.parquet"

@@ -15,7 +15,7 @@ from catalog.grid import Grid
 from tasks import options as base
 from tasks.acquire import ground as slope_filter
 from tasks.acquire import terrain, voids
-from tasks.acquire.bins import bins, means
+from tasks.acquire.bins import Cells, bins, means
 from tasks.acquire.topcolour import photo
 from tasks.acquire.tops import highest, spikes
 from tasks.acquire.types import Photo, Points, Rasters
@@ -74,11 +74,12 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     dsm = voids.fill(highest(cells, points.height, rim.shape), rim, options.fill_m)
     decks = np.isin(points.kind, options.bridge_classes)
     (bridges,) = means(cells[decks], rim.shape, points.height[decks])
-    dtm = _dtm(points[_is_ground(points, options) & ~decks], rim, options)
+    ground = _is_ground(points, options) & ~decks
     return Rasters(
         grid,
         dsm=dsm[inner],
-        dtm=dtm[inner],
+        dtm=_dtm(points[ground], rim, options)[inner],
+        ground=_holding(cells[ground], rim.shape)[inner],
         bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
         photo=_photo(points, grid, options, dop_cell),
     )
@@ -136,6 +137,13 @@ def _is_ground(points: Points, options: Options) -> Bools:
     if options.ground == "classes":
         return np.isin(points.kind, options.ground_classes)
     return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
+
+
+def _holding(cells: Cells, shape: tuple[int, int]) -> Bools:
+    """Return the cells that hold a point, ``(H, W)``."""
+    holding = np.zeros(shape, bool)
+    holding.flat[cells[cells >= 0]] = True
+    return holding
 
 
 def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:

@@ -3,9 +3,10 @@
 The paper says that the DTM is refined "via our ECSRC algorithm" and that "road masks, enhanced through
 ECSRC", take "ground truth terrain from DTM and road from DSM", and no more. Here
 
-- *refined* means: all cells of the DTM are clustered like road cells, on the DTM's own heights. What is in no
-  cluster of `min_area_m2` stands apart from all ground around it by more than `theta_z_m`: it is what the
-  ground filter let through (roofs, hedges, floating shreds), and is replaced from around it;
+- *refined* means: the cells in which ground was found are clustered like road cells, on their own heights.
+  What is in no cluster of `min_area_m2` stands apart from all ground around it by more than `theta_z_m`: it
+  is what the ground filter let through (roofs, hedges, floating shreds), and is replaced from around it.
+  Cells between them take no part: their slopes would tie a roof to its garden;
 - *enhanced* means: the road mask is clustered on the DSM, as by the stage `ecsrc`; the rest of it (crowns,
   vehicles, roofs) counts as terrain.
 
@@ -16,6 +17,7 @@ filter does wrong. Whoever reports figures against it has to say so (`CIRCULAR`)
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import label
 
 from catalog.grid import Grid
 from tasks import ecsrc
@@ -28,13 +30,15 @@ OPTIONS = ecsrc.Options(keep_largest=None)
 """The paper's thresholds. All clusters of enough area stay: how many there are depends on the area's size."""
 
 
-def refine(dtm: Floats, grid: Grid, fill_m: float, options: ecsrc.Options = OPTIONS) -> Floats:
+def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float, options: ecsrc.Options = OPTIONS) -> Floats:
     """Replace the cells of a DTM that ECSRC does not find on the ground.
 
     Parameters
     ----------
     dtm : ndarray, (H, W)
         Bare ground as a ground filter left it, m; NaN where unknown.
+    ground : ndarray of bool, (H, W)
+        Cells in which ground was found; the heights of the others come from around them.
     grid : Grid
         Its cells.
     fill_m : float
@@ -47,9 +51,13 @@ def refine(dtm: Floats, grid: Grid, fill_m: float, options: ecsrc.Options = OPTI
     ndarray, (H, W)
         m; cells without a height before have none after.
     """
-    kept = _kept(dtm, np.isfinite(dtm), grid, options)
+    ground = ground & np.isfinite(dtm)
+    kept = _kept(dtm, ground, grid, options)
+    voids_of_all, _ = label(~kept, np.ones((3, 3)))
+    # Voids that lost no ground keep the heights they were bridged with.
+    anew = np.isin(voids_of_all, voids_of_all[ground & ~kept]) & ~kept
     bridged = voids.fill(np.where(kept, dtm, np.nan), grid, fill_m)
-    return np.where(np.isfinite(dtm), bridged, np.nan)
+    return np.where(anew & np.isfinite(dtm), bridged, dtm)
 
 
 def reference(

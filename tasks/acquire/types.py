@@ -33,9 +33,7 @@ class Points:
     def __getitem__(self, which: slice | Bools | NDArray[np.intp]) -> Points:
         """Return some of the points: by a slice, a mask or indices."""
         colour = None if self.colour is None else self.colour[which]
-        return Points(
-            self.easting[which], self.northing[which], self.height[which], self.kind[which], colour
-        )
+        return Points(self.easting[which], self.northing[which], self.height[which], self.kind[which], colour)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +58,8 @@ class Rasters:
     """Highest point per cell, ``(H, W)``, m; NaN where unknown."""
     dtm: Floats
     """Bare ground, ``(H, W)``, m; NaN where unknown."""
+    ground: Bools
+    """Cells with points on the ground, ``(H, W)``; the DTM is inferred in the others."""
     bridges: Floats | None = None
     """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there is none."""
     photo: Photo | None = None
