@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,20 +134,27 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
     TaskError
         If it is rotated or in another CRS than the grid.
     """
+    with opened(path, name) as src:
+        lattice = place(src, path, name, grid, core, crs)
+        slices = lattice.under(grid) if lattice else None
+        if lattice is None or slices is None:
+            return None
+        values, unit = _values(src, lattice, *slices), src.units[0] or ""
+        crs = src.crs.to_wkt() if src.crs else crs
+    return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
+
+
+@contextmanager
+def opened(path: Path, name: str) -> Iterator[Any]:
+    """Open a raster; what goes wrong with it inside is `Unreadable`."""
     try:
         with rasterio.open(path) as src:
-            lattice = _lattice(src, path, name, grid, core, crs)
-            slices = lattice.under(grid) if lattice else None
-            if lattice is None or slices is None:
-                return None
-            values, unit = _values(src, lattice, *slices), src.units[0] or ""
-            crs = src.crs.to_wkt() if src.crs else crs
+            yield src
     except (RasterioError, OSError) as error:
         if not path.exists():
             raise Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
         reason = str(error.__cause__ or error).partition("\n")[0]
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
-    return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
 
 
 def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
@@ -188,8 +197,14 @@ def misfit(lattice: Lattice, grid: Grid) -> str:
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
 
 
-def _lattice(src: Any, path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
-    """Return where a file lies, or None if it is in another CRS and elsewhere."""
+def place(src: Any, path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
+    """Return where a file lies, or None if it is in another CRS and elsewhere; parameters as for `read`.
+
+    Raises
+    ------
+    TaskError
+        If it is rotated, or overlaps the grid in another CRS, or nobody knows where it lies.
+    """
     if src.transform.is_identity:
         if src.shape == core.shape:
             return Lattice(core.west, core.north, core.cell, core.cell, core.width, core.height)
