@@ -27,7 +27,7 @@ BEST_ANGLE_DEG, WIDEST_ANGLE_DEG = 12.0, 45.0
 NEARER, FARTHER = 0.25, 0.05
 """Parts of the depth that surfaces may lie before and behind the sparse points: crowns and roofs have few."""
 SMALLEST_PATCH = 2e-4
-"""Patches of depth smaller than this part of the picture stand for nothing: chance agreement in crowns, water."""
+"""Patches of depth smaller than this part of the picture are chance agreement, as in crowns and water."""
 
 
 class Options(base.Options):
@@ -57,7 +57,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Pixels without distortion: a focal length and where the first pixel's corner lies on the image plane."""
+    """Pixels without distortion: a focal length, and where the first one's corner lies on the image plane."""
 
     focal: float
     """Pixels."""
@@ -124,17 +124,18 @@ def photo_cloud(view: View, others: Sequence[View], points: Floats, options: Opt
     rays = pixels.rays()
     image = _read(view, options.size)
     pairs = [_rectify(view, other, points, pixels.focal) for other in others]
-    depths, errors = [], []
+    depths: list[NDArray[np.float32]] = []
+    errors: list[NDArray[np.float32]] = []
     for other, pair in zip(others, pairs, strict=True):
         depth = _match(view, image, other, _read(other, options.size), pair, options)
         depths.append(_onto(rays, view, pair, depth))
         # Depth per pixel of parallax is depth squared over focal length and base.
-        errors.append(np.square(depths[-1]) / (pixels.focal * pair.base_m))
+        errors.append(depths[-1] ** 2 / np.float32(pixels.focal * pair.base_m))
     depth = _patches(
         _agreed(depths, errors, options.agree_px), max(pixels.focal * pair.base_m for pair in pairs)
     )
-    world = rays @ view.rotation + 0.0
-    places = (view.centre + depth[..., None] * world).astype(np.float64)
+    world: Floats = rays @ view.rotation
+    places = view.centre + depth[..., None] * world
     normals, smooth = _normals(places, world)
     colours, _ = _seen(view, image, view.rotation, pixels)
     known = np.isfinite(depth) & smooth
@@ -147,7 +148,8 @@ def merge(clouds: Sequence[Cloud], spacing_m: float) -> Cloud:
         np.concatenate([getattr(cloud, name) for cloud in clouds])
         for name in ("points", "normals", "colours")
     )
-    cube = np.floor((points - points.min(axis=0)) / spacing_m).astype(np.int64)
+    cube = np.floor(points / spacing_m).astype(np.int64)
+    cube -= cube.min(axis=0)
     size = cube.max(axis=0) + 1
     key = (cube[:, 0] * size[1] + cube[:, 1]) * size[2] + cube[:, 2]
     _, member, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -160,12 +162,12 @@ def merge(clouds: Sequence[Cloud], spacing_m: float) -> Cloud:
     return Cloud(mean(points), mixed, np.rint(mean(colours)).astype(np.uint8))
 
 
-def ground_pixel_m(found: Reconstruction, options: Options) -> float:
-    """Return the size on the ground of a pixel of the depth maps, the median of the photographs (m)."""
+def ground_pixel_m(found: Reconstruction, size: int) -> float:
+    """Return what a pixel of photographs reduced to ``size`` covers on the ground, the median (m)."""
     sizes = []
     for view in found.views:
         depth = (found.points[view.seen] - view.centre) @ view.rotation[2]
-        sizes.append(float(np.median(depth)) / _pinhole(view, options.size).focal)
+        sizes.append(float(np.median(depth)) / _pinhole(view, size).focal)
     return float(np.median(sizes))
 
 
@@ -265,11 +267,11 @@ def _match(
     pair: Pair,
     options: Options,
 ) -> NDArray[np.float32]:
-    """Return depths in the first photograph of a pair, along the common camera's z, ``(h, w)``, NaN unknown."""
+    """Return depths of a pair's first photograph along the common camera's z, ``(h, w)``; NaN unknown."""
     import cv2
 
     first, inside = _seen(view, image, pair.turn, pair.one)
-    second, _ = _seen(other, partner, pair.turn, pair.two)
+    second, shown = _seen(other, partner, pair.turn, pair.two)
     window = options.window_px
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -286,7 +288,10 @@ def _match(
     )
     grey = [cv2.cvtColor(each, cv2.COLOR_BGR2GRAY) for each in (first, second)]
     parallax = matcher.compute(*grey).astype(np.float32) / 16
-    known = inside & (parallax >= 0)
+    # Where the partner shows nothing, or at the end of the search, the matcher still has an answer.
+    column = np.arange(pair.one.width) - np.rint(parallax).astype(np.intp)
+    there = np.take_along_axis(shown, np.clip(column, 0, pair.one.width - 1), axis=1) & (column >= 0)
+    known = inside & there & (parallax > 0) & (parallax < pair.parallaxes - 1)
     apart = parallax + np.float32(pair.one.left - pair.two.left)
     with np.errstate(divide="ignore"):
         return np.where(known, np.float32(pair.one.focal * pair.base_m) / apart, np.float32(np.nan))
@@ -345,7 +350,7 @@ def _patches(depth: NDArray[np.float32], parallax_m: float) -> NDArray[np.float3
     return np.where(parallax > 0, depth, np.float32(np.nan))
 
 
-def _normals(places: Floats, world: NDArray[np.float32]) -> tuple[Floats, Bools]:
+def _normals(places: Floats, world: Floats) -> tuple[Floats, Bools]:
     """Return unit normals towards the camera and where they are known: where the neighbours are."""
     across, down = np.full_like(places, np.nan), np.full_like(places, np.nan)
     across[:, 2:-2] = places[:, 4:] - places[:, :-4]
@@ -355,4 +360,4 @@ def _normals(places: Floats, world: NDArray[np.float32]) -> tuple[Floats, Bools]
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     away = np.sum(normals * world, axis=-1, keepdims=True) > 0
     normals = np.where(away, -normals, normals)
-    return normals, np.isfinite(normals).all(axis=-1)
+    return normals, np.asarray(np.isfinite(normals).all(axis=-1))

@@ -183,10 +183,9 @@ def read_control(path: Path, placed: Placed, crs: str | None = None) -> Control:
     """
     known = {shot.path.name: shot.path for shot in placed.shots}
     found: dict[str, tuple[list[float], dict[Path, tuple[float, float]]]] = {}
-    line = 1
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            for line, row in enumerate(csv.DictReader(file), start=2):
+            for row in csv.DictReader(file):
                 where = [float(row[axis]) for axis in ("easting", "northing", "height")]
                 _, marks = found.setdefault(row.get("name") or str(where), (where, {}))
                 marks[known[Path(row["image"]).name]] = float(row["x_px"]), float(row["y_px"])
@@ -194,8 +193,8 @@ def read_control(path: Path, placed: Placed, crs: str | None = None) -> Control:
         raise TaskError(f"{path} cannot be read: {error.strerror}", file=str(path)) from error
     except (KeyError, TypeError, ValueError) as error:
         raise TaskError(
-            f"{path}, line {line}: {error} is no column, number or photograph known here; columns are "
-            "image,x_px,y_px,easting,northing,height[,name]",
+            f"{path}, row {sum(len(marks) for _, marks in found.values()) + 1}: {error} is no column, "
+            "number or photograph known here; columns are image,x_px,y_px,easting,northing,height[,name]",
             file=str(path),
         ) from error
     points = np.array([where for where, _ in found.values()]).reshape(-1, 3)

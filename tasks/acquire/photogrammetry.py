@@ -1,7 +1,8 @@
 """Structure from motion, georeferenced by the cameras' GNSS: photographs -> poses and sparse points.
 
-The paper's stage A leaves this to photogrammetry; here it is COLMAP (Schönberger & Frahm, 2016) by its Python
-binding: SIFT, matching among GNSS neighbours, incremental mapping with position priors in the bundle adjustment.
+The paper's stage A leaves this to photogrammetry; here it is COLMAP (Schönberger & Frahm, 2016) by its
+Python binding: SIFT, matching among GNSS neighbours, incremental mapping with the positions as priors in the
+bundle adjustment.
 All of it lives in a local frame, whole metres off the metric CRS, so that float32 files lose nothing.
 
 Photographs that look straight down on flat ground tell nothing of the focal length: a longer one with the
@@ -104,6 +105,8 @@ class Reconstruction:
     """Whether the focal length is the files' own."""
     model: Path
     """Folder of the model in COLMAP's format, in the local frame."""
+    root: Path
+    """Folder the model's names of photographs are relative to."""
 
     @property
     def gnss_m(self) -> tuple[float, float]:
@@ -167,7 +170,7 @@ def reconstruct(
     folder = work / "model"
     folder.mkdir()
     model.write(folder)
-    return _result(model, folder, placed, shots, origin, controlled, held and controlled is None)
+    return _result(model, (folder, root), placed, shots, origin, controlled, held and controlled is None)
 
 
 def _features(
@@ -226,7 +229,7 @@ def _match(pycolmap: ModuleType, database: Path, count: int, options: Options) -
     with pycolmap.Database.open(database) as opened:
         if not opened.num_verified_image_pairs():
             raise TaskError(
-                f"none of the {count} photographs match each other: {_more(options)}, or do they show one place?"
+                f"none of the {count} photographs match each other; do they show one place? {_more(options)}"
             )
 
 
@@ -311,7 +314,8 @@ def _control(
     pycolmap.create_default_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(print_summary=False), config, model
     ).solve()
-    return np.array([_intersect(rays) for rays in marks]) - given
+    left: Floats = np.array([_intersect(rays) for rays in marks]) - given
+    return left
 
 
 def _add(pycolmap: ModuleType, model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
@@ -332,12 +336,12 @@ def _intersect(rays: Sequence[tuple[Any, Floats]]) -> Floats:
         across = np.eye(3) - np.outer(direction, direction) / (direction @ direction)
         normal += across
         right += across @ image.projection_center()
-    return np.linalg.solve(normal, right)
+    return np.asarray(np.linalg.solve(normal, right), np.float64)
 
 
 def _result(
     model: Any,
-    folder: Path,
+    folders: tuple[Path, Path],
     placed: Placed,
     shots: Mapping[str, Shot],
     origin: Floats,
@@ -358,7 +362,8 @@ def _result(
         residuals=np.array([view.centre + origin - measured[view.path] for view in views]),
         control_m=control_m,
         focal_held=held,
-        model=folder,
+        model=folders[0],
+        root=folders[1],
     )
 
 

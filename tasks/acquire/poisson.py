@@ -18,7 +18,7 @@ from tasks.errors import TaskError
 from tasks.types import Floats
 
 CELLS = 2.0
-"""Width of the octree's finest cells, in distances between points: fewer points in each make noise a shape."""
+"""Width of the octree's finest cells, in distances between points: with fewer points noise takes shape."""
 FAR = 5.0
 """Vertices farther than this from every point, in distances between points, are made up."""
 DEEPEST = 13
@@ -35,7 +35,9 @@ end_header
 """
 
 
-def poisson(cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path) -> TexturedMesh:
+def poisson(
+    cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path, threads: int | None = None
+) -> TexturedMesh:
     """Return the surface of a cloud with colours at its vertices.
 
     Parameters
@@ -48,6 +50,8 @@ def poisson(cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path
         Where the cloud's zero lies: easting, northing, height, ``(3,)``, m.
     work : Path
         Folder for the two files COLMAP wants.
+    threads : int, optional
+        All cores by default.
 
     Raises
     ------
@@ -60,7 +64,9 @@ def poisson(cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path
     write_ply(work / "cloud.ply", cloud)
     span = float(np.ptp(cloud.points, axis=0).max()) if len(cloud) else 0.0
     depth = math.ceil(math.log2(max(1.1 * span / (CELLS * spacing_m), 2)))
-    options = pycolmap.PoissonMeshingOptions(depth=min(depth, DEEPEST), trim=0.0, color=True, num_threads=1)
+    options = pycolmap.PoissonMeshingOptions(
+        depth=min(depth, DEEPEST), trim=0.0, color=True, num_threads=threads or -1
+    )
     pycolmap.poisson_meshing(work / "cloud.ply", work / "mesh.ply", options)
     mesh = trimesh.load(work / "mesh.ply", process=False)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
