@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from catalog import Grid
 from catalog.grid import Bounds
@@ -45,7 +47,7 @@ def sheet_grid(bounds: Bounds, crs: str, cell: float, step: float) -> Grid:
 def fill(
     sheet: Sheet, spooled: Spooled, options: Options, executor: Executor, say: Callable[[str], None]
 ) -> None:
-    """Write the rasters of all blocks into a sheet.
+    """Write the rasters of all blocks into a sheet; a bar tells how far it is.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ def fill(
     executor : Executor
         Makes the blocks, one worker each.
     say : Callable[[str], None]
-        Told of every block.
+        Told how many there are.
 
     Raises
     ------
@@ -66,9 +68,10 @@ def fill(
         If the disk is full, or a worker dies.
     """
     jobs = list(_jobs(sheet, spooled, options))
-    for done, job in enumerate(executor.map(_make, jobs, _lost), 1):
+    say(f"{len(jobs)} block{'s' * (len(jobs) != 1)} of {spooled.blocks.edge:g} m")
+    made = executor.map(_make, jobs, _lost)
+    for job in track(made, "making rasters", len(jobs), console=Console(stderr=True)):
         _enter(sheet, job)
-        say(f"block {done} of {len(jobs)}")
 
 
 def _jobs(sheet: Sheet, spooled: Spooled, options: Options) -> Iterator[BlockJob]:

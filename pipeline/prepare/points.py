@@ -127,7 +127,9 @@ def _ground(
 
 def _for_density(options: Options, spooled: Spooled) -> tuple[Options, tuple[str, ...]]:
     """Return the options for so many points per m2: of very many near by, one lies low by noise alone."""
-    density = spooled.points / (len(spooled.places) * spooled.blocks.edge**2)
+    west, south, east, north = spooled.bounds
+    area = min((east - west) * (north - south), len(spooled.places) * spooled.blocks.edge**2)
+    density = spooled.points / max(area, 1)
     told = "confidence" in options.filter.model_fields_set
     if options.ground != "filter" or density <= DENSE or told:
         return options, ()

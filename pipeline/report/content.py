@@ -136,4 +136,5 @@ def _reference(run: Run, done: set[str]) -> str:
         if roads == len(tiles)
         else f"cells of {len(tiles) - roads} of {len(tiles)} tiles are classed by the raw segmented mask"
     )
-    return f"{heights}; {classes}."
+    data = "; ".join(sorted({tile.dataset for tile in tiles if tile.dataset}))
+    return f"{f'Data: {data}. ' if data else ''}{heights}; {classes}."
