@@ -1,0 +1,125 @@
+"""``flexroad prepare`` as a user has it: a process, its output, its exit code, its folder."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from shapely import box
+
+from catalog import Catalog
+from tests.make_clouds import write_cloud
+
+CALL = [sys.executable, "-c", "from pipeline.cli import main; main()"]
+WEST, SOUTH = 356_000.0, 5_699_000.0
+
+
+def flexroad(*words, expect=0) -> str:
+    done = subprocess.run(
+        [*CALL, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    assert done.returncode == expect, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    """A street on a slope, with houses on both sides: 120 m x 80 m."""
+    rng = np.random.default_rng(5)
+    east, north = rng.uniform(0, 1, (2, 60_000)) * [[120], [80]]
+    house = (abs(north - 40) > 10) & (east % 30 < 12)
+    height = 100 + 0.02 * east + 6 * house
+    xyz = np.column_stack([east + WEST, north + SOUTH, height])
+    return write_cloud(
+        tmp_path_factory.mktemp("cloud") / "street.laz", xyz, np.where(house, 6, 2), "EPSG:25832"
+    )
+
+
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory):
+    import geopandas
+
+    path = tmp_path_factory.mktemp("roads") / "roads.gpkg"
+    street = box(WEST, SOUTH + 35, WEST + 120, SOUTH + 45)
+    geopandas.GeoDataFrame({"class": ["road"]}, geometry=[street], crs="EPSG:25832").to_file(path)
+    return path
+
+
+def test_points_to_metrics(cloud, roads, tmp_path):
+    """What it prints leads on: the next command runs as printed."""
+    out = tmp_path / "street"
+    said = flexroad(
+        "prepare", "points", cloud, "-o", out, "--roads", roads, "--date", "2024-05-01", "--workers", 1
+    )
+    (following,) = (line for line in said.splitlines() if line.startswith("next: "))
+    words = following.removeprefix("next: flexroad ").replace("RUN", str(tmp_path / "run")).split()
+    assert "1 tiles: 1 done" in flexroad(*words, "--executor", "serial")
+    (tile,) = Catalog.read(out / "catalog.parquet").tiles
+    assert (tile.dataset, f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == (
+        "street",
+        "2024-05-01",
+        False,
+    )
+
+
+def test_options_reach_the_rasters(cloud, tmp_path):
+    import rasterio
+
+    flexroad(
+        "prepare", "points", cloud, "-o", tmp_path, "--cell", 2, "--dop-cell", 1, "--ground-class", 2, 6,
+        "--name", "made", "--dtm", "mean", "--workers", 1,
+    )  # fmt: skip
+    with rasterio.open(tmp_path / "dtm.tif") as raster:
+        assert raster.res == (2, 2)
+        assert "2, 6" in raster.tags()["DTM"]
+        assert "mean" in raster.tags()["DTM"]
+    assert Catalog.read(tmp_path / "catalog.parquet").tiles[0].dataset == "made"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["points", "nowhere.laz"], "nowhere.laz"),
+        (["points", "CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
+        (["points", "CLOUD", "--to-crs", "EPSG:4326"], "EPSG:4326"),
+        (["points", "CLOUD", "--roads", "nowhere.gpkg"], "nowhere.gpkg"),
+        (["points", "CLOUD", "--dop-cell", "0.3"], "--dop-cell"),
+        (["points", "CLOUD", "--ground", "classes", "--ground-class", "9"], "class 9"),
+        (["mesh", "nowhere.obj"], "nowhere.obj"),
+        (["odm", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_leaves_nothing(cloud, tmp_path, words, says):
+    words = [cloud if word == "CLOUD" else word for word in words]
+    said = flexroad("prepare", *words, "-o", tmp_path / "out", "--workers", 1, expect=2)
+    (error,) = (line for line in said.splitlines() if line.startswith("error: "))
+    assert says in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_typo_is_answered_with_the_right_word(cloud, tmp_path):
+    assert "--cell" in flexroad("prepare", "points", cloud, "-o", tmp_path, "--cel", 2, expect=2)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_it_leaves_nothing(cloud, tmp_path, how):
+    out = tmp_path / "out"
+    with subprocess.Popen(
+        [*CALL, "prepare", "points", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        while not (out.exists() and any(out.iterdir())):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        process.send_signal(how)
+        said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "nothing was written" in said[1]
+    assert not out.exists()
