@@ -37,7 +37,7 @@ def test_the_sites_span_what_the_paper_tells():
     assert len({s.name for s in SITES}) == 5
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_scenes_rise_as_their_site_says(seed):
     from tasks.synthetic import make_scene
 
