@@ -1,0 +1,35 @@
+"""Tiny DINOv2 models with random weights, saved as folders: the mechanics without a download."""
+
+from pathlib import Path
+
+
+def save_backbone(folder: Path, registers: int = 0, seed: int = 0, hidden_size: int = 48) -> Path:
+    """Save a model of three layers; with registers it is of the class that has them."""
+    import torch
+    from transformers.models.dinov2.configuration_dinov2 import Dinov2Config
+    from transformers.models.dinov2.modeling_dinov2 import Dinov2Model
+    from transformers.models.dinov2_with_registers.configuration_dinov2_with_registers import (
+        Dinov2WithRegistersConfig,
+    )
+    from transformers.models.dinov2_with_registers.modeling_dinov2_with_registers import (
+        Dinov2WithRegistersModel,
+    )
+
+    torch.manual_seed(seed)
+    size = {
+        "hidden_size": hidden_size,
+        "num_hidden_layers": 3,
+        "num_attention_heads": 2,
+        "mlp_ratio": 2,
+        "image_size": 56,
+        "patch_size": 14,
+        # Random layers hardly change what they are given; larger weights make tokens look around.
+        "initializer_range": 0.1,
+    }
+    if registers:
+        config = Dinov2WithRegistersConfig(**size, num_register_tokens=registers)
+        model = Dinov2WithRegistersModel(config)
+    else:
+        model = Dinov2Model(Dinov2Config(**size))
+    model.save_pretrained(folder)
+    return folder
