@@ -99,6 +99,9 @@ Output = Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: 
 RoadValue = Annotated[
     list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
 ]
+Roads = Annotated[
+    str | None, typer.Option(help="Vector files of roads: a file, or a pattern relative to ROOT.")
+]
 TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
 MinCover = Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")]
 Date = Annotated[datetime | None, typer.Option(help="When the data was taken.")]
@@ -113,6 +116,7 @@ def catalog_rasters(
     dop: Annotated[str | None, typer.Option(help="Files of the orthophoto.")] = None,
     road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
     road_value: RoadValue = None,
+    roads: Roads = None,
     reference: Annotated[str | None, typer.Option(help="Files of true heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, typer.Option(help="Files of the true road mask.")] = None,
     tile_size: TileSize = 250,
@@ -130,6 +134,7 @@ def catalog_rasters(
         "road_mask": road_mask,
         "reference": reference,
         "reference_road": reference_road,
+        "roads": roads,
     }
     found = rasters.index(
         root,
@@ -149,6 +154,7 @@ def catalog_nrw(
     output: Output,
     road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
     road_value: RoadValue = None,
+    roads: Roads = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = 0.25,
     date: Date = None,
@@ -164,6 +170,7 @@ def catalog_nrw(
         date=date,
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
+        roads=roads,
     )
     _write_catalog(found, output)
 

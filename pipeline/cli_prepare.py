@@ -40,13 +40,14 @@ COMMON: dict[str, Any] = {
         typer.Option("--height-unit", help="Unit of heights where no CRS tells; default: as in plan."),
     ],
     "roads": Annotated[
-        Path | None, typer.Option("--roads", help="Roads for the mask: polygons, a raster or a mesh.")
+        Path | None,
+        typer.Option("--roads", help="Roads: polygons, a raster or a mesh, for the mask; or lines."),
     ],
     "roads_layer": Annotated[
         str | None, typer.Option("--roads-layer", help="Layer of a vector file with several.")
     ],
     "roads_where": Annotated[
-        str | None, typer.Option("--roads-where", help="Which polygons: \"class = 'road'\".")
+        str | None, typer.Option("--roads-where", help="Which features: \"class = 'road'\".")
     ],
     "tile_size_m": Annotated[
         float, typer.Option("--tile-size", help="Size of a tile in m; a smaller area is one tile.")

@@ -20,6 +20,7 @@ from catalog.cut import Indexed, cut
 from catalog.errors import CatalogError
 from catalog.grid import Bounds
 from catalog.raster_files import RasterFile, opened, scan, some
+from catalog.roads import find, with_roads
 from catalog.tile import Tile
 
 CRS = "EPSG:25832"
@@ -67,6 +68,7 @@ def index(
     date: datetime | None = None,
     min_cover: float = 0.25,
     derived: Path | None = None,
+    roads: str | None = None,
 ) -> Indexed:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one counts.
 
@@ -87,11 +89,13 @@ def index(
     derived : Path, optional
         Folder for rasters of the bridge points (class 17) of the point clouds, which with the terrain
         model make the paper's extended DTM; without it the clouds are left unread, with a note.
+    roads : str, optional
+        Vector files of roads: a file, or a glob pattern relative to ``root``.
 
     Raises
     ------
     CatalogError
-        If there is no surface model, the mask's pattern finds nothing, or no tile is left.
+        If there is no surface model, the mask's or the roads' pattern finds nothing, or no tile is left.
     """
     root = root.resolve()
     downloads = _downloads(root)
@@ -123,7 +127,12 @@ def index(
         min_cover=min_cover,
         dataset=DATASET,
     )
-    return replace(indexed, notes=(*notes, *indexed.notes, *_without_terrain(indexed.tiles)))
+    vectors = find(root, roads, CRS) if roads is not None else []
+    return replace(
+        indexed,
+        tiles=with_roads(indexed.tiles, vectors, CRS),
+        notes=(*notes, *indexed.notes, *_without_terrain(indexed.tiles)),
+    )
 
 
 def _downloads(root: Path) -> list[Download]:

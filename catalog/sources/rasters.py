@@ -1,4 +1,4 @@
-"""Folders of rasters: GeoTIFF, ASCII grid, XYZ or VRT, in any cut, put into tiles."""
+"""Folders of rasters: GeoTIFF, ASCII grid, XYZ or VRT, in any cut, put into tiles; and roads as vectors."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from catalog.cut import Indexed, cut
 from catalog.errors import CatalogError
 from catalog.raster_files import scan
+from catalog.roads import find, with_roads
 from catalog.tile import LAYERS
 
 
@@ -31,6 +32,7 @@ def index(
         The folder.
     patterns : Mapping[str, str]
         Layer name (see `catalog.LAYERS`) to glob pattern relative to ``root``; ``dsm`` must be there.
+        Of ``roads``, vector files, the pattern may be a file anywhere.
     road_values : tuple of int
         Cell values that mean road in the masks; empty: every value but 0 and nodata.
     tile_size_m : float
@@ -45,11 +47,14 @@ def index(
     Raises
     ------
     CatalogError
-        If a pattern finds nothing usable, the CRS is missing or not in metres, or no tile is left.
+        If a pattern finds nothing usable, the CRS is missing or not in metres, no tile is left, or a file
+        of roads reaches none.
     """
     root = root.resolve()
     _check(root, patterns)
-    scanned = {name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns}
+    scanned = {
+        name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns and name != "roads"
+    }
     notes = [note for _, skipped in scanned.values() for note in skipped]
     indexed = cut(
         root,
@@ -60,7 +65,8 @@ def index(
         crs=crs,
         min_cover=min_cover,
     )
-    return replace(indexed, notes=(*notes, *indexed.notes))
+    roads = find(root, patterns["roads"], crs) if "roads" in patterns else []
+    return replace(indexed, tiles=with_roads(indexed.tiles, roads, crs), notes=(*notes, *indexed.notes))
 
 
 def _check(root: Path, patterns: Mapping[str, str]) -> None:

@@ -24,7 +24,7 @@ class Asked:
     height_unit: str | None = None
     """``metre``, ``foot`` or ``us-foot``, for inputs that do not say; by default the unit of their plan."""
     roads: Path | None = None
-    """Roads to burn into the mask: polygons, a raster, or a mesh seen from above."""
+    """Roads to burn into the mask: polygons, a raster, or a mesh seen from above; lines make no mask."""
     roads_layer: str | None = None
     """Layer of ``roads``."""
     roads_where: str | None = None

@@ -99,8 +99,12 @@ def publish_mesh(
     grid = sheet_grid(mesh.bounds, frame.target, asked.cell_m, asked.step_m)
     dop_cell = asked.dop_cell_m if mesh_asked.dop else None
     say(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
-    with Sheet(out, grid, dop_cell, _facts(name, asked, mesh_asked, options)) as sheet:
-        add_roads(sheet, asked)
+    with Sheet(out, grid, dop_cell, _facts(name, mesh_asked, options)) as sheet:
+        masked = add_roads(sheet, asked)
+        if masked:
+            sheet.facts["REFERENCE"] = (
+                f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {refine.CIRCULAR}"
+            )
         fill(sheet, _spooled(sheet, mesh, mesh_asked, options, asked.step_m), options, executor, say)
         if mesh_asked.refine:
             say("refining the terrain")
@@ -111,14 +115,14 @@ def publish_mesh(
             say("drawing the orthophoto")
             _draw(sheet, mesh)
         dataset = asked.dataset or name
-        if asked.roads is not None:
+        if masked:
             _refer(sheet)
             dataset = f"{dataset}; {refine.CIRCULAR}"
         published = sheet.publish(asked.tile_size_m, asked.date, dataset)
     return published.noting(*mesh.notes, *frame.notes)
 
 
-def _facts(name: str, asked: Asked, mesh_asked: MeshAsked, options: points.Options) -> dict[str, str]:
+def _facts(name: str, mesh_asked: MeshAsked, options: points.Options) -> dict[str, str]:
     made = points.facts(options)
     facts = {
         "SOURCE": f"{name}; {mesh_asked.density:g} points per m2 of surface, seed {mesh_asked.seed}",
@@ -127,8 +131,6 @@ def _facts(name: str, asked: Asked, mesh_asked: MeshAsked, options: points.Optio
     }
     if mesh_asked.dop:
         facts["DOP"] = "texture of the highest surface, from straight above"
-    if asked.roads is not None:
-        facts["REFERENCE"] = f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {refine.CIRCULAR}"
     return facts
 
 

@@ -1,43 +1,78 @@
-"""Roads that the user has, as a mask: polygons of any vector file, a raster, or a mesh seen from above."""
+"""Roads that the user has, as a mask: polygons of any vector file, a raster, or a mesh seen from above.
+
+Lines have no width of their own: they go into the catalog as they are, for ``segment: vector``.
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
+import shapely
 from rasterio.errors import RasterioError
-from rasterio.features import rasterize
 from rasterio.warp import Resampling, reproject
 
-from catalog import Grid
+from catalog import CatalogError, Grid
 from catalog.crs import short
 from catalog.frame import Frame
+from catalog.roads import VectorFile, opened
 from pipeline.errors import ConfigError
 from pipeline.prepare.asked import Asked
 from pipeline.prepare.sheet import Sheet
+from tasks.road_vectors import cells
 from tasks.types import Bools
 
 MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
+LINES = ("LineString", "MultiLineString")
 
 
-def add_roads(sheet: Sheet, asked: Asked) -> None:
-    """Write the road mask of a sheet, if roads were given.
+def add_roads(sheet: Sheet, asked: Asked) -> bool:
+    """Write the road mask of a sheet, if roads were given, and name them in its catalog if they are vectors.
+
+    Returns
+    -------
+    bool
+        Whether there is a road mask now: not without roads, nor from lines.
 
     Raises
     ------
     ConfigError
         If the roads cannot be read, or none lies on the sheet.
     """
-    if asked.roads is not None:
-        mask = burn(asked.roads, asked.roads_layer, asked.roads_where, sheet.grid)
+    if asked.roads is None:
+        return False
+    mask = burn(asked.roads, asked.roads_layer, asked.roads_where, sheet.grid)
+    if mask is not None:
         sheet.write("road_mask", sheet.grid, mask)
+    vectors = _vectors(asked.roads)
+    if vectors is not None:
+        sheet.attach_roads(vectors, *([] if mask is not None else [_of_lines(asked)]))
+    return mask is not None
 
 
-def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools:
-    """Return the cells whose centre is road, ``(H, W)``.
+def _vectors(path: Path) -> VectorFile | None:
+    """Return what a vector file tells, or None if it is none."""
+    try:
+        return opened(path, None)
+    except CatalogError:
+        return None
+
+
+def _of_lines(asked: Asked) -> str:
+    told = {"layer": asked.roads_layer, "where": asked.roads_where}
+    chosen = "".join(f", {name}: {json.dumps(text)}" for name, text in told.items() if text)
+    return (
+        f"{asked.roads} holds lines, so there is no road mask; run with a configuration that has "
+        f"segment: {{method: vector{chosen}}}"
+    )
+
+
+def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools | None:
+    """Return the cells whose centre is road, ``(H, W)``, or None if the roads are lines.
 
     Parameters
     ----------
@@ -53,22 +88,26 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools:
     Raises
     ------
     ConfigError
-        If the file cannot be read, holds lines, or has no road on the grid.
+        If the file cannot be read, holds points, or has no road on the grid.
     """
     if not path.exists():
         raise ConfigError(f"--roads {path} does not exist")
-    if path.suffix.lower() in MESHES:
-        mask = _mesh(path, grid)
-    else:
-        mask = _raster(path, grid)
-        if mask is None:
-            mask = _polygons(path, layer, where, grid)
+    mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)
+    if mask is None:
+        features = _features(path, layer, where, grid)
+        if features is None:
+            return None
+        mask = cells(features.geometry.to_numpy(), grid)
     if not mask.any():
-        bounds = ", ".join(f"{edge:.0f}" for edge in grid.bounds)
-        raise ConfigError(
-            f"no road of {path} lies in the area ({bounds} in {short(grid.crs)}); check the CRS of both"
-        )
+        raise _elsewhere(path, grid)
     return mask
+
+
+def _elsewhere(path: Path, grid: Grid) -> ConfigError:
+    bounds = ", ".join(f"{edge:.0f}" for edge in grid.bounds)
+    return ConfigError(
+        f"no road of {path} lies in the area ({bounds} in {short(grid.crs)}); check the CRS of both"
+    )
 
 
 def _mesh(path: Path, grid: Grid) -> Bools:
@@ -97,24 +136,31 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
             )
     except RasterioError:
         return None
-    return mask != 0
+    road: Bools = mask != 0
+    return road
 
 
-def _polygons(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools:
+def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> Any:
+    """Return the polygons of a vector file in the grid's CRS, or None if it holds lines."""
+    vectors = _vectors(path)
+    if vectors is not None and vectors.extents is None and layer is None:
+        # OSM's own format, which holds roads mostly as lines, is too much to be read for a look.
+        return None
     features = _read(path, layer, where)
     if features.crs is None:
         raise ConfigError(f"{path} carries no CRS; give it one, e.g. ogr2ogr -a_srs {short(grid.crs)}")
     features = features[~(features.geometry.isna() | features.geometry.is_empty)].to_crs(grid.crs)
-    kinds = sorted(set(features.geom_type) - set(AREAS))
+    kinds = sorted(set(features.geom_type) - {*AREAS, *LINES})
     if kinds:
         raise ConfigError(
-            f"{path} holds {kinds[0]}s where polygons of roads are wanted; give their layer with "
-            "--roads-layer, choose them with --roads-where, or buffer the lines by half the roads' width"
+            f"{path} holds {kinds[0]}s where polygons or lines of roads are wanted; give their layer with "
+            "--roads-layer, or choose them with --roads-where"
         )
-    if features.empty:
-        return np.zeros(grid.shape, bool)
-    burnt: Any = rasterize(features.geometry, out_shape=grid.shape, transform=grid.transform, dtype=np.uint8)
-    return np.asarray(burnt != 0)
+    if not set(features.geom_type) & set(LINES):
+        return features
+    if not features.intersects(shapely.box(*grid.bounds)).any():
+        raise _elsewhere(path, grid)
+    return None
 
 
 def _read(path: Path, layer: str | None, where: str | None) -> Any:

@@ -26,6 +26,7 @@ from rasterio.windows import Window
 from catalog import LAYERS, Catalog, Grid, Layer, Tile
 from catalog.cut import assumed, cut
 from catalog.raster_files import opened, some, zoned
+from catalog.roads import VectorFile, with_roads
 from pipeline.errors import ConfigError
 from tasks.acquire.types import Photo
 
@@ -84,6 +85,8 @@ class Sheet:
         self.facts = dict(facts)
         self._new = not out.exists()
         self._open: dict[str, Any] = {}
+        self._roads: list[VectorFile] = []
+        self._notes: list[str] = []
         self.scratch = out / f".prepare-{os.getpid()}"
         """Folder for temporary files of whoever makes the rasters; it goes with the sheet."""
         try:
@@ -141,6 +144,11 @@ class Sheet:
             raster.write(photo.colour, window=window)
             raster.write_mask(photo.known, window=window)
 
+    def attach_roads(self, file: VectorFile, *notes: str) -> None:
+        """Name a vector file as the roads of the tiles it reaches; it stays where it is."""
+        self._roads.append(file)
+        self._notes += notes
+
     def read(self, layer: str, where: Grid) -> NDArray[Any]:
         """Return a window of a layer as written so far, ``(H, W)``: float64 heights or a bool mask."""
         values: NDArray[Any] = self._open[layer].read(1, window=_window(self.grid, where))
@@ -163,6 +171,8 @@ class Sheet:
         ------
         ConfigError
             If the disk is full, or no tile has enough heights.
+        CatalogError
+            If the roads reach no tile.
         """
         names = [layer for layer in LAYERS if layer in self._open]
         for layer in names:
@@ -170,9 +180,10 @@ class Sheet:
                 self._open[layer].close()
                 _to_cog(self.scratch / f"{layer}.tmp.tif", self.scratch / f"{layer}.tif", layer)
         tiles, notes = self._tiles(names, tile_size_m, date, dataset)
+        tiles = with_roads(tiles, self._roads, None)
         self._replace(names)
         Catalog(tiles).write(self.out / CATALOG)
-        return Published(self.out / CATALOG, len(tiles), (*notes, *assumed(tiles)))
+        return Published(self.out / CATALOG, len(tiles), (*self._notes, *notes, *assumed(tiles)))
 
     def _replace(self, names: list[str]) -> None:
         # A catalog stands for finished rasters: the old one goes first, the new one comes last.

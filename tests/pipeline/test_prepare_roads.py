@@ -4,11 +4,13 @@ import geopandas
 import numpy as np
 import pytest
 import rasterio
-from shapely import LineString, Polygon, box
+from shapely import LineString, Point, Polygon, box
 
-from catalog import Grid
+from catalog import Catalog, Grid
 from pipeline.errors import ConfigError
-from pipeline.prepare.roads import burn
+from pipeline.prepare.asked import Asked
+from pipeline.prepare.roads import add_roads, burn
+from pipeline.prepare.sheet import Sheet
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
 
@@ -60,13 +62,45 @@ def test_raster_is_taken_by_nearest_neighbour(tmp_path):
     assert np.array_equal(burn(path, None, None, GRID), values[row, col])
 
 
+def published(folder, roads, **more):
+    """The only tile of a flat area whose roads were given, and what was said of it."""
+    with Sheet(folder, GRID, None, {}) as sheet:
+        for layer in ("dsm", "dtm"):
+            sheet.write(layer, GRID, np.zeros(GRID.shape))
+        masked = add_roads(sheet, Asked(roads=roads, **more))
+        made = sheet.publish()
+    (tile,) = Catalog.read(made.catalog).tiles
+    assert masked == (tile.layer("road_mask") is not None)
+    return tile, made.notes
+
+
+def test_lines_go_into_the_catalog_without_a_mask(tmp_path):
+    shapes = [LineString([(400_000, 5_700_050), (400_080, 5_700_050)])]
+    roads = write(tmp_path / "map.gpkg", shapes, layer="ways", kind=["road"])
+    write(roads, [box(400_000, 5_700_000, 400_010, 5_700_100)], layer="areas")
+    tile, notes = published(tmp_path / "out", roads, roads_layer="ways", roads_where="kind = 'road'")
+    assert tile.layer("road_mask") is None
+    assert tile.paths(tile.layer("roads")) == (roads,)
+    assert 'segment: {method: vector, layer: "ways", where: "kind = \'road\'"}' in notes[0]
+
+
+def test_polygons_are_burnt_and_named_rasters_only_burnt(tmp_path):
+    roads = write(tmp_path / "roads.gpkg", [box(400_000, 5_700_000, 400_010, 5_700_100)])
+    tile, _ = published(tmp_path / "out", roads)
+    assert tile.paths(tile.layer("roads")) == (roads,)
+    again, _ = published(tmp_path / "again", tmp_path / "out" / "road_mask.tif")
+    assert again.layer("road_mask") is not None
+    assert again.layer("roads") is None
+
+
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 @pytest.mark.parametrize(
     ("make", "layer", "where", "says"),
     [
         (lambda path: None, None, None, "does not exist"),
         (lambda path: path.write_text("roads"), None, None, "cannot be read"),
-        (lambda path: write(path, [LineString([(0, 0), (1, 1)])]), None, None, "LineStrings where polygons"),
+        (lambda path: write(path, [Point(400_010, 5_700_020)]), None, None, "Points where polygons or lines"),
+        (lambda path: write(path, [LineString([(0, 0), (1, 1)])]), None, None, "no road of .* lies in the"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, None, "no road of .* lies in the area"),
         (lambda path: write(path, [box(0, 0, 9, 9)], crs=None), None, None, "no CRS"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), "streets", None, "no layer 'streets'"),

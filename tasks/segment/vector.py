@@ -1,0 +1,51 @@
+"""Step B of the paper, road extraction: M^r from vectors, as areas or as centre lines with a width."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from tasks import road_vectors
+from tasks.errors import TaskError
+from tasks.hygiene import NOTHING, Hygiene, clean
+from tasks.survey import outside
+from tasks.types import RoadMask, TileData
+
+VERSION = 1
+READS = ("roads",)
+
+
+class Options(road_vectors.Options):
+    """Which features are roads, how wide they are, and how the mask is tidied."""
+
+    method: Literal["vector"] = "vector"
+    hygiene: Hygiene = Field(NOTHING, description="tidying of the mask; by default it is left as it is")
+
+
+def segment(data: TileData, options: Options) -> RoadMask:
+    """Return the cells whose centre is on a road of the catalog's vectors; those on bridges are flagged.
+
+    Raises
+    ------
+    TaskError
+        If the tile has no vectors, they cannot be used, or none of its cells is road.
+    """
+    found = road_vectors.roads(data.roads, data.grid, options)
+    burnt = road_vectors.cells(found.areas, data.grid)
+    mask = clean(burnt, data, options.hygiene)
+    if not mask[data.grid.window(data.core)].any():
+        files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
+        raise TaskError(
+            f"no road of {files} lies on this tile: leave the tile out, or check segment.layer, "
+            "segment.where and segment.left_out",
+            layer="roads",
+        )
+    return RoadMask(
+        grid=data.grid,
+        core=data.core,
+        mask=mask,
+        outside=outside(data),
+        bridge=road_vectors.cells(found.areas[found.bridge], data.grid) & mask,
+        notes=found.notes,
+    )
