@@ -1,0 +1,68 @@
+"""Eighteen photographs of a drone against the cloud that other software made of them (about a minute)."""
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+
+from catalog.grid import Grid
+from pipeline.execute import SerialExecutor
+from pipeline.prepare.asked import Asked
+from pipeline.prepare.photos import PhotosAsked, prepare_photos
+from tasks.acquire import dense, photogrammetry, points
+
+pytestmark = pytest.mark.real
+
+GNSS_PLAN_M, GNSS_HEIGHT_M = 3.0, 5.0
+
+
+@pytest.fixture(scope="module")
+def published(real_data, tmp_path_factory):
+    return prepare_photos(
+        [real_data / "brighton_beach" / "images"],
+        tmp_path_factory.mktemp("brighton"),
+        Asked(cell_m=0.5),
+        PhotosAsked(
+            sfm=photogrammetry.Options(image_size=1400, features=4096, threads=2, calibrate="held"),
+            stereo=dense.Options(size=800, partners=3),
+            refine=False,
+        ),
+        points.Options(ground="filter", fill_m=0),
+        SerialExecutor(),
+        lambda line: None,
+    )
+
+
+def test_all_photographs_are_placed_within_the_accuracy_of_their_receiver(published):
+    placed = published.notes[0]
+    assert placed.startswith("18 of 18 photographs placed")
+    words = placed.split()
+    assert float(words[words.index("cameras") + 1]) < GNSS_PLAN_M
+    assert float(words[words.index("and") + 1]) < GNSS_HEIGHT_M
+
+
+def test_the_surface_is_that_of_the_delivered_cloud(published, real_data):
+    with rasterio.open(published.catalog.parent / "dsm.tif") as raster:
+        ours = raster.read(1).astype(float)
+        grid = Grid("EPSG:32615", raster.bounds.left, raster.bounds.top, 0.5, raster.width, raster.height)
+    cloud = laspy.read(real_data / "brighton_beach" / "model.laz")
+    x, y, z = (np.asarray(axis) for axis in (cloud.x, cloud.y, cloud.z))
+    on = (x > grid.west) & (x < grid.east) & (y > grid.south) & (y < grid.north)
+    theirs = np.full(grid.shape, -np.inf)
+    np.maximum.at(theirs, grid.cells(x[on], y[on]), z[on])
+    both = np.isfinite(theirs) & np.isfinite(ours)
+    assert both.sum() > 0.8 * np.isfinite(theirs).sum()
+    off = (ours - theirs)[both]
+    # The heights of both are a receiver's, without corrections.
+    assert np.abs(np.median(off)) < GNSS_HEIGHT_M
+    assert _nmad(off) < 0.6
+    # Two calibrations of one lens differ by a bowl: what is left without it is what the stereo does.
+    row, col = (axis[both] / 100 for axis in np.indices(grid.shape))
+    bowl = np.stack([np.ones(len(off)), col, row, col**2, col * row, row**2], axis=1)
+    flat = np.abs(off - np.median(off)) < 2
+    left = off[flat] - bowl[flat] @ np.linalg.lstsq(bowl[flat], off[flat], rcond=None)[0]
+    assert _nmad(left) < 0.15
+
+
+def _nmad(values):
+    return 1.4826 * np.median(np.abs(values - np.median(values)))
