@@ -101,12 +101,13 @@ def _points_options(
     from tasks.acquire.ground import Options as Filter
     from tasks.acquire.points import Options
 
-    def told(**options: Any) -> dict[str, Any]:
-        return {name: value for name, value in options.items() if value is not None}
+    ground_filter = Filter(**_told(slope=slope, radius_m=radius))
+    return Options(filter=ground_filter, **_told(fill_m=fill, void_m=void, **more))
 
-    return Options(
-        filter=Filter(**told(slope=slope, radius_m=radius)), **told(fill_m=fill, void_m=void, **more)
-    )
+
+def _told(**options: Any) -> dict[str, Any]:
+    """Return the options that were given; the others keep the defaults of their models."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _executor(workers: int | None) -> Executor:
@@ -241,3 +242,47 @@ def prepare_odm(
     of_mesh = mesh.MeshAsked(density=density, seed=seed)
     options = _points_options(slope, radius, fill, void, ground="filter")
     _carry_out(lambda: odm.prepare_odm(project, output, asked, of_mesh, options, _executor(workers), _say))
+
+
+@prepare.command("photos")
+@with_common
+def prepare_photos(
+    asked: Asked,
+    images: Annotated[list[Path], typer.Argument(help="Overlapping photographs with GNSS tags, or folders.")],
+    output: Out,
+    control: Annotated[
+        Path | None, typer.Option(help="Ground control, CSV: image,x_px,y_px,easting,northing,height.")
+    ] = None,
+    control_crs: Annotated[
+        str | None, typer.Option(help="CRS of the control; default: the rasters'.")
+    ] = None,
+    image_size: Annotated[
+        int | None, typer.Option(min=320, help="Longest side at which features are sought, in pixels.")
+    ] = None,
+    stereo_size: Annotated[
+        int | None, typer.Option(min=320, help="Longest side at which depth is measured, in pixels.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of all random choices.")] = None,
+    no_refine: NoRefine = False,
+    slope: Slope = None,
+    radius: Radius = None,
+    fill: Fill = None,
+    void: Void = None,
+    workers: Workers = None,
+) -> None:
+    """Reconstruct a place from photographs: cameras, dense stereo, Poisson mesh, and that as `mesh` does."""
+    from pipeline.prepare import photos
+    from tasks.acquire import dense, patchmatch, photogrammetry
+
+    of_photos = photos.PhotosAsked(
+        control,
+        control_crs,
+        photogrammetry.Options(**_told(image_size=image_size, seed=seed)),
+        dense.Options(**_told(size=stereo_size)),
+        patchmatch.Options(**_told(size=stereo_size)),
+        refine=not no_refine,
+    )
+    options = _points_options(slope, radius, fill, void, ground="filter")
+    _carry_out(
+        lambda: photos.prepare_photos(images, output, asked, of_photos, options, _executor(workers), _say)
+    )
