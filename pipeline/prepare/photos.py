@@ -240,6 +240,10 @@ def _jobs(found: Reconstruction, folder: Path, options: dense.Options, spacing: 
 
 
 def _match(job: DepthJob) -> Path:
+    import cv2
+
+    # Photographs run side by side, one thread each; OpenCV does not read the environment.
+    cv2.setNumThreads(1)
     cloud = dense.photo_cloud(job.view, job.others, job.points, job.options)
     if len(cloud):
         cloud = dense.merge([cloud], job.spacing_m)

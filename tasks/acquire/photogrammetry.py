@@ -127,8 +127,8 @@ def colmap() -> ModuleType:
         import pycolmap
     except ImportError as error:
         raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
-    # Errors only: its progress is hundreds of lines.
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    # Its progress is hundreds of lines, and what it calls errors are raised here in words of our own.
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap  # type: ignore[no-any-return]
 
 
@@ -227,7 +227,7 @@ def _match(pycolmap: ModuleType, database: Path, count: int, options: Options) -
         )
         pycolmap.match_spatial(database, pairing_options=pairing, **common)
     with pycolmap.Database.open(database) as opened:
-        if not opened.num_verified_image_pairs():
+        if not opened.num_inlier_matches():
             raise TaskError(
                 f"none of the {count} photographs match each other; do they show one place? {_more(options)}"
             )
