@@ -1,0 +1,92 @@
+"""Vector files of roads are named by the tiles they reach."""
+
+import numpy as np
+import pytest
+from shapely import LineString, box
+
+from catalog import Catalog, CatalogError
+from catalog.sources import nrw, rasters
+from tests.make_rasters import write
+from tests.make_roads import write as write_roads
+from tests.make_roads import write_osm
+
+HEIGHTS = np.full((250, 750), 100, np.float32)
+"""Three tiles side by side, from 295500 to 296250 east."""
+
+
+@pytest.fixture
+def survey(tmp_path):
+    root = tmp_path / "survey"
+    for name in ("dsm", "dtm"):
+        write(root / f"{name}.tif", HEIGHTS)
+    return root
+
+
+def indexed(root, roads, crs=None):
+    return rasters.index(root, {"dsm": "dsm.tif", "dtm": "dtm.tif", "roads": str(roads)}, crs=crs).tiles
+
+
+def named(tiles):
+    return [
+        [path.name for path in tile.paths(layer)] if (layer := tile.layer("roads")) else [] for tile in tiles
+    ]
+
+
+def test_a_file_is_named_by_the_tiles_within_reach(survey, tmp_path):
+    """The first road ends 99 m west of the last tile, the other 20 m within it."""
+    write_roads(survey / "a.gpkg", [LineString([(295_400, 5_629_300), (295_901, 5_629_300)])])
+    write_roads(survey / "b.gpkg", [LineString([(296_020, 5_629_300), (296_900, 5_629_300)])])
+    tiles = indexed(survey, "?.gpkg")
+    assert named(tiles) == [["a.gpkg"], ["a.gpkg", "b.gpkg"], ["a.gpkg", "b.gpkg"]]
+    Catalog(tiles).write(survey / "catalog.parquet")
+    (again, *_) = Catalog.read(survey / "catalog.parquet").tiles
+    assert again.layer("roads").files == ("a.gpkg",)
+    assert again.paths(again.layer("roads"))[0].is_file()
+
+
+def test_a_file_may_lie_anywhere_in_any_crs(survey, tmp_path):
+    import geopandas
+
+    line = geopandas.GeoSeries([LineString([(295_500, 5_629_300), (295_600, 5_629_300)])], crs="EPSG:25832")
+    roads = tmp_path / "elsewhere" / "r.geojson"
+    roads.parent.mkdir()
+    write_roads(roads, list(line.to_crs("EPSG:4326")), "EPSG:4326")
+    tiles = indexed(survey, roads)
+    assert named(tiles) == [["r.geojson"], [], []]
+    assert tiles[0].paths(tiles[0].layer("roads")) == (roads,)
+
+
+def test_osm_files_tell_no_bounds_and_are_named_by_all(survey):
+    write_osm(survey / "map.osm", {"highway=service": [(6.1, 50.7), (6.2, 50.8)]})
+    assert named(indexed(survey, "map.osm")) == [["map.osm"]] * 3
+
+
+def test_nrw_downloads_take_roads_too(tmp_path):
+    for product in ("dom1", "dgm1"):
+        write(tmp_path / f"{product}_32_356_5699_1_nw_2020.tif", HEIGHTS[:, :250], 356_000, 5_700_000)
+    write_roads(tmp_path / "r.gpkg", [box(356_000, 5_699_800, 356_100, 5_699_900)])
+    assert named(nrw.index(tmp_path, roads="r.gpkg").tiles) == [["r.gpkg"]]
+
+
+def test_a_crs_given_stands_in_for_a_missing_one(survey):
+    with pytest.warns(UserWarning, match="'crs' was not provided"):
+        write_roads(survey / "r.gpkg", [LineString([(295_500, 5_629_300), (295_600, 5_629_300)])], None)
+    with pytest.raises(CatalogError, match=r"--roads .*r.gpkg carries no CRS; say which it is with --crs"):
+        indexed(survey, "r.gpkg")
+    assert [tile.layer("roads").crs for tile in indexed(survey, "r.gpkg", "EPSG:25832")[:1]] == ["EPSG:25832"]
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "says"),
+    [
+        (lambda path: None, "r.gpkg", "no file matches --roads 'r.gpkg' below .*; there are dsm.tif"),
+        (lambda path: path.write_text("roads"), "r.gpkg", "--roads .*r.gpkg is no vector file"),
+        (lambda path: None, "dsm.tif", "--roads .*dsm.tif is no vector file"),
+        (lambda path: write_roads(path, [box(0, 0, 1, 1)]), "r.gpkg", "--roads .*r.gpkg reaches no tile"),
+    ],
+)  # fmt: skip
+def test_what_is_no_roads_is_one_line(survey, make, given, says):
+    make(survey / "r.gpkg")
+    with pytest.raises(CatalogError, match=says) as caught:
+        indexed(survey, given)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,238 @@
+"""Which features are roads, how they are made areas, and how files are read."""
+
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import GeometryCollection, LineString, MultiLineString, Point, box
+
+from catalog import Grid
+from catalog.crs import transformer
+from tasks import TaskError, vector_files
+from tasks.road_vectors import Options, burn, cells, roads
+from tests.make_roads import GRID, on_grid, tile, write, write_osm
+
+WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
+
+
+def area(*paths, **options):
+    """Area under all roads of the files (m2), near the tile."""
+    return shapely.union_all(roads(tile(*paths).roads, GRID, Options(**options)).areas).area
+
+
+def test_a_line_is_as_wide_as_it_says_and_ends_where_it_ends(tmp_path):
+    path = write(tmp_path / "r.gpkg", [WEST_EAST], width=["24'"])
+    assert area(path) == pytest.approx(80 * 7.3152)
+    mask = burn(tile(path))
+    truth = np.zeros(GRID.shape, bool)
+    truth[46:54, 10:90] = True  # centres within 3.66 m of the line, 0.5 to 3.5 m
+    np.testing.assert_array_equal(mask, truth)
+
+
+@settings(max_examples=30, deadline=None)
+@given(turn=st.floats(-2.5, 2.5), wide=st.floats(2, 20), narrow=st.floats(2, 20))
+def test_where_lines_meet_no_wedge_is_left(tmp_path_factory, turn, wide, narrow):
+    """All within the narrower half width of the common end is road, and nothing beyond the round buffers."""
+    middle = (50.0, 50.0)
+    far = (50 + 40 * np.cos(turn), 50 + 40 * np.sin(turn))
+    lines = [LineString(on_grid((10, 50), middle)), LineString(on_grid(middle, far))]
+    path = tmp_path_factory.mktemp("joint") / "r.geojson"
+    write(path, lines, width_m=[wide, narrow])
+    found = shapely.union_all(roads(tile(path).roads, GRID, Options()).areas)
+    disc = Point(*on_grid(middle)[0]).buffer(min(wide, narrow) / 2, quad_segs=8)
+    assert disc.difference(found).area < 1e-6
+    round_ended = shapely.union_all(shapely.buffer(lines, np.array([wide, narrow]) / 2, quad_segs=64))
+    assert found.difference(round_ended.buffer(0.01)).area < 1e-6
+
+
+def test_a_ring_closes(tmp_path):
+    ring = LineString(on_grid((30, 30), (70, 30), (70, 70), (30, 70), (30, 30)))
+    found = shapely.union_all(
+        roads(tile(write(tmp_path / "r.gpkg", [ring], width=[6])).roads, GRID, Options()).areas
+    )
+    assert found.contains(Point(*on_grid((28, 28))[0])) is True
+    assert len(found.interiors) == 1
+
+
+def test_areas_are_taken_as_they_are_and_collections_come_apart(tmp_path):
+    shapes = [
+        GeometryCollection([box(*on_grid((0, 0))[0], *on_grid((10, 10))[0]), MultiLineString([WEST_EAST])]),
+        LineString(on_grid((60, 60), (80, 60), (80, 90), (60, 60))),
+        Point(*on_grid((40, 40))[0]),
+        None,
+    ]
+    path = write(tmp_path / "r.gpkg", shapes, width=[2, 2, 2, 2], area=["no", "yes", None, None])
+    assert area(path) == pytest.approx(100 + 80 * 2 + 20 * 30 / 2)
+
+
+def strips(tmp_path, column, values, **more):
+    """Lines 2 m wide, 10 m apart, one for each value; those that are road."""
+    lines = [LineString(on_grid((10, 5 + 10 * i), (90, 5 + 10 * i))) for i in range(len(values))]
+    path = tmp_path / "r.gpkg"
+    path.unlink(missing_ok=True)
+    write(path, lines, width=[2] * len(values), **{column: values, **more})
+    return path
+
+
+def kept(mask, n):
+    return [bool(mask[round(100 - 5 - 10 * i), 50]) for i in range(n)]
+
+
+@pytest.mark.parametrize("column", ["highway", "class", "fclass", "HIGHWAY"])
+def test_ways_for_walkers_and_ways_to_come_are_out(tmp_path, column):
+    classes = [
+        "residential",
+        "footway",
+        "steps",
+        "cycleway",
+        "proposed",
+        "razed",
+        "abandoned",
+        "construction",
+        "track",
+    ]
+    mask = burn(tile(strips(tmp_path, column, classes)))
+    assert kept(mask, 9) == [True] + [False] * 7 + [True]
+    chosen = burn(tile(tmp_path / "r.gpkg"), Options(left_out=("track",)))
+    assert kept(chosen, 9) == [True] * 8 + [False]
+
+
+def test_features_of_osm_without_highway_are_no_roads_others_need_no_class(tmp_path):
+    assert kept(burn(tile(strips(tmp_path, "highway", ["service", None]))), 2) == [True, False]
+    assert kept(burn(tile(strips(tmp_path, "class", ["lane", None]))), 2) == [True, True]
+
+
+def test_what_lies_under_something_is_out_unless_asked_for(tmp_path):
+    values = ["yes", "building_passage", "no", None, "culvert", "F", "T"]
+    path = strips(tmp_path, "tunnel", values)
+    assert kept(burn(tile(path)), 7) == [False, False, True, True, False, True, False]
+    assert kept(burn(tile(path), Options(tunnels=True)), 7) == [True] * 7
+    assert kept(burn(tile(strips(tmp_path, "covered", ["yes", "no"]))), 2) == [False, True]
+
+
+def test_bridges_are_kept_and_flagged(tmp_path):
+    path = strips(tmp_path, "bridge", ["yes", "viaduct", "no", None, "1", "0"])
+    found = roads(tile(path).roads, GRID, Options())
+    deck = cells(found.areas[found.bridge], GRID)
+    assert kept(deck, 6) == [True, True, False, False, True, False]
+    assert kept(cells(found.areas, GRID), 6) == [True] * 6
+
+
+def test_a_joint_is_a_bridge_if_all_that_meet_there_are(tmp_path):
+    lines = [LineString(on_grid((10 + 20 * i, 50), (30 + 20 * i, 50))) for i in range(3)]
+    path = write(tmp_path / "r.gpkg", lines, width=[6] * 3, bridge=["no", "yes", "yes"])
+    found = roads(tile(path).roads, GRID, Options())
+    deck = shapely.union_all(found.areas[found.bridge])
+    assert deck.bounds[0] - GRID.west == pytest.approx(30)
+    assert deck.area == pytest.approx(40 * 6)
+
+
+def test_layer_and_condition_choose(tmp_path):
+    path = strips(tmp_path, "class", ["lane", "yard"])
+    write(path, [WEST_EAST], layer="more", width=[20])
+    with pytest.raises(TaskError, match="has the layers r, more; name one with segment.layer"):
+        area(path)
+    assert area(path, layer="r") == pytest.approx(2 * 160)
+    assert area(path, layer="r", where="class = 'yard'") == pytest.approx(160)
+    assert area(path, layer="more") == pytest.approx(80 * 20)
+
+
+# --- OSM's own format ---------------------------------------------------------------------------------
+
+
+def degrees(*places):
+    lon, lat = transformer(GRID.crs, "EPSG:4326").transform(*np.array(on_grid(*places)).T)
+    return list(zip(lon.tolist(), lat.tolist(), strict=True))
+
+
+@pytest.fixture
+def osm(tmp_path):
+    """One way each of a road, tunnel, river, building and footway, and a square for cars."""
+    return write_osm(
+        tmp_path / "map.osm",
+        {
+            "highway=residential;width=7 m": degrees((10, 90), (90, 90)),
+            "highway=primary;lanes=2;bridge=yes": degrees((10, 70), (90, 70)),
+            "highway=primary;tunnel=yes": degrees((10, 55), (90, 55)),
+            "highway=footway": degrees((10, 45), (90, 45)),
+            "waterway=river;width=9": degrees((10, 35), (90, 35)),
+            "building=yes": degrees((10, 10), (30, 10), (30, 25), (10, 25), (10, 10)),
+            "highway=service;area=yes": degrees((60, 10), (80, 10), (80, 25), (60, 25), (60, 10)),
+        },
+    )
+
+
+def test_osm_files_are_read_lines_and_areas(osm):
+    found = roads(tile(osm).roads, GRID, Options())
+    # 0.9996 is the scale of the UTM zone here; nodes are kept to 1e-7 degrees, a centimetre.
+    assert sorted(shapely.area(found.areas)) == pytest.approx([15 * 20, 80 * 7, 80 * 7], rel=0.01)
+    assert shapely.area(found.areas[found.bridge]).tolist() == pytest.approx([80 * 7], rel=0.01)
+    assert area(osm, layer="lines") == pytest.approx(2 * 80 * 7, rel=0.01)
+    assert area(osm, where="highway = 'primary'", layer="lines") == pytest.approx(80 * 7, rel=0.01)
+
+
+def test_nodes_in_any_order_and_pbf():
+    """The sample that comes with pyogrio: its motorway runs in a tunnel below its streets."""
+    sample = Path(pyogrio.__file__).parent / "tests" / "fixtures" / "sample.osm.pbf"
+    if not sample.exists():
+        pytest.skip("pyogrio came without its tests")
+    table = pyogrio.read_dataframe(
+        sample, layer="lines", where="highway IS NOT NULL", USE_CUSTOM_INDEXING="NO"
+    ).to_crs("EPSG:32630")
+    grid = Grid.covering("EPSG:32630", tuple(table.total_bounds), 1.0)
+    found = shapely.union_all(roads(tile(sample).roads, grid, Options()).areas)
+    streets = table[table.highway == "residential"].geometry
+    assert len(streets) == 20
+    assert all(found.buffer(0.01).covers(street) for street in streets)
+    (motorway,) = table[table.highway == "motorway"].geometry
+    assert not found.covers(motorway)
+    with_it = shapely.union_all(roads(tile(sample).roads, grid, Options(tunnels=True)).areas)
+    assert with_it.buffer(0.01).covers(motorway)
+
+
+# --- one index per file -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def readings(monkeypatch):
+    """Counts how often files are read."""
+    count = []
+    read = vector_files._read
+    monkeypatch.setattr(vector_files, "_read", lambda *given: count.append(1) or read(*given))
+    return count
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson"])
+def test_a_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
+    """Also where tiles lie in two of the squares that an indexed file is read by."""
+    line = LineString([(399_000, 5_699_990), (401_000, 5_699_990)])
+    crs = GRID.crs
+    path = tmp_path / f"r.{suffix}"
+    write(path, [line], crs, width=[6])
+    masks = []
+    for i in range(8):
+        grid = Grid(crs, 399_600 + 100 * i, 5_700_050, 1.0, 100, 100)
+        masks.append(burn(tile(path, grid=grid)))
+    assert all(mask.sum() == 600 for mask in masks)
+    squares = 4 if suffix == "gpkg" else 1
+    assert 1 <= len(readings) <= squares
+
+
+def test_a_feature_in_two_squares_is_one(tmp_path):
+    """Squares meet at 400 km east and 5 700 km north."""
+    path = write(tmp_path / "r.gpkg", [LineString([(399_950, 5_699_950), (400_050, 5_700_050)])], width=[6])
+    grid = Grid(GRID.crs, 399_900, 5_700_100, 1.0, 200, 200)
+    found = roads(tile(path).roads, grid, Options())
+    assert len(found.areas) == 1
+    assert found.areas[0].area == pytest.approx(6 * 100 * 2**0.5)
+
+
+def test_a_file_that_changed_is_read_anew(tmp_path):
+    path = write(tmp_path / "r.geojson", [WEST_EAST], width=[6])
+    assert area(path) == pytest.approx(480, rel=1e-3)
+    write(path, [WEST_EAST, LineString(on_grid((10, 80), (90, 80)))], width=[10, 10])
+    assert area(path) == pytest.approx(1600, rel=1e-3)

@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from shapely import LineString, box
+
+from tasks import TaskError
+from tasks.hygiene import Hygiene
+from tasks.segment.vector import Options, segment
+from tests.make_roads import GRID, on_grid, tile, write
+
+LINE = LineString(on_grid((0, 50), (100, 50)))
+
+
+def test_mask_bridges_and_survey(tmp_path):
+    lines = [LineString(on_grid((0, 50), (60, 50))), LineString(on_grid((60, 50), (100, 50)))]
+    road = segment(
+        tile(write(tmp_path / "r.gpkg", lines, width=["6 m"] * 2, bridge=["no", "yes"])), Options()
+    )
+    truth = np.zeros(GRID.shape, bool)
+    truth[47:53] = True
+    np.testing.assert_array_equal(road.mask, truth)
+    np.testing.assert_array_equal(road.bridge, truth & (np.arange(100) >= 60))
+    assert (road.grid, road.core, road.probability, road.notes) == (GRID, GRID, None, ())
+    assert not road.outside.any()
+
+
+def test_roads_in_degrees_lie_where_they_belong(tmp_path):
+    import geopandas
+
+    lines = geopandas.GeoSeries([LINE], crs=GRID.crs).to_crs("EPSG:4326")
+    plain = segment(tile(write(tmp_path / "m.gpkg", [LINE], width=[6.4])), Options())
+    turned = segment(tile(write(tmp_path / "d.geojson", list(lines), "EPSG:4326", width=[6.4])), Options())
+    np.testing.assert_array_equal(plain.mask, turned.mask)
+
+
+def test_a_crs_given_in_the_catalog_stands_in(tmp_path):
+    with pytest.warns(UserWarning, match="'crs' was not provided"):
+        path = write(tmp_path / "r.gpkg", [LINE], None, width=[6])
+    with pytest.raises(
+        TaskError, match="r.gpkg carries no CRS; give it one, e.g. ogr2ogr -a_srs EPSG:25832"
+    ) as caught:
+        segment(tile(path), Options())
+    assert caught.value.file == str(path)
+    assert segment(tile(path, crs=GRID.crs), Options()).mask.sum() == 600
+
+
+def test_hygiene_tidies_what_is_asked_for(tmp_path):
+    lines = [LINE, LineString(on_grid((20, 80), (24, 80)))]
+    path = write(tmp_path / "r.gpkg", lines, width=[6, 4])
+    assert segment(tile(path), Options()).mask[:40].any()
+    assert not segment(tile(path), Options(hygiene=Hygiene(drop_m2=20))).mask[:40].any()
+
+
+def test_a_road_beside_the_tile_reaches_in_by_its_half_width(tmp_path):
+    line = LineString(on_grid((0, -10), (100, -10)))
+    path = write(tmp_path / "r.gpkg", [line], width=[24])
+    assert segment(tile(path), Options()).mask.sum() == 200
+
+
+def test_road_in_the_halo_alone_is_none(tmp_path):
+    core = GRID
+    path = write(tmp_path / "r.gpkg", [LineString(on_grid((0, -10), (100, -10)))], width=[6])
+    with pytest.raises(TaskError, match="no road of r.gpkg lies on this tile: .*segment.where") as caught:
+        segment(tile(path, grid=core.buffered(20), core=core), Options())
+    assert caught.value.layer == "roads"
+
+
+def test_several_files_add_up(tmp_path):
+    one = write(tmp_path / "a.gpkg", [LINE], width=[6])
+    other = write(tmp_path / "b.geojson", [box(*on_grid((0, 0))[0], *on_grid((10, 10))[0])])
+    assert segment(tile(one, other), Options()).mask.sum() == 700
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "says"),
+    [
+        (lambda path: None, {}, "cannot be opened .*put it back"),
+        (lambda path: path.write_text("roads"), {}, "cannot be read as vectors"),
+        (lambda path: write(path, [LINE]), {"layer": "ways"}, "has no layer 'ways'; there are r"),
+        (lambda path: write(path, [LINE]), {"where": "kind = 1"}, "cannot be read as roads: .*segment.where"),
+        (lambda path: write(path, [LINE]), {"where": "id = 7"}, "no road of r.gpkg lies on this tile"),
+        (lambda path: write(path, [LINE], "EPSG:3857"), {}, "no road of r.gpkg lies on this tile"),
+        (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(4000)), {}, "cannot be read"),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:GPKG. bad application_id")
+def test_what_is_no_road_is_one_line(tmp_path, make, options, says):
+    path = tmp_path / "r.gpkg"
+    make(path)
+    with pytest.raises(TaskError, match=says) as caught:
+        segment(tile(path), Options(**options))
+    assert "\n" not in str(caught.value)
+    assert caught.value.layer == "roads"
+
+
+def test_a_file_cut_short_costs_its_tile(tmp_path):
+    whole = write(tmp_path / "whole.geojson", [LINE] * 50)
+    path = tmp_path / "r.geojson"
+    path.write_bytes(whole.read_bytes()[:-500])
+    with pytest.raises(TaskError, match="r.geojson cannot be read"):
+        segment(tile(path), Options())
+
+
+def test_no_vectors_says_how_to_get_them():
+    with pytest.raises(TaskError, match="no roads layer in the catalog: give a vector file with --roads"):
+        segment(tile(), Options())
