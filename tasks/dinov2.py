@@ -41,7 +41,8 @@ def normalised(
 
 def missing_extra(error: ImportError) -> TaskError:
     """Return what to say where the extra is not installed."""
-    return TaskError(f'DINOv2 needs {error.name or error}: pip install "flexroad[dinov2]"')
+    package = (error.name or str(error)).split(".")[0]
+    return TaskError(f'DINOv2 needs {package}: pip install "flexroad[dinov2]"')
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +127,8 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
     has_gpu = torch.cuda.is_available()
     if device == "cuda" and not has_gpu:
         raise TaskError("no device 'cuda' on this machine; set segment.device to cpu or auto")
-    if not has_gpu:
+    where = "cuda" if has_gpu and device != "cpu" else "cpu"
+    if where == "cpu":
         # Processes share the cores tile by tile.
         torch.set_num_threads(1)
     folder = _folder(name)
@@ -142,7 +144,6 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         raise TaskError(f"{folder}: weights lack {len(found['missing_keys'])} arrays; {_how(name)}")
     if model.config.patch_size != PATCH:
         raise TaskError(f"{folder}: patches of {model.config.patch_size} pixels, not {PATCH}; {_how(name)}")
-    where = "cuda" if has_gpu and device != "cpu" else "cpu"
     identity = _identity(model)
     return Backbone(name, model.eval().requires_grad_(False).to(where), where, half, identity)
 

@@ -16,7 +16,7 @@ from rasterio.enums import Resampling
 from rasterio.warp import reproject
 
 from catalog.grid import Grid
-from tasks import options
+from tasks import options, registration
 from tasks.acquire.types import Photo
 from tasks.dinov2 import PATCH, Backbone, Device, load_backbone, normalised
 from tasks.dinov2_head import Head, check, predictor, read_head
@@ -77,7 +77,8 @@ def segment(data: TileData, options: Options) -> RoadMask:
     Raises
     ------
     TaskError
-        If the tile has no orthophoto; if head or backbone are missing, damaged or do not belong together.
+        If the tile has no orthophoto, or no cell is road; if head or backbone are missing, damaged or do
+        not belong together.
     """
     if data.dop is None:
         raise TaskError(
@@ -90,14 +91,21 @@ def segment(data: TileData, options: Options) -> RoadMask:
     check(head, backbone)
     photo, probability = _seen(data, head, backbone, options)
     row, col = photo.grid.cells(*_centres(data.grid))
-    mask = probability[row, col] >= (options.threshold or head.about.threshold)
+    threshold = options.threshold or head.about.threshold
+    mask = clean(probability[row, col] >= threshold, data, options.hygiene)
+    if not mask[data.grid.window(data.core)].any():
+        raise TaskError(
+            f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
+            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on tiles like it",
+            layer="dop",
+        )
     return RoadMask(
         grid=data.grid,
         core=data.core,
-        mask=clean(mask, data, options.hygiene),
+        mask=mask,
         outside=outside(data),
         probability=_mean(probability, photo.grid, data.grid),
-        notes=_notes(photo.known[row, col]),
+        notes=_notes(photo.known[row, col], registration.note(data, photo)),
     )
 
 
@@ -134,6 +142,7 @@ def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray
     return np.clip(cells, 0, 1)
 
 
-def _notes(known: Bools) -> tuple[str, ...]:
+def _notes(known: Bools, shifted: str | None) -> tuple[str, ...]:
     share = np.count_nonzero(~known) / known.size
-    return (f"{share:.1%} of the cells have no orthophoto and count as no road",) if share else ()
+    dark = f"dop: {share:.1%} of the cells have no orthophoto and count as no road" if share else None
+    return tuple(note for note in (dark, shifted) if note)

@@ -1,0 +1,74 @@
+"""`segment: {method: dinov2}` in a run: one line of the config, and a tile without a photo fails alone."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from catalog import Catalog
+from catalog.sources import prepared
+from pipeline.config import load_config
+from pipeline.execute import SerialExecutor
+from pipeline.run import Run, execute
+from pipeline.synthesis import write_scenes
+from pipeline.tables import read_metrics
+from tasks import load
+from tasks.dinov2_head import Head, read_head
+from tasks.training import dinov2 as training
+from tasks.training.types import Sample
+from tests.conftest import QUICK
+from tests.make_backbone import save_backbone
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A catalog of two tiles, the first without its photo; a backbone; a head trained on the second tile."""
+    write_scenes(tmp_path / "scenes", 2, seed=3, size_m=60, dop=True)
+    first, second = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
+    first.paths(first.layer("dop"))[0].unlink()
+    Catalog(tuple(prepared.index(tmp_path / "scenes"))).write(tmp_path / "scenes" / "catalog.parquet")
+    folder = save_backbone(tmp_path / "backbone", registers=2)
+    data = load.load(second, load.Options())
+    sample = Sample(data, data.reference_road, np.isfinite(data.dsm))
+    options = training.Options(
+        backbone=str(folder), layers=2, gsd_m=0.25, window_px=112, epochs=30, learning_rate=0.03
+    )
+    (tmp_path / "head.safetensors").write_bytes(training.train([sample], [sample], options).model)
+    return tmp_path
+
+
+def done(place, **segment):
+    options = {"method": "dinov2", "model": str(place / "head.safetensors"), **segment}
+    config = place / "config.yaml"
+    config.write_text(yaml.safe_dump({**QUICK, "segment": options}, sort_keys=False))
+    run = Run.create(place / "run", load_config(config), Catalog.read(place / "scenes" / "catalog.parquet"))
+    return {result.tile_id: result for result in execute(run, SerialExecutor())}
+
+
+def test_one_line_of_the_config_chooses_dinov2(place):
+    first, second = done(place, backbone=str(place / "backbone")).values()
+    assert (first.status, second.status) == ("failed", "done")
+    (failure,) = {fault.line for fault in first.failures}
+    assert failure.startswith("segment: TaskError: no orthophoto (layer dop)")
+    rows = read_metrics(place / "run")
+    assert (rows[rows.tile_id == second.tile_id].road_fraction > 0).all()
+    # Nothing changed: nothing is computed. A head with other numbers is another stage result.
+    again = done(place, backbone=str(place / "backbone"))[second.tile_id]
+    assert "segment" not in again.computed
+    head = read_head(place / "head.safetensors")
+    other = Head(head.weight, head.bias - 1, head.about)
+    (place / "head.safetensors").write_bytes(other.encode())
+    anew = done(place, backbone=str(place / "backbone"))[second.tile_id]
+    assert anew.computed["segment"] == 1
+
+
+def test_the_head_names_its_backbone(place):
+    """It need not be given again; what the file says can be read without this program."""
+    from safetensors import safe_open
+
+    with safe_open(place / "head.safetensors", framework="numpy") as file:
+        said = json.loads(file.metadata()["flexroad"])
+    assert said["backbone"] == str(place / "backbone")
+    assert said["registers"] == 2
+    assert [result.status for result in done(place).values()] == ["failed", "done"]
