@@ -331,6 +331,21 @@ def test_the_same_weights_elsewhere_serve(backbones, heads, sample, tmp_path):
     assert files(Options(model=heads[0], backbone="facebook/dinov2-small")) == (heads[0],)
 
 
+def test_a_hub_name_means_what_was_downloaded_under_it(backbones, heads, sample, tmp_path, monkeypatch):
+    """Laid out as `hf download` lays it out."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    home = tmp_path / "models--facebook--dinov2-tiny"
+    snapshot = home / "snapshots" / commit
+    snapshot.mkdir(parents=True)
+    for file in backbones[0].iterdir():
+        (snapshot / file.name).write_bytes(file.read_bytes())
+    (home / "refs").mkdir()
+    (home / "refs" / "main").write_text(commit)
+    named = found(sample.data, heads[0], backbone="facebook/dinov2-tiny")
+    np.testing.assert_array_equal(named.probability, found(sample.data, heads[0]).probability)
+
+
 def test_weights_that_are_not_there_say_how_to_get_them(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
     with pytest.raises(TaskError, match="facebook/dinov2-tiny are not .* `hf download facebook/dinov2-tiny`"):
