@@ -16,7 +16,8 @@ from tasks.acquire import dense, photogrammetry, points
 from tests import make_photos
 
 ASKED = PhotosAsked(
-    sfm=photogrammetry.Options(image_size=640, features=2500, threads=2), stereo=dense.Options(size=480)
+    sfm=photogrammetry.Options(image_size=640, features=1500, threads=2, calibrate="held"),
+    stereo=dense.Options(size=480, partners=3),
 )
 
 
