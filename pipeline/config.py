@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
+import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -278,7 +279,9 @@ def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> A
 
 def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
     # A discriminated union puts the chosen method first in the path; the file has no such level.
-    path = [str(part) for part in fault["loc"] if part not in methods("tasks.fit")]
+    stage = re.split(r"\W", where)[-1]
+    tags = methods(f"tasks.{stage}") if stage in DEFAULTS else ()
+    path = [str(part) for i, part in enumerate(fault["loc"]) if i or part not in tags]
     key = ".".join([where, *path])
     if fault["type"] == "extra_forbidden":
         return f"{key}: unknown key{_hint(path[-1], _keys(model))}"

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from catalog import Catalog, Grid
+from catalog import Catalog, Grid, Tile
+from catalog.roads import opened, with_roads
 from catalog.sources import prepared
 from pipeline.errors import ConfigError
 from pipeline.execute import DaskExecutor, Executor, SerialExecutor
 from pipeline.standin import write_stand_in
 from tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
+from tasks.synthetic.centrelines import CentreLine, centre_lines
 from tasks.synthetic.orthophoto import orthophoto
 
 WORTH_PROCESSES = 12
@@ -82,7 +87,8 @@ def write_scenes(
         wanted = {job.tile_id for job in jobs}
         found = prepared.index(folder)
         # A folder may hold more tiles than were asked for now.
-        Catalog(tuple(tile for tile in found if tile.id in wanted)).write(path)
+        kept = [tile for tile in found if tile.id in wanted]
+        Catalog(_with_roads(folder / "roads.gpkg", jobs, kept)).write(path)
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
     return path
@@ -113,6 +119,48 @@ def _write_scene(job: SceneJob) -> str:
     layers = {**scene.layers, **({"dop": orthophoto(*asked)} if job.dop else {})}
     prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, job.name)
     return ""
+
+
+def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
+    """Write the centre lines of all scenes into one file; return the tiles that name it."""
+    path.unlink(missing_ok=True)
+    # Neighbours of one world share their streets: by their places each line is written once.
+    lines = {
+        line.points.tobytes(): line
+        for job in jobs
+        for line in centre_lines(job.grid, job.seed, job.stratum, job.options)
+    }
+    if not lines:
+        return tuple(tiles)
+    _write_lines(path, list(lines.values()), jobs[0].grid.crs)
+    return with_roads(tiles, [opened(path, None)], None)
+
+
+def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
+    import geopandas
+    import shapely
+
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.gpkg")
+    columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}
+    shapes = [shapely.LineString(line.points) for line in lines]
+    try:
+        with _dated():
+            geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs).to_file(temporary, layer="roads")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _dated() -> Iterator[None]:
+    """Let GDAL write the made worlds' date instead of now."""
+    import pyogrio
+
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{MADE:%Y-%m-%dT%H:%M:%SZ}"})
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 def _lost(job: SceneJob, why: str) -> str:

@@ -92,7 +92,7 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
         raise TaskError(f"a seed is 0 or more, not {seed}")
     if stratum is not None:
         named(stratum)
-    plan = _plan(seed, stratum, options)
+    plan = plan_of(seed, stratum, options)
     # The terrain model is smoothed; the margin keeps the tile's border from showing.
     wide = grid.buffered(4 * DTM_BLUR_M)
     canvas, inner = Canvas.of(wide, plan), wide.window(grid)
@@ -117,7 +117,8 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     )
 
 
-def _plan(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
+def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
+    """Return the street plan of a world."""
     return Plan(
         seed,
         options.block_m,

@@ -52,6 +52,7 @@ def test_extends(tmp_path):
     [
         ({"ecrsc": {}}, "x: ecrsc: unknown key; did you mean ecsrc?"),
         ({"ecsrc": {"theta_z": 0.5}}, "x: ecsrc.theta_z: unknown key; did you mean theta_z_m?"),
+        ({"segment": {"method": "vector", "wher": ""}}, "x: segment.wher: unknown key; did you mean where?"),
         ({"fit": {"degre": 2}}, "x: fit.degre: unknown key; did you mean degree?"),
         ({"ecsrc": {"theta_z_m": -1}}, "x: ecsrc.theta_z_m: input should be greater than"),
         ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),

@@ -9,6 +9,8 @@ from catalog import Catalog
 from catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
 from pipeline.errors import ConfigError
 from pipeline.synthesis import write_scenes
+from tasks.load import Options, load
+from tasks.segment import vector
 from tasks.synthetic import make_scene
 from tasks.synthetic.dsc3d import survey as survey_of_scenes
 from tasks.synthetic.gerod import survey
@@ -35,6 +37,17 @@ def test_the_preset_s_files_hold_its_scenes(benchmark):
     for name, layer in scene.layers.items():
         with rasterio.open(benchmark.parent / name / f"{tile_id}.tif") as file:
             assert np.array_equal(file.read(1), layer.astype(file.dtypes[0]))
+
+
+def test_the_made_roads_are_a_layer_and_the_same_each_time(benchmark, tmp_path):
+    for tile in Catalog.read(benchmark).tiles:
+        data = load(tile, Options())
+        road = vector.segment(data, vector.Options()).mask
+        both, either = (road & data.reference_road).sum(), (road | data.reference_road).sum()
+        assert both / either > 0.95
+    again = write_scenes(tmp_path, 5, seed=2, preset="gerod")
+    roads = "roads.gpkg"
+    assert (again.parent / roads).read_bytes() == (benchmark.parent / roads).read_bytes()
 
 
 def test_what_a_preset_cannot_do_is_refused(tmp_path):

@@ -1,0 +1,27 @@
+import numpy as np
+import pytest
+import shapely
+
+from catalog import Grid
+from tasks.road_vectors import cells
+from tasks.synthetic import SceneOptions, make_scene
+from tasks.synthetic.centrelines import centre_lines
+
+GRID = Grid("EPSG:25832", 295500, 5629500, 1.0, 200, 200)
+
+
+@pytest.mark.parametrize(
+    ("stratum", "options"),
+    [
+        (None, SceneOptions()),
+        ("urban", SceneOptions(medians=1.0, roundabouts=1.0)),
+        ("rural", SceneOptions(sunken_share=1.0, stream_share=0.0)),
+    ],
+)
+def test_lines_as_wide_as_told_are_the_true_roads(stratum, options):
+    lines = centre_lines(GRID, 3, stratum, options)
+    half = np.array([line.width_m for line in lines]) / 2
+    road = cells(shapely.buffer([shapely.LineString(line.points) for line in lines], half), GRID)
+    truth = make_scene(GRID, 3, stratum, options).reference_road
+    # Noses of medians and islands that streets run into are not told.
+    assert (road & truth).sum() / (road | truth).sum() > 0.93
