@@ -4,10 +4,12 @@ from shapely import LineString, box
 
 from tasks import TaskError
 from tasks.hygiene import Hygiene
-from tasks.segment.vector import Options, segment
+from tasks.segment.vector import VERSION, Options, segment
 from tests.make_roads import GRID, on_grid, tile, write
 
 LINE = LineString(on_grid((0, 50), (100, 50)))
+GOLDEN = (1, 2045, 106474, 109174, 672)
+"""Version, cells of the mask, sums of their rows and columns, cells on bridges."""
 
 
 def test_mask_bridges_and_survey(tmp_path):
@@ -103,3 +105,24 @@ def test_a_file_cut_short_costs_its_tile(tmp_path):
 def test_no_vectors_says_how_to_get_them():
     with pytest.raises(TaskError, match="no roads layer in the catalog: give a vector file with --roads"):
         segment(tile(), Options())
+
+
+def test_golden(tmp_path):
+    """Whoever changes the mask on purpose counts VERSION up, and so makes stored masks anew."""
+    lines = [
+        LineString(on_grid((5, 12), (48, 50.3), (95, 71))),
+        LineString(on_grid((48, 50.3), (20, 95))),
+        LineString(on_grid((60, 5), (64, 95))),
+        LineString(on_grid((2, 70), (98, 40))),
+        box(*on_grid((70, 10))[0], *on_grid((91.2, 22.7))[0]),
+    ]
+    told = {
+        "highway": ["secondary", "service", "residential", "cycleway", "pedestrian_zone"],
+        "width": ["7,5", None, "24'6\"", None, None],
+        "lanes": [None, "2", None, None, None],
+        "bridge": [None, None, "yes", None, None],
+    }
+    road = segment(tile(write(tmp_path / "r.gpkg", lines, **told)), Options())
+    rows, cols = np.nonzero(road.mask)
+    sums = int(rows.sum()), int(cols.sum())
+    assert (VERSION, len(rows), *sums, int(road.bridge.sum())) == GOLDEN
