@@ -17,7 +17,7 @@ from pipeline.prepare.blocks import fill, sheet_grid
 from pipeline.prepare.roads import add_roads
 from pipeline.prepare.sheet import Published, Sheet
 from pipeline.prepare.spool import Spooled, edge_m, scratch, spool
-from tasks.acquire.points import Options, reach_m
+from tasks.acquire.points import Options, facts, reach_m
 
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01
@@ -81,8 +81,8 @@ def prepare_points(
             raise CatalogError(_astray(clouds))
         black = [cloud.path.name for cloud, seen in zip(clouds, spooled.colours, strict=True) if not seen]
         notes = (*frame.notes, *notes, *dense, *_left_out(spooled, black))
-        facts = _facts(clouds, frame, spooled, options)
-        with Sheet(out, grid, None if black else asked.dop_cell_m, facts) as sheet:
+        tags = _tags(clouds, frame, spooled, options)
+        with Sheet(out, grid, None if black else asked.dop_cell_m, tags) as sheet:
             fill(sheet, spooled, options, executor, say)
             add_roads(sheet, asked)
             dataset = asked.dataset or _name(files)
@@ -166,14 +166,8 @@ def _astray(clouds: Sequence[Cloud]) -> str:
     )
 
 
-def _facts(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Options) -> dict[str, str]:
+def _tags(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Options) -> dict[str, str]:
     """Return the tags that tell how the rasters were made."""
-    filling = f"filled up to {options.void_m:g} m"
-    surface = f"linear (TIN), {filling}" if options.dtm == "tin" else f"mean per cell, {filling}"
-    found = {
-        "classes": f"points of {_classes(options.ground_classes)}",
-        "filter": f"slope filter (Vosselman 2000): {options.filter!r}",
-    }[options.ground]
     return {
         "SOURCE": some([cloud.path.name for cloud in clouds]),
         "SOURCE_CREATED": some(sorted({str(cloud.created) for cloud in clouds if cloud.created}))
@@ -181,13 +175,7 @@ def _facts(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Opt
         "POINTS": str(spooled.points),
         "SOURCE_CRS": short(frame.source),
         "SOURCE_UNITS": f"{frame.plan_m or 'reprojected'} m in plan, {frame.height_m} m in height",
-        "DSM": f"highest point per cell, voids filled up to {options.fill_m:g} m",
-        "DSM_DESPIKED": f"single points {options.despike_m:g} m above their neighbours"
-        if options.despike_m
-        else "no",
-        "DTM": f"{found}; {surface}",
-        "BRIDGES": f"mean of {_classes(options.bridge_classes)} per cell",
-        "DOP": f"colour of the highest point per pixel, voids filled up to {options.dop_fill_m:g} m",
+        **facts(options),
         "LEFT_OUT": "noise (classes 7, 18) and withheld points",
     }
 

@@ -1,1 +1,1 @@
-"""Before there are rasters: DSM, DTM and orthophoto from points, meshes and photographs (the paper's step A)."""
+"""Before there are rasters: the paper's step A, from points, meshes and photographs to DSM, DTM and DOP."""

@@ -111,7 +111,8 @@ def facts(options: Options) -> dict[str, str]:
         ground = f"points of {_classes(options.ground_classes)}"
     else:
         ground = (
-            f"slope-filtered points (radius {options.filter.radius_m:g} m, slope {options.filter.slope:g})"
+            f"slope-filtered points (Vosselman 2000: radius {options.filter.radius_m:g} m, "
+            f"slope {options.filter.slope:g}, tolerance {options.filter.tolerance_m:.2f} m)"
         )
     kind = "TIN of the cells' centroids" if options.dtm == "tin" else "mean per cell"
     return {
