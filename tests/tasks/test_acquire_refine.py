@@ -1,4 +1,4 @@
-"""The paper's DSC3D reference: what ECSRC takes out of terrain and road, and that it leaves the rest alone."""
+"""The paper's DSC3D reference: what ECSRC takes out of terrain and road; the rest it leaves alone."""
 
 import numpy as np
 
