@@ -203,11 +203,10 @@ def _layer(tile: Tile, layer: Layer, checksum: bool) -> list[Any]:
     files: list[list[str | int | None]] = []
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
+            stat = path.stat()
             if checksum:
-                with path.open("rb") as file:
-                    files.append([name, hashlib.file_digest(file, "sha256").hexdigest()])
+                files.append([name, _digest_of(path, stat.st_size, stat.st_mtime_ns)])
             else:
-                stat = path.stat()
                 files.append([name, stat.st_size, stat.st_mtime_ns])
         except OSError:
             # A missing file is `load`'s to report; when it comes back the name changes.
