@@ -258,6 +258,20 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
     _say(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
 
 
+@catalogs.command("check")
+def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+    """Look a catalog over: layers, missing files, and how far the photo lies off the heights."""
+    from catalog import Catalog
+    from pipeline.check import check
+
+    faults = 0
+    for remark in check(Catalog.read(path)):
+        _say(f"warning: {remark.text}" if remark.fault else remark.text)
+        faults += remark.fault
+    if faults:
+        raise typer.Exit(1)
+
+
 # --- run ----------------------------------------------------------------------------------------------
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]

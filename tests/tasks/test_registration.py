@@ -1,0 +1,75 @@
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from catalog import Grid
+from tasks.acquire.types import Photo
+from tasks.registration import note, pair, shift
+from tasks.synthetic import block, make_scene
+from tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
+from tasks.types import TileData
+
+GSD = 0.5
+
+
+@lru_cache
+def scene(seed=3):
+    grid = block(1, 160)[0][1]
+    layers = make_scene(grid, seed, "urban").layers
+    data = TileData("t", grid, grid, layers["dsm"].astype(float), layers["dtm"].astype(float))
+    colour = orthophoto(grid, seed, "urban", gsd=GSD)
+    fine = Grid.covering(grid.crs, grid.bounds, GSD)
+    return data, Photo(fine, colour, np.ones(fine.shape, bool))
+
+
+def moved(photo: Photo, east_m: float, north_m: float) -> Photo:
+    """What a camera saw, laid down elsewhere; unknown where that leaves nothing."""
+    grid = photo.grid
+    col, row = round(east_m / grid.cell), round(-north_m / grid.cell)
+    known = np.roll(photo.known, (row, col), (0, 1))
+    known[: max(row, 0)] = known[grid.height + min(row, 0) :] = False
+    known[:, : max(col, 0)] = known[:, grid.width + min(col, 0) :] = False
+    return Photo(grid, np.roll(photo.colour, (row, col), (1, 2)) * known, known)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize(
+    ("by", "to_m"), [((0.0, 0.0), 0.2), ((2.0, -1.0), 0.2), ((2.0, -1.5), 0.5), ((-3.5, 4.0), 0.5)]
+)
+def test_a_made_shift_is_found_to_half_a_cell_and_so_is_the_sun(seed, by, to_m):
+    data, photo = scene(seed)
+    found = shift([pair(data, moved(photo, *by))])
+    assert (found.east_m, found.north_m) == pytest.approx(by, abs=to_m)
+    assert found.sun == pytest.approx((SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG), abs=5)
+    assert found.confidence > 0.3
+
+
+def test_only_a_shift_is_noted():
+    data, photo = scene()
+    assert note(data, photo) is None
+    assert note(data, moved(photo, 2.0, 0.0)).startswith("dop: seems to lie 2.0 m east")
+
+
+def test_a_photo_that_shows_nothing_tells_nothing():
+    data, photo = scene()
+    blank = replace(photo, colour=np.full_like(photo.colour, 90))
+    assert note(data, blank) is None
+    assert note(data, replace(photo, known=np.zeros_like(photo.known))) is None
+    random = np.random.default_rng(0).integers(0, 255, photo.colour.shape, np.uint8)
+    assert note(data, replace(photo, colour=random)) is None
+
+
+def test_voids_and_a_halo_without_photo_do_not_move_it():
+    data, photo = scene()
+    dsm, known = data.dsm.copy(), photo.known.copy()
+    dsm[60:90, 20:50] = np.nan
+    known[:, :60] = False
+    found = shift([pair(replace(data, dsm=dsm), moved(replace(photo, known=known), 2.0, -1.5))])
+    assert (found.east_m, found.north_m) == pytest.approx((2.0, -1.5), abs=0.5)
+
+
+def test_two_tiles_of_a_flight_agree_with_each():
+    pairs = [pair(*scene(seed)) for seed in (3, 4)]
+    assert shift(pairs).length_m < 0.3
