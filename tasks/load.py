@@ -108,7 +108,7 @@ def load(tile: Tile, options: Options) -> TileData:
 
 def _source(tile: Tile, name: str) -> Source | None:
     layer = tile.layer(name)
-    return layer and Source(name, tile.paths(layer), layer.crs)
+    return Source(name, tile.paths(layer), layer.crs) if layer else None
 
 
 def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:
