@@ -1,8 +1,7 @@
 """Filter the road mask: ECSRC, the paper's step B ("Road and Terrain Point Cloud Extraction", Algorithm 1).
 
 Three parts, as in the algorithm: growth over neighbouring cells (Eq. neighbors), `mergeClusters`,
-`cleanClusters`. A cluster is a tree of a union-find forest whose root is its first cell in row-major
-order, so that labels do not depend on the order of the merges.
+`cleanClusters`. What holds on streets with trees and cars, where this one does not, is `tasks.grounded`.
 """
 
 from __future__ import annotations
@@ -15,12 +14,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from tasks import options as base
-from tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
+from tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
+from tasks.types import Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 1
-
-Roots = NDArray[np.int32]
-"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent, -1 is no road."""
 
 
 class Options(base.Options):
@@ -62,38 +59,13 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     points = road.mask & np.isfinite(data.dsm)
     if options.variant == "off":
         return RoadClusters(data.grid, points.astype(np.int32))
-    cell = data.grid.cell
-    parents = np.where(points, np.arange(points.size, dtype=np.int32).reshape(points.shape), np.int32(-1))
-    roots = parents.ravel()
+    cell, roots = data.grid.cell, plant(points)
     heights = np.ascontiguousarray(data.dsm)
-    _join(heights, roots, _half_disc(1.5), options.theta_z_m)
-    _join(heights, roots, _half_disc(options.theta_xy_m / cell), options.theta_z_m)
-    # A cell's area has rounding errors where its size is no binary fraction: 5000 cells of 0.1 m are 50 m2.
-    least = options.min_area_m2 / cell**2 * (1 - 1e-9)
-    labels = _clean(points, _flatten(roots).reshape(points.shape), least, options.keep_largest)
+    _join(heights, roots, half_disc(1.5), options.theta_z_m)
+    _join(heights, roots, half_disc(options.theta_xy_m / cell), options.theta_z_m)
+    least = least_cells(options.min_area_m2, cell)
+    labels = clean(points, flatten(roots).reshape(points.shape), least, options.keep_largest)
     return RoadClusters(data.grid, labels)
-
-
-def _half_disc(radius: float) -> NDArray[np.int64]:
-    """Return the (row, col) steps of up to ``radius`` cells that go forward in row-major order, ``(n, 2)``.
-
-    A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc are the same pairs of
-    cells seen from their other end. Short steps come first: they leave fewer sets for the long ones.
-    """
-    reach = int(radius + 1e-9)
-    row, col = np.mgrid[0 : reach + 1, -reach : reach + 1].reshape(2, -1)
-    square = row**2 + col**2
-    forward = (square <= radius**2 + 1e-9) & ((row > 0) | (col > 0))
-    steps = np.stack([row, col], axis=1)[forward]
-    return np.ascontiguousarray(steps[np.argsort(square[forward], kind="stable")])
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _root(roots: Roots, i: int) -> int:
-    while roots[i] != i:
-        roots[i] = roots[roots[i]]
-        i = roots[i]
-    return i
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -104,7 +76,7 @@ def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: floa
         if roots[i] < 0:
             continue
         r, c = i // cols, i % cols
-        a = _root(roots, i)
+        a = root(roots, i)
         for k in range(steps.shape[0]):
             row, col = r + steps[k, 0], c + steps[k, 1]
             if row >= rows or col < 0 or col >= cols:
@@ -112,31 +84,6 @@ def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: floa
             j = row * cols + col
             if roots[j] < 0 or roots[j] == a or abs(heights[r, c] - heights[row, col]) > theta_z:
                 continue
-            b = _root(roots, j)
+            b = root(roots, j)
             a, b = min(a, b), max(a, b)
             roots[b] = a
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _flatten(roots: Roots) -> Roots:
-    # A parent comes before its children, so it already points at the root.
-    for i in range(roots.size):
-        if roots[i] >= 0:
-            roots[i] = roots[roots[i]]
-    return roots
-
-
-def _clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArray[np.int32]:
-    """Label the ``keep`` largest of the clusters of at least ``least`` cells (`cleanClusters`).
-
-    Of clusters of equal size the one whose first cell comes first is kept.
-    """
-    # Roots ascend like first cells, so both ranks below break ties by first cell.
-    _, member, sizes = np.unique(roots[points], return_inverse=True, return_counts=True)
-    largest = np.argsort(-sizes, kind="stable")[:keep]
-    kept = np.sort(largest[sizes[largest] >= least])
-    number = np.zeros(len(sizes), np.int32)
-    number[kept] = np.arange(1, len(kept) + 1)
-    labels = np.zeros(points.shape, np.int32)
-    labels[points] = number[member]
-    return labels

@@ -1,0 +1,77 @@
+"""Clusters of cells as a union-find forest.
+
+A cluster is a tree whose root is its first cell in row-major order, so that nothing depends on the order of
+the merges.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tasks.types import Bools
+
+Roots = NDArray[np.int32]
+"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent, -1 is no member."""
+
+
+def plant(members: Bools) -> Roots:
+    """Return a forest in which every member is a cluster of its own."""
+    cells = np.arange(members.size, dtype=np.int32)
+    return np.where(members.ravel(), cells, np.int32(-1))
+
+
+def half_disc(radius: float) -> NDArray[np.int64]:
+    """Return the (row, col) steps of up to ``radius`` cells that go forward in row-major order, ``(n, 2)``.
+
+    A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc are the same pairs of
+    cells seen from their other end. Short steps come first: they leave fewer sets for the long ones.
+    """
+    reach = int(radius + 1e-9)
+    row, col = np.mgrid[0 : reach + 1, -reach : reach + 1].reshape(2, -1)
+    square = row**2 + col**2
+    forward = (square <= radius**2 + 1e-9) & ((row > 0) | (col > 0))
+    steps = np.stack([row, col], axis=1)[forward]
+    return np.ascontiguousarray(steps[np.argsort(square[forward], kind="stable")])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def root(roots: Roots, i: int) -> int:
+    """Return the root of a cell, and shorten the way to it."""
+    while roots[i] != i:
+        roots[i] = roots[roots[i]]
+        i = roots[i]
+    return i
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def flatten(roots: Roots) -> Roots:
+    """Let every member point at its root, in place."""
+    # A parent comes before its children, so it already points at the root.
+    for i in range(roots.size):
+        if roots[i] >= 0:
+            roots[i] = roots[roots[i]]
+    return roots
+
+
+def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArray[np.int32]:
+    """Label the ``keep`` largest of the clusters of at least ``least`` cells (`cleanClusters`).
+
+    Of clusters of equal size the one whose first cell comes first is kept.
+    """
+    # Roots ascend like first cells, so both ranks below break ties by first cell.
+    _, member, sizes = np.unique(roots[points], return_inverse=True, return_counts=True)
+    largest = np.argsort(-sizes, kind="stable")[:keep]
+    kept = np.sort(largest[sizes[largest] >= least])
+    number = np.zeros(len(sizes), np.int32)
+    number[kept] = np.arange(1, len(kept) + 1)
+    labels = np.zeros(points.shape, np.int32)
+    labels[points] = number[member]
+    return labels
+
+
+def least_cells(area_m2: float, cell: float) -> float:
+    """Return how many cells make an area."""
+    # A cell's area has rounding errors where its size is no binary fraction: 5000 cells of 0.1 m are 50 m2.
+    return area_m2 / cell**2 * (1 - 1e-9)
