@@ -15,6 +15,7 @@ import typer
 
 from catalog.errors import CatalogError
 from pipeline.cli_prepare import prepare
+from pipeline.cli_train import train
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
 app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
+app.command("train")(train)
 
 SEVERAL = ("--tile", "--road-value", "--ground-class", "--bridge-class")
 """Options that take several values in a row."""

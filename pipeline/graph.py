@@ -165,14 +165,16 @@ def _node(
         # The first stage takes the tile itself.
         list(inputs) if stage.inputs else asdict(tile.grid),
         [source for source in sources if source[0] in getattr(module, "READS", ())],
-        [_bytes(path) for path in getattr(module, "files", _none)(options)],
+        [_bytes(path) for path in model_files(options)],
     ]
     stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
     return Node(digest(made_of), stage.name, options, inputs, stored)
 
 
-def _none(options: Options) -> tuple[Path, ...]:
-    return ()
+def model_files(options: Options) -> tuple[Path, ...]:
+    """Return the files that only the options name, as their module's `files` tells them."""
+    files: Callable[[Options], tuple[Path, ...]] = getattr(stage_module(options), "files", lambda _: ())
+    return files(options)
 
 
 def _bytes(path: Path) -> str | None:

@@ -31,7 +31,7 @@ from catalog import Catalog
 from pipeline.config import Config, load_config
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
-from pipeline.graph import TileGraph, tile_graph, tile_graphs
+from pipeline.graph import TileGraph, model_files, tile_graph, tile_graphs
 from pipeline.store import TileFolder, check_writable, write_atomic
 from pipeline.tables import write_tables
 from pipeline.warm import warm
@@ -62,8 +62,9 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder or the store cannot be written.
+            If the folder or the store cannot be written, or a model is missing.
         """
+        check_models(config)
         old = _record(path)
         origin = old["origin"] if old else _origin(catalog)
         store = store or (Path(old["store"]) if old and old["shared_store"] else path / "store")
@@ -172,9 +173,12 @@ def execute(
 
     Raises
     ------
+    ConfigError
+        If a model is missing.
     OSError
         If the tables cannot be written, as on a full disk.
     """
+    check_models(run.config)
     start = time.perf_counter()
     results: list[TileResult] = []
 
@@ -207,6 +211,27 @@ def execute(
         write_tables(run.path, *outcome(run, results))
         run.log("end", seconds=round(time.perf_counter() - start, 3))
     return results
+
+
+def check_models(config: Config) -> None:
+    """Refuse a configuration that names a model which is not there, before any tile is tried.
+
+    Raises
+    ------
+    ConfigError
+        If a file that options name is missing; the line says how to get one.
+    """
+    for chain in config.chains.values():
+        for stage, options in chain.items():
+            for path in model_files(options):
+                if path.is_file():
+                    continue
+                chosen = options.model_dump()
+                remedy = "restore it, or name another one"
+                if path == chosen.get("model"):
+                    how = f"--method {chosen['method']} --labels mask -o {path}"
+                    remedy = f"make it with `flexroad train CATALOG {how}`"
+                raise ConfigError(f"{config.name}: {stage}: {path} does not exist; {remedy}")
 
 
 def outcome(run: Run, results: Sequence[TileResult] = ()) -> tuple[list[dict[str, Any]], list[Failure]]:

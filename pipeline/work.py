@@ -170,7 +170,7 @@ def do_tile(job: Job) -> TileResult:
             rows.append(failed_row(graph, variant, error.failure.line))
             failures.append(error.failure)
     failures = list(dict.fromkeys(failures))
-    notes = next((pull.results[fp].notes for fp, node in graph.nodes.items() if _read(node, pull)), ())
+    notes = tuple(dict.fromkeys(note for fp, node in graph.nodes.items() for note in _noted(fp, node, pull)))
     if not failures:
         try:
             _finish(job, folder, pull, rows, notes)
@@ -239,8 +239,12 @@ def _head(graph: TileGraph, variant: str, status: Status) -> Row:
     }
 
 
-def _read(node: Node, pull: Pull) -> bool:
-    return node.stage == "load" and node.fingerprint in pull.results
+def _noted(fingerprint: str, node: Node, pull: Pull) -> tuple[str, ...]:
+    """Return what a stage that reads sources had to say of them, as far as it was asked."""
+    if node.stage not in ("load", "segment") or fingerprint not in pull.results:
+        return ()
+    notes: tuple[str, ...] = pull.results[fingerprint].notes
+    return notes
 
 
 def _finish(job: Job, folder: TileFolder, pull: Pull, rows: list[Row], notes: tuple[str, ...]) -> None:

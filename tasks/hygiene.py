@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options
+from tasks import options, road_vectors
 from tasks.errors import TaskError
 from tasks.survey import outside
 from tasks.types import Bools, TileData
@@ -132,10 +132,7 @@ def _second(data: TileData, options: Hygiene) -> Bools:
     if options.fuse_with == "road_mask" and data.road_mask is not None:
         return data.road_mask
     if options.fuse_with == "roads" and data.roads is not None:
-        from tasks import road_vectors
-
-        burnt: Bools = road_vectors.burn(data)
-        return burnt
+        return road_vectors.burn(data)
     raise TaskError(
         f"hygiene.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
         f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set hygiene.fuse: none",

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from PIL import Image
@@ -41,6 +42,8 @@ RELIEF = LinearSegmentedColormap.from_list(
     "relief", ["#8fae9a", "#b9c7a0", "#e6dcb4", "#d9bd90", "#c4a183", "#e9e2da"]
 )
 ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
+TRUE = "#00d5ff"
+"""Outline of what should have been found: stands out on grass, asphalt and roofs."""
 OVERLAY = 0.72
 """Opacity of a mask over the relief."""
 UNKNOWN = "#f2f2f2"
@@ -150,18 +153,87 @@ def error_map(
     """
     limit = limit_m if limit_m is not None else _round_limit(error)
     figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
-    if road is not None and road.any() and not road.all():
-        axes.contour(
-            grid.eastings - grid.west,
-            grid.northings - grid.south,
-            road,
-            levels=[0.5],
-            colors="#222222",
-            linewidths=0.6,
-        )
+    if road is not None:
+        _outline(axes, road, grid, "#222222", 0.6)
     beyond = bool(np.nanmax(np.abs(error), initial=0.0) > limit)
     label = "too low  ←  error (m)  →  too high"
     _colour_bar(figure, axes, "RdBu_r", Normalize(-limit, limit), label, "both" if beyond else "neither")
+    return _png(figure)
+
+
+def found_map(
+    ground: Floats | NDArray[np.uint8], truth: Bools, found: Bools, grid: Grid, title: str = ""
+) -> bytes:
+    """Draw the outlines of true and found road over a photo, or over a shaded relief.
+
+    Parameters
+    ----------
+    ground : ndarray
+        A photo of the grid's ground, red, green and blue, ``(3, h, w)``; or heights (m), ``(H, W)``.
+    truth, found : Bools
+        Road by the labels and by the segmenter, ``(H, W)``.
+    grid : Grid
+        Where the cells lie.
+    title : str
+        What is drawn, above the map.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide.
+    """
+    if ground.ndim == 3:
+        rgb = np.moveaxis(ground, 0, -1) / 255
+    else:
+        paper = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*grid.shape, 3))
+        rgb = _shaded(paper, np.asarray(ground, np.float64), grid.cell)
+    figure, axes = _map(rgb, grid, title)
+    # The wider line below shows on both sides of the other where they agree.
+    parts = (("labels", truth, TRUE, 2.4), ("found", found, DROPPED, 0.9))
+    for _, mask, colour, width in parts:
+        _outline(axes, mask, grid, colour, width)
+    legend = _beside(figure, axes, WIDTH_PX - LEFT_PX - MAP_PX - GAP_PX)
+    legend.set_axis_off()
+    handles = [Line2D([], [], color=colour, lw=width, label=name) for name, _, colour, width in parts]
+    legend.legend(handles=handles, loc="upper left", frameon=False, fontsize=8, handlelength=1.2)
+    return _png(figure)
+
+
+def curves(
+    lines: Mapping[str, tuple[Floats, Floats]],
+    labels: tuple[str, str],
+    limits: tuple[tuple[float, float] | None, tuple[float, float] | None] = (None, None),
+    mark: tuple[float, float, str] | None = None,
+) -> bytes:
+    """Draw named lines over one another, ``(n,)`` and ``(n,)`` each.
+
+    Parameters
+    ----------
+    lines : Mapping of str to pair of Floats
+        Where each goes, by name.
+    labels : tuple of str
+        Of both axes.
+    limits : tuple, optional
+        Of both axes.
+    mark : tuple, optional
+        A point on them, and what it is.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide.
+    """
+    figure = Figure(figsize=(WIDTH_PX / DPI, 3.4), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    for (name, (x, y)), colour in zip(lines.items(), (KEPT, DROPPED, ROAD), strict=False):
+        axes.plot(x, y, color=colour, lw=1.6, label=name)
+    if mark is not None:
+        axes.plot(*mark[:2], "o", color=DROPPED, ms=6, label=mark[2])
+    axes.set(xlabel=labels[0], ylabel=labels[1], xlim=limits[0], ylim=limits[1])
+    axes.grid(color="#e4e2dd", lw=0.6)
+    axes.tick_params(labelsize=8, length=2)
+    axes.legend(fontsize=8, frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
     return _png(figure)
 
 
@@ -281,6 +353,13 @@ def _map(
     axes.tick_params(labelsize=7, length=2)
     axes.set_title(title, fontsize=9)
     return figure, axes
+
+
+def _outline(axes: Axes, mask: Bools, grid: Grid, colour: str, width: float) -> None:
+    """Draw the border of a mask onto a map."""
+    if mask.any() and not mask.all():
+        east, north = grid.eastings - grid.west, grid.northings - grid.south
+        axes.contour(east, north, mask, levels=[0.5], colors=colour, linewidths=width)
 
 
 def _beside(figure: Figure, axes: Axes, width_px: float) -> Axes:
