@@ -15,7 +15,7 @@ import numpy as np
 
 from catalog import Grid
 from pipeline.config import methods
-from tasks.types import Mesh, Metrics, RoadClusters, RoadMask
+from tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
 HEADER = "header.json"
 
@@ -60,7 +60,7 @@ def _plain(item: Any) -> Any:
 
 
 def _types() -> dict[str, type]:
-    known: dict[str, type] = {kind.__name__: kind for kind in (Mesh, Metrics, RoadClusters, RoadMask)}
+    known: dict[str, type] = {kind.__name__: kind for kind in (Mesh, Metrics, Quality, RoadClusters, RoadMask)}
     for module in methods("tasks.fit").values():
         known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
     return known

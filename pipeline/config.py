@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from pipeline.errors import ConfigError
-from tasks import ecsrc, evaluate, load, sample
+from tasks import assess, ecsrc, evaluate, load, sample
 from tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method"}
@@ -88,6 +88,7 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
         "fit": one_of("tasks.fit"),
         "sample": TypeAdapter(sample.Options),
         "evaluate": TypeAdapter(evaluate.Options),
+        "assess": TypeAdapter(assess.Options),
     }
 
 

@@ -4,6 +4,8 @@ Read `STAGES` and then the files it names, in that order, and you have read the 
 
     Tile -> load -> segment -> ecsrc -> fit -> sample -> evaluate -> row
 
+Beside them, `assess` says without ground truth how far the fitted surface can be trusted: not the paper's.
+
 A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``. A source layer counts
 by (path relative to the catalog, size, mtime), or by its bytes, for the stages whose module names it in
 `READS`; a file that only the options name (a model), told by the module's `files`, counts by its bytes.
@@ -44,6 +46,7 @@ STAGES = (
     Stage("fit", ("load", "ecsrc")),
     Stage("sample", ("fit", "segment", "ecsrc")),
     Stage("evaluate", ("sample", "load", "segment")),
+    Stage("assess", ("load", "segment", "ecsrc", "fit")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
@@ -145,7 +148,7 @@ def tile_graph(
 
 
 def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
-    return [[variant, made["evaluate"]] for variant, made in variants.items()]
+    return [[variant, made["evaluate"], made["assess"]] for variant, made in variants.items()]
 
 
 def _node(

@@ -9,6 +9,7 @@ from pipeline.graph import TileGraph
 from pipeline.store import plain_name
 from tasks.export import cog, glb, npz, ply
 from tasks.nurbs import NurbsSurface
+from tasks.support import of_faces
 
 Product = tuple[bytes, str]
 """Bytes and media type."""
@@ -44,7 +45,9 @@ def _glb(
 def _ply(
     graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
 ) -> dict[str, Product]:
-    return {ply.NAME: (ply.encode(pull(made["sample"])), ply.MEDIA_TYPE)}
+    mesh = pull(made["sample"])
+    support = of_faces(pull(made["assess"]).support, pull(made["segment"]), mesh)
+    return {ply.NAME: (ply.encode(mesh, support), ply.MEDIA_TYPE)}
 
 
 def _cog(
@@ -58,6 +61,7 @@ def _cog(
     return {
         cog.NAME_HEIGHT: (cog.encode_height(heights, core), cog.MEDIA_TYPE),
         cog.NAME_ROAD: (cog.encode_mask(kept, core), cog.MEDIA_TYPE),
+        cog.NAME_SUPPORT: (cog.encode_support(pull(made["assess"]).support, core), cog.MEDIA_TYPE),
     }
 
 

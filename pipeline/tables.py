@@ -35,6 +35,20 @@ COLUMNS: dict[str, str] = {
     "error": "str",
     "nearest_road_m": "float64",
     "nearest_terrain_m": "float64",
+    "residual_median_m": "float64",
+    "residual_nmad_m": "float64",
+    "residual_p95_m": "float64",
+    "curvature_per_m": "float64",
+    "edge_step_m": "float64",
+    "measured_road": "float64",
+    "dtm_road": "float64",
+    "inferred_road": "float64",
+    "dropped_road": "float64",
+    "off_dtm_m": "float64",
+    "off_dtm_road": "float64",
+    "bounded_weights": "float64",
+    "doubt_m": "float64",
+    "flags": "str",
 }
 """Columns of metrics.parquet and their types; the fixed ones first."""
 
@@ -67,6 +81,7 @@ def read_metrics(run: Path) -> pd.DataFrame:
     if not path.exists():
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
-        return pd.read_parquet(path)
+        # Runs of earlier days lack the later columns.
+        return pd.read_parquet(path).reindex(columns=list(COLUMNS))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error

@@ -24,9 +24,11 @@ from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_module
 from pipeline.products import products
 from pipeline.store import Store, TileFolder, file_entry, no_nan
 from tasks.errors import TaskError
-from tasks.types import Metrics
+from tasks.types import Metrics, Quality
 
 Row = dict[str, Any]
+QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
+"""Figures of a row that need no ground truth."""
 Status = Literal["done", "failed", "cached"]
 
 
@@ -213,19 +215,19 @@ def failed_row(graph: TileGraph, variant: str, error: str) -> Row:
     """Return the row of a variant without figures."""
     return (
         _head(graph, variant, "failed")
-        | dict.fromkeys(Metrics.__annotations__)
-        | {
-            "seconds": None,
-            "error": error,
-        }
+        | dict.fromkeys((*Metrics.__annotations__, *QUALITY))
+        | {"seconds": None, "error": error, "flags": ""}
     )
 
 
 def _row(graph: TileGraph, variant: str, pull: Pull) -> Row:
     evaluated = graph.variants[variant]["evaluate"]
-    metrics = asdict(pull(evaluated))
+    figures = asdict(pull(evaluated))
+    quality: Quality = pull(graph.variants[variant]["assess"])
+    figures |= {name: getattr(quality, name) for name in QUALITY}
     seconds = sum(pull.chain_seconds[evaluated].values())
-    return no_nan(_head(graph, variant, "done") | metrics | {"seconds": seconds, "error": ""})
+    told = {"seconds": seconds, "error": "", "flags": ", ".join(quality.flags)}
+    return no_nan(_head(graph, variant, "done") | figures | told)
 
 
 def _head(graph: TileGraph, variant: str, status: Status) -> Row:

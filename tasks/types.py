@@ -80,6 +80,8 @@ class RoadClusters:
     grid: Grid
     labels: NDArray[np.int32]
     """``(H, W)``; 0 is no road, clusters count from 1 in the order of their first cell."""
+    unsound: Bools | None = None
+    """Road cells, none of them kept, where the DTM is not sound either, ``(H, W)``; None: nobody asked."""
 
     @property
     def mask(self) -> Bools:
@@ -150,3 +152,42 @@ class Metrics:
     """Share of the core's reference cells that are road by the evaluation mask."""
     completeness: float
     """Share of the core's reference cells the mesh has a height for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """What a surface tells of itself on the core's road cells by the raw mask; nothing here is ground truth.
+
+    Lengths in metres, shares of the road from 0 to 1. NaN where there is nothing to measure.
+    """
+
+    residual_median_m: float
+    """Surface minus DSM at the kept road points: a shift."""
+    residual_nmad_m: float
+    """Spread of the same."""
+    residual_p95_m: float
+    """95th percentile of its absolute value: points the surface does not follow."""
+    curvature_per_m: float
+    """Largest second difference of the surface, per squared cell size (1/m)."""
+    edge_step_m: float
+    """95th percentile of the surface's step where the road ends, against the line of the last two cells."""
+    measured_road: float
+    """Share of the road where the scan saw the ground."""
+    dtm_road: float
+    """Share where the DTM stands in."""
+    inferred_road: float
+    """Share where neither supports the surface."""
+    dropped_road: float
+    """Share of the mask that the filter dropped."""
+    off_dtm_m: float
+    """Median of surface minus DTM."""
+    off_dtm_road: float
+    """Share of the road, where there is a DTM, that is farther from it than two heights of one ground."""
+    bounded_weights: float
+    """Share of the weights at a bound; NaN unless the surface is a NURBS."""
+    doubt_m: float
+    """Mean distance of the surface to the nearer witness, scan or DTM: what its error may be."""
+    flags: tuple[str, ...]
+    """What stands out, by `tasks.assess.FLAGS`."""
+    support: NDArray[np.uint8]
+    """The core's cells by `tasks.support.Support`, ``(H, W)``."""

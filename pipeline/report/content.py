@@ -8,6 +8,7 @@ import pandas as pd
 import yaml
 
 from pipeline.report.steps import edge_steps
+from pipeline.report.trust import most_doubtful, over_tiles
 from pipeline.run import Run, summary
 from pipeline.tables import read_metrics
 
@@ -48,6 +49,10 @@ class Content:
     """The main table per stratum; empty where the catalog names none."""
     worst: pd.DataFrame
     """Tiles with the highest road L2 of the exported variant."""
+    trust: pd.DataFrame
+    """What the surfaces tell of themselves, mean over tiles; empty for runs that did not ask them."""
+    doubtful: pd.DataFrame
+    """Tiles of the exported variant to look at first; needs no ground truth."""
     steps: pd.DataFrame
     """Height steps between neighbouring tiles."""
     failures: pd.DataFrame
@@ -83,6 +88,8 @@ def gather(run: Run) -> Content:
         beside=_over_tiles(done, variants, BESIDE, "mean"),
         strata=_per_stratum(done, variants),
         worst=_worst(done, shown),
+        trust=over_tiles(done, variants),
+        doubtful=most_doubtful(done, shown, WORST),
         steps=edge_steps(run),
         failures=failures,
         versions=run.versions,

@@ -13,6 +13,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
+from pipeline.report import trust
 from pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
@@ -32,8 +33,8 @@ class TilePictures:
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     parts = [f"# {content.title}", content.state + ".", content.reference]
-    for title, table in _sections(content):
-        parts += [f"## {title}", markdown(table)]
+    for title, table, line in _sections(content):
+        parts += [f"## {title}", *([line] if line else []), markdown(table)]
     versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
     parts += ["## Configuration", f"```yaml\n{content.config}```", f"Versions: {versions}."]
     return "\n\n".join(parts) + "\n"
@@ -46,7 +47,7 @@ def csv_page(content: Content) -> str:
 
 def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
     """Return one self-contained page."""
-    sections = [(title, table, "") for title, table in _sections(content)]
+    sections = list(_sections(content))
     return template("page.html.j2").render(
         title=content.title, content=content, sections=sections, tiles=tiles
     )
@@ -61,18 +62,20 @@ def template(name: str) -> jinja2.Template:
     return environment.get_template(name)
 
 
-def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame]]:
-    """Yield the tables that have something to say."""
+def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
+    """Yield title and table, and how to read it, of the tables that have something to say."""
     named = (
-        ("Mean over tiles", content.main),
-        ("Median over tiles", content.median),
-        ("Further figures, mean over tiles", content.beside),
-        ("Per stratum, mean over tiles", content.strata),
-        ("Worst tiles by road L2", content.worst),
-        ("Height steps between neighbouring tiles", content.steps.head(10)),
-        ("Failures", content.failures),
+        ("Mean over tiles", content.main, ""),
+        ("Median over tiles", content.median, ""),
+        ("Further figures, mean over tiles", content.beside, ""),
+        ("Per stratum, mean over tiles", content.strata, ""),
+        ("Worst tiles by road L2", content.worst, ""),
+        ("Worst tiles by doubt, without ground truth", content.doubtful, trust.MEANING),
+        ("What the surfaces tell of themselves, mean over tiles", content.trust, ""),
+        ("Height steps between neighbouring tiles", content.steps.head(10), ""),
+        ("Failures", content.failures, ""),
     )
-    return ((title, table) for title, table in named if len(table))
+    return (section for section in named if len(section[1]))
 
 
 def are_numbers(table: pd.DataFrame) -> list[bool]:

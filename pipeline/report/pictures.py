@@ -5,12 +5,12 @@ from __future__ import annotations
 from pipeline.graph import TileGraph
 from pipeline.report.content import Content
 from pipeline.report.pages import TilePictures
-from pipeline.report.render import error_map, filter_picture, hillshade, render_meshes
+from pipeline.report.render import error_map, filter_picture, hillshade, render_meshes, support_picture
 from pipeline.run import Run
 from pipeline.store import Store
 from pipeline.work import Pull, StageError
 from tasks.drape import drape
-from tasks.types import Mesh, RoadClusters, RoadMask, TileData
+from tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 MOST = 24
 """Tiles shown; of larger runs the worst."""
@@ -40,7 +40,7 @@ def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
 def _shown(content: Content) -> list[str]:
     if len(content.tiles) <= MOST:
         return list(content.tiles)
-    return list(content.worst["tile"])
+    return list(dict.fromkeys([*content.worst["tile"], *content.doubtful["tile"]]))
 
 
 def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
@@ -49,6 +49,7 @@ def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
     road: RoadMask = pull(made["segment"])
     clusters: RoadClusters = pull(made["ecsrc"])
     mesh: Mesh = pull(made["sample"])
+    quality: Quality = pull(made["assess"])
     core, window = data.core, data.grid.window(data.core)
     dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
     truth = (data.dtm if data.reference is None else data.reference)[window]
@@ -58,13 +59,18 @@ def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
         (
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
+            ("What the surface rests on", support_picture(dsm, quality.support, raw, core)),
             (
                 f"{variant} minus {against}",
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
             ),
         ),
-        data.notes,
+        (*_flagged(quality), *data.notes),
     )
+
+
+def _flagged(quality: Quality) -> tuple[str, ...]:
+    return (f"Flags: {', '.join(quality.flags)}.",) if quality.flags else ()
 
 
 def _with_view(found: TilePictures, view: bytes | None) -> TilePictures:

@@ -12,7 +12,7 @@ import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from PIL import Image
 
 from catalog import Grid
 from catalog.grid import Bounds
+from tasks.support import Support
 from tasks.types import Bools, Floats, Mesh
 
 log = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ RELIEF = LinearSegmentedColormap.from_list(
     "relief", ["#8fae9a", "#b9c7a0", "#e6dcb4", "#d9bd90", "#c4a183", "#e9e2da"]
 )
 ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
+BY_DTM = "#8a5fbf"
 TRUE = "#00d5ff"
 """Outline of what should have been found: stands out on grass, asphalt and roofs."""
 OVERLAY = 0.72
@@ -103,9 +105,42 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: s
     bytes
         A PNG, 480 pixels wide; the legend gives both areas.
     """
+    return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid, title)
+
+
+def support_picture(
+    height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid, title: str = ""
+) -> bytes:
+    """Draw what the surface rests on along the road, over the relief.
+
+    Parameters
+    ----------
+    height : Floats
+        The DSM (m), ``(H, W)``.
+    support : ndarray
+        The cells by `tasks.support.Support`, ``(H, W)``.
+    road : Bools
+        Road before the filter, ``(H, W)``.
+    grid : Grid
+        Where the cells lie.
+    title : str
+        What is drawn, above the map.
+
+    Returns
+    -------
+    bytes
+        A PNG, 480 pixels wide; the legend gives the areas.
+    """
+    kinds = (Support.MEASURED, KEPT), (Support.DTM, BY_DTM), (Support.INFERRED, DROPPED)
+    names = {Support.MEASURED: "measured", Support.DTM: "DTM", Support.INFERRED: "inferred"}
+    parts = [(names[kind], road & (support == kind), colour) for kind, colour in kinds]
+    return _parts_picture(height, parts, grid, title)
+
+
+def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid: Grid, title: str) -> bytes:
+    """Draw named areas in their colours over a grey relief, with a legend."""
     paper = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
     rgb = _shaded(paper, height, grid.cell)
-    parts = (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED))
     for _, mask, colour in parts:
         rgb = _laid_over(rgb, mask, colour, OVERLAY)
     figure, axes = _map(rgb, grid, title)

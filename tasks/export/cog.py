@@ -1,4 +1,4 @@
-"""Heights and road mask of a tile as cloud-optimised GeoTIFF: the paper's R^S and road mask for any GIS."""
+"""Heights, road mask and support of a tile as cloud-optimised GeoTIFF: the paper's R^S for any GIS."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from catalog.grid import Grid
 from tasks.errors import TaskError
 from tasks.types import Bools, Floats
 
-VERSION = 1
+VERSION = 2
 NAME_HEIGHT = "_height.tif"
 NAME_ROAD = "_road.tif"
+NAME_SUPPORT = "_support.tif"
 MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
 
 
@@ -46,6 +47,17 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
         If the array does not have the grid's shape.
     """
     return _encode(road.astype(np.uint8), grid, "road", "", predictor=2, overview_resampling="mode")
+
+
+def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
+    """Return what each cell rests on, ``(H, W)``, as GeoTIFF: uint8 by `tasks.support.Support`, 0 is nodata.
+
+    Raises
+    ------
+    TaskError
+        If the array does not have the grid's shape.
+    """
+    return _encode(support, grid, "support", "", nodata=0, predictor=2, overview_resampling="mode")
 
 
 def _encode(values: NDArray[Any], grid: Grid, name: str, unit: str, **options: Any) -> bytes:

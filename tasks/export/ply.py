@@ -1,4 +1,4 @@
-"""The paper's final mesh as binary PLY, with a class per face: for CloudCompare, QGIS and scripts.
+"""The paper's final mesh as binary PLY, with class and support per face: for CloudCompare, QGIS and scripts.
 
 Coordinates are absolute and float64. trimesh and VTK write float32 vertices, which are 0.5 m apart at a
 northing of 5.6 million; hence the ten lines of header here.
@@ -7,17 +7,19 @@ northing of 5.6 million; hence the ten lines of header here.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tasks.support import Support
 from tasks.types import Mesh
 
-VERSION = 1
+VERSION = 2
 NAME = ".ply"
 MEDIA_TYPE = "application/octet-stream"
 
 ROAD, GROUND = 11, 2
 """Classes of faces: the ASPRS codes that LAS files use for road surface and ground."""
 
-FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1")])
+FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1"), ("support", "u1")])
 
 HEADER = """\
 ply
@@ -25,6 +27,7 @@ format binary_little_endian 1.0
 comment crs {crs}
 comment origin {origin}
 comment class {ground} ground, {road} road surface (ASPRS)
+comment support {support}
 element vertex {vertices}
 property double x
 property double y
@@ -32,12 +35,13 @@ property double z
 element face {faces}
 property list uchar int vertex_indices
 property uchar class
+property uchar support
 end_header
 """
 
 
-def encode(mesh: Mesh) -> bytes:
-    """Return a mesh as PLY.
+def encode(mesh: Mesh, support: NDArray[np.uint8]) -> bytes:
+    """Return a mesh as PLY, with what each face rests on (`tasks.support.Support`, ``(F,)``).
 
     Vertices are (easting, northing, height) in metres in the CRS that a comment of the header names;
     ``origin`` there is the tile's whole-metre origin, a good shift for programs that compute in float32.
@@ -47,6 +51,7 @@ def encode(mesh: Mesh) -> bytes:
         origin=" ".join(f"{v:.15g}" for v in mesh.origin),
         ground=GROUND,
         road=ROAD,
+        support=", ".join(f"{kind} {kind.name.lower()}" for kind in Support),
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
     )
@@ -54,6 +59,7 @@ def encode(mesh: Mesh) -> bytes:
     faces["corners"] = 3
     faces["vertices"] = mesh.faces
     faces["class"] = np.where(mesh.road, ROAD, GROUND)
+    faces["support"] = support
     vertices = (mesh.vertices + np.asarray(mesh.origin, np.float64)).astype("<f8")
     # PLY headers are ASCII; names in WKT need not be.
     return header.encode("ascii", "backslashreplace") + vertices.tobytes() + faces.tobytes()

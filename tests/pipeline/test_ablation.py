@@ -21,6 +21,8 @@ NODES = {
     "fit": 18,
     "sample": VARIANTS,
     "evaluate": VARIANTS,
+    # as many as there are surfaces: how they are sampled is no matter
+    "assess": 18,
 }
 
 

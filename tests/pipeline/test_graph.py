@@ -37,10 +37,11 @@ def test_the_same_again_is_the_same(survey):
     ("override", "stages"),
     [
         ({"load": {"halo_m": 10}}, list(STAGE_NAMES)),
-        ({"ecsrc": {"theta_z_m": 0.1}}, ["ecsrc", "fit", "sample", "evaluate"]),
-        ({"fit": {"degree": 2}}, ["fit", "sample", "evaluate"]),
+        ({"ecsrc": {"theta_z_m": 0.1}}, ["ecsrc", "fit", "sample", "evaluate", "assess"]),
+        ({"fit": {"degree": 2}}, ["fit", "sample", "evaluate", "assess"]),
         ({"sample": {"road_m": 2}}, ["sample", "evaluate"]),
         ({"evaluate": {"nearest": True}}, ["evaluate"]),
+        ({"assess": {"agree_m": 0.2}}, ["assess"]),
         ({"export": {"formats": ["glb"]}}, []),
     ],
 )
@@ -55,12 +56,12 @@ def test_an_option_at_its_default_changes_nothing(survey):
 def test_a_version_changes_its_stage_and_what_follows(survey, monkeypatch):
     before = names(survey)
     monkeypatch.setattr(ecsrc, "VERSION", ecsrc.VERSION + 1)
-    assert changed(before, names(survey)) == ["ecsrc", "fit", "sample", "evaluate"]
+    assert changed(before, names(survey)) == ["ecsrc", "fit", "sample", "evaluate", "assess"]
 
 
 def test_variants_share_what_they_have_in_common(survey):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
-    assert len(graph.nodes) == 3 + 3 * 3
+    assert len(graph.nodes) == 3 + 3 * 4
     stages = [node.stage for node in graph.nodes.values()]
     assert sorted(set(stages), key=stages.index) == list(STAGE_NAMES)
     for node in graph.nodes.values():

@@ -19,7 +19,7 @@ FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
     "p95_road_m mad_road_deg mad_terrain_deg triangles road_fraction completeness seconds error"
 ).split()
-EACH = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1}
+EACH = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 3, "assess": 3, "export": 1}
 """What one tile costs with the paper's three variants: what they share is computed once."""
 
 

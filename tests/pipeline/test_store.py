@@ -46,6 +46,7 @@ def test_every_result_comes_back_exactly(pull):
         kinds.add(type(value).__name__)
     assert kinds == {
         "RoadMask", "RoadClusters", "PlaneSurface", "RasterSurface", "NurbsSurface", "Mesh", "Metrics",
+            "Quality",
     }  # fmt: skip
 
 

@@ -15,6 +15,9 @@ def roof(crs: str = "EPSG:25832") -> Mesh:
     return Mesh(crs, (295500.0, 5629250.0, 150.0), vertices, faces, np.array([False, True, False]))
 
 
+RESTS_ON = np.array([1, 2, 3], np.uint8)
+
+
 def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Header lines, vertices and faces, by the PLY description alone."""
     head, body = data.split(b"end_header\n", 1)
@@ -36,17 +39,18 @@ def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 def test_coordinates_are_absolute_and_exact():
     mesh = roof()
-    _, vertices, faces = parse(ply.encode(mesh))
+    _, vertices, faces = parse(ply.encode(mesh, RESTS_ON))
     truth = mesh.vertices + np.array(mesh.origin)
     for axis, name in enumerate("xyz"):
         np.testing.assert_array_equal(vertices[name], truth[:, axis])
     assert (faces["count"] == 3).all()
     np.testing.assert_array_equal(faces["vertex_indices"], mesh.faces)
     np.testing.assert_array_equal(faces["class"], [2, 11, 2])
+    np.testing.assert_array_equal(faces["support"], RESTS_ON)
 
 
 def test_header_names_crs_and_origin():
-    lines, _, _ = parse(ply.encode(roof()))
+    lines, _, _ = parse(ply.encode(roof(), RESTS_ON))
     assert lines[:4] == [
         "ply",
         "format binary_little_endian 1.0",
@@ -57,14 +61,14 @@ def test_header_names_crs_and_origin():
 
 @pytest.mark.parametrize("crs", ['PROJCRS["a",\n  BASEGEOGCRS["b"]]', 'PROJCRS["Réunion"]'])
 def test_wkt_stays_one_ascii_line(crs):
-    lines, vertices, _ = parse(ply.encode(roof(crs)))
+    lines, vertices, _ = parse(ply.encode(roof(crs), RESTS_ON))
     assert len([line for line in lines if line.startswith("comment crs PROJCRS")]) == 1
     assert len(vertices) == 5
 
 
 def test_trimesh_reads_it():
     mesh = roof()
-    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh)), file_type="ply", process=False)
+    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh, RESTS_ON)), file_type="ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices + np.array(mesh.origin))
     np.testing.assert_array_equal(read.faces, mesh.faces)
 
@@ -72,11 +76,11 @@ def test_trimesh_reads_it():
 def test_vtk_reads_it(tmp_path):
     mesh = roof()
     path = tmp_path / "mesh.ply"
-    path.write_bytes(ply.encode(mesh))
+    path.write_bytes(ply.encode(mesh, RESTS_ON))
     read = pyvista.read(path)
     np.testing.assert_array_equal(read.faces.reshape(-1, 4)[:, 1:], mesh.faces)
     np.testing.assert_allclose(read.points, mesh.vertices + np.array(mesh.origin), rtol=1e-7)
 
 
 def test_equal_meshes_give_equal_bytes():
-    assert ply.encode(roof()) == ply.encode(roof())
+    assert ply.encode(roof(), RESTS_ON) == ply.encode(roof(), RESTS_ON)

@@ -1,0 +1,111 @@
+"""What the surface rests on, and when a DTM under a road is believed: against made truth."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catalog.grid import Grid
+from tasks.support import REACH_M, Support, continuation, of_faces, support, unsound, without_unsound
+from tasks.types import Mesh, RoadClusters, RoadMask, TileData
+
+GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
+ROW, COL = np.indices(GRID.shape)
+NOWHERE = np.zeros(GRID.shape, bool)
+STREET = np.abs(ROW - 25) < 5
+RAMP = 100 + 0.08 * COL - 0.03 * ROW
+
+
+def tile(dsm=RAMP, dtm=RAMP) -> TileData:
+    return TileData("made", GRID, GRID, dsm.copy(), dtm.copy())
+
+
+def street(mask=STREET, outside=NOWHERE) -> RoadMask:
+    return RoadMask(GRID, GRID, mask, outside)
+
+
+def kept(mask, unsound=None) -> RoadClusters:
+    return RoadClusters(GRID, mask.astype(np.int32), unsound)
+
+
+def test_every_cell_rests_on_what_the_fit_takes_there():
+    crown = STREET & (COL > 20) & (COL < 30)
+    house, hole, sea = ROW < 8, (ROW > 40) & (COL < 10), COL > 55
+    data = tile()
+    data.dsm[crown | house] += 6
+    data.dtm[hole] = np.nan
+    data.dsm[:, 12], data.dtm[:, 13] = np.nan, np.nan
+    found = support(data, street(outside=sea), kept(STREET & ~crown))
+    truth = np.full(GRID.shape, Support.MEASURED)
+    truth[crown | house] = Support.DTM
+    truth[hole] = Support.INFERRED
+    # A kept cell without DSM has no height, whatever the DTM says; any other without DSM has the DTM's.
+    truth[:, 12] = np.where(STREET[:, 12], Support.INFERRED, truth[:, 12])
+    truth[~STREET & ~hole & (COL == 12)] = Support.DTM
+    truth[:, 13] = np.where(STREET[:, 13], Support.MEASURED, Support.INFERRED)
+    truth[sea] = Support.NONE
+    np.testing.assert_array_equal(found, truth)
+
+
+def test_a_dtm_that_is_not_sound_supports_nothing():
+    crown = STREET & (COL > 20) & (COL < 30)
+    data, clusters = tile(dsm=RAMP + 6 * crown), kept(STREET & ~crown, crown)
+    assert (support(data, street(), clusters)[crown] == Support.INFERRED).all()
+    np.testing.assert_array_equal(np.isnan(without_unsound(data, clusters).dtm), crown)
+    assert without_unsound(data, kept(STREET)) is data
+
+
+def test_faces_take_the_cell_under_their_centroid():
+    found = np.where(COL < 30, Support.MEASURED, Support.DTM).astype(np.uint8)
+    west, east = [(28.5, 10, 0), (29.5, 10, 0), (28.5, 12, 0)], [(30.5, 10, 0), (33, 10, 0), (30.5, 12, 0)]
+    vertices = np.array(west + east, float)
+    mesh = Mesh(
+        GRID.crs, (*GRID.origin, 0.0), vertices, np.arange(6, dtype=np.int32).reshape(2, 3), np.ones(2, bool)
+    )
+    np.testing.assert_array_equal(of_faces(found, street(), mesh), [Support.MEASURED, Support.DTM])
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-500, 5000))
+def test_a_plane_goes_on_as_it_is(by_row, by_col, level):
+    plane = level + by_row * ROW + by_col * COL
+    known = STREET & ((COL < 22) | (COL > 30))
+    found, scatter = continuation(np.where(known, plane, 1e4), known, 1.0)
+    # Slopes are a little damped (`LEVEL_M2`), but not where the known cells lie all around.
+    np.testing.assert_allclose(found[known], plane[known], atol=0.03)
+    assert scatter[known].max() < 0.5
+
+
+def test_continuation_is_a_weighted_plane_fit():
+    rng = np.random.default_rng(1)
+    heights, known = rng.normal(0, 1, GRID.shape), rng.random(GRID.shape) < 0.3
+    found, _ = continuation(heights, known, 1.0)
+    r, c = 20, 31
+    near = known & (np.abs(ROW - r) <= 15) & (np.abs(COL - c) <= 15)
+    x = np.column_stack([np.ones(near.sum()), ROW[near] - r, COL[near] - c])
+    root = np.exp(-0.25 * (x[:, 1] ** 2 + x[:, 2] ** 2) / 25)
+    oracle = np.linalg.lstsq(x * root[:, None], heights[near] * root, rcond=None)[0][0]
+    assert found[r, c] == pytest.approx(oracle, abs=0.01)
+
+
+@pytest.mark.parametrize(("off", "believed"), [(0.0, True), (0.2, True), (1.5, False), (-1.5, False)])
+def test_the_road_beside_a_gap_judges_the_dtm_in_it(off, believed):
+    gap = STREET & (COL > 25) & (COL < 35)
+    rng = np.random.default_rng(0)
+    data = tile(dsm=RAMP + 0.05 * rng.standard_normal(GRID.shape), dtm=RAMP + off * gap)
+    found = unsound(data, street(), STREET & ~gap)
+    assert not found[~gap].any()
+    assert found[gap].mean() == (0 if believed else 1)
+
+
+def test_far_from_any_road_that_is_seen_the_dtm_is_believed():
+    seen = STREET & (COL < 10)
+    found = unsound(tile(dtm=RAMP + 9.0), street(), seen)
+    assert found[STREET & (COL > 10) & (COL < 20)].all()
+    assert not found[COL >= 9 + REACH_M + 1].any()
+    assert not unsound(tile(dtm=RAMP + 9.0), street(), NOWHERE).any()
+
+
+def test_under_a_crown_on_a_bridge_the_deck_goes_on():
+    deck, crown = STREET & (COL > 10) & (COL < 50), STREET & (COL > 27) & (COL < 34)
+    found = unsound(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
+    np.testing.assert_array_equal(found, crown)
