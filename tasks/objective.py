@@ -55,7 +55,7 @@ class Objective:
         gradient[0] = by_a * w
         if self.free_weights:
             gradient[1] = by_a * a + by_w * w
-        return loss + _regulariser(z, self.lambda_reg, NEIGHBOURS, gradient[0]), gradient
+        return loss + range_term(z, self.lambda_reg, NEIGHBOURS, gradient[0]), gradient
 
 
 def objective(
@@ -155,7 +155,7 @@ def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, out: Float
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _regulariser(z: Floats, lambda_reg: float, neighbours: NDArray[np.int64], by_z: Floats) -> float:
+def range_term(z: Floats, lambda_reg: float, neighbours: NDArray[np.int64], by_z: Floats) -> float:
     """Return the regulariser (Eq. loss_ctrl) and add its gradient to ``by_z``.
 
     The range of ``P_ij - P_l`` over l is the range of the neighbours' heights: P_ij itself cancels.

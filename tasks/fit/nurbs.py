@@ -1,12 +1,14 @@
 """Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
 
-Adam on the heights and weights of a fixed grid of control points, from the DTM; the loss is
-`tasks.objective`, the surface `tasks.nurbs`.
+The heights and weights of a fixed grid of control points, from the DTM. The paper's way is Adam on
+`tasks.objective`; with unit weights the problem is convex and `tasks.irls` solves it. The surface is
+`tasks.nurbs`. docs/fit.md compares the choices.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,12 +16,14 @@ from pydantic import Field, model_validator
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from catalog.grid import Grid
-from tasks import adam, autograd
+from tasks import adam, autograd, irls
+from tasks.bending import plate
 from tasks.errors import TaskError
 from tasks.nurbs import NurbsSurface, clamped_knots, greville
 from tasks.objective import Objective, objective
 from tasks.options import Options as BaseOptions
 from tasks.planes import least_squares_plane
+from tasks.stiffness import stiffest
 from tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
@@ -53,6 +57,24 @@ class Options(BaseOptions):
     weights: Literal["free", "unit"] = Field(
         "free", description="free: weights are optimised between 1/10 and 10; unit: all are 1"
     )
+    solver: Literal["adam", "irls"] = Field(
+        "adam", description="irls: reweighted least squares, for unit weights; takes neither rate nor window"
+    )
+    huber_m: float = Field(
+        0.0, ge=0, description="differences below it (m) count by their square, for irls; 0 is L1"
+    )
+    smoothness: Literal["range", "bending"] = Field(
+        "range",
+        description="range: lambda_reg on the control points; bending: the mean squared curvature, for irls",
+    )
+    bending_m3: float | Literal["auto"] = Field(
+        100.0,
+        description="weight of the road's squared curvature (m3); auto: by generalised cross-validation, "
+        "for masks without spoilers",
+    )
+    bending_terrain: float = Field(
+        0.02, gt=0, le=1000, description="the terrain's weight as a part of the road's"
+    )
     learning_rate: float = Field(0.1, gt=0, description="Adam's step, m for heights, 1 for ln w")
     iterations: int = Field(200, ge=0, description="most Adam steps")
     stop_tolerance: float = Field(1e-4, ge=0, description="stop when the loss changes by less than this part")
@@ -71,6 +93,19 @@ class Options(BaseOptions):
             raise ValueError(f"device {self.device} needs engine torch; numba runs on the cpu")
         return self
 
+    @model_validator(mode="after")
+    def _what_the_solver_can(self) -> Options:
+        if self.solver == "irls":
+            if self.weights == "free" or self.engine == "torch" or not self.iterations:
+                raise ValueError("solver irls needs weights unit, engine numba and at least one iteration")
+        elif self.smoothness == "bending" or self.huber_m:
+            raise ValueError("smoothness bending and huber_m need solver irls")
+        if self.smoothness == "bending" and self.degree < 2:
+            raise ValueError("smoothness bending needs degree 2 or more: planes between lines do not bend")
+        if self.bending_m3 != "auto" and self.bending_m3 <= 0:
+            raise ValueError(f"bending_m3 {self.bending_m3} must be above 0, or auto")
+        return self
+
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
     """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere.
@@ -84,16 +119,11 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     space = spline_space(data.grid, options)
     start, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
-    variables = np.stack([start - datum, np.zeros_like(start)])
-    limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
-    schedule = adam.Schedule(
-        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
-    )
-    if options.engine == "torch":
-        (z, rho), _ = autograd.minimise(loss, variables, limit, schedule, options.device)
+    if options.solver == "irls":
+        z = _irls(data.grid, clusters.mask, loss, start - datum, space, options)
+        weights = np.ones_like(z)
     else:
-        (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
-    weights = np.exp(rho)
+        z, weights = _adam(loss, start - datum, options)
     east, north = data.grid.origin
     return NurbsSurface(
         crs=data.grid.crs,
@@ -106,6 +136,36 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         datum=datum,
         origin=(float(east), float(north)),
     )
+
+
+def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
+    """Return control heights above the datum (m) and weights."""
+    variables = np.stack([start, np.zeros_like(start)])
+    limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
+    schedule = adam.Schedule(
+        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
+    )
+    if options.engine == "torch":
+        (z, rho), _ = autograd.minimise(loss, variables, limit, schedule, options.device)
+    else:
+        (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
+    return z, np.exp(rho)
+
+
+def _irls(grid: Grid, road: Bools, loss: Objective, start: Floats, space: Space, options: Options) -> Floats:
+    """Return control heights above the datum (m)."""
+    flat = irls.Convex(loss, start.shape, options.huber_m)
+
+    def solved(convex: irls.Convex, start: Floats) -> irls.Solution:
+        return irls.minimise(convex, start, options.iterations, options.stop_tolerance)
+
+    if options.smoothness == "range":
+        return solved(flat, start).z
+    west, south, east, north = grid.hull
+    unit = plate(np.where(road, 1.0, options.bending_terrain), space, (east - west, north - south))
+    if options.bending_m3 == "auto":
+        return stiffest(flat, unit, start, road, solved).z
+    return solved(replace(flat, plate=unit.times(options.bending_m3)), start).z
 
 
 def spline_space(grid: Grid, options: Options) -> Space:
@@ -151,7 +211,8 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
         raise TaskError(_too_few(f"{cells} cells with a height", n, m))
     terrain = options.lambda_terrain if options.terrain else 0.0
     factor = np.where(road, 1.0, terrain)
-    return objective(heights - datum, factor, space, options.lambda_reg, options.weights == "free")
+    lambda_reg = options.lambda_reg if options.smoothness == "range" else 0.0
+    return objective(heights - datum, factor, space, lambda_reg, options.weights == "free")
 
 
 def start_heights(data: TileData, road: Bools, space: Space, terrain: bool) -> tuple[Floats, float]:
