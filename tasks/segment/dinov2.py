@@ -28,7 +28,8 @@ from tasks.types import Bools, RoadMask, TileData
 from tasks.windows import blend, cover
 
 VERSION = 1
-READS = ("dop",)
+READS = ("dop", "roads")
+"""The roads where the hygiene fuses with them."""
 TIE_M = 1e-6
 """Of pixels equally near to a cell's centre the one in the south-east is taken, in every tile."""
 

@@ -17,7 +17,8 @@ from tasks.survey import outside
 from tasks.types import RoadMask, TileData
 
 VERSION = 1
-READS = ("dop",)
+READS = ("dop", "roads")
+"""The roads where the hygiene fuses with them."""
 SHOWN = 0.99
 """Share of the tile below which it is said how much the photo shows."""
 

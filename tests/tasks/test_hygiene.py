@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +10,7 @@ from scipy import ndimage
 from catalog.grid import Grid
 from tasks.errors import TaskError
 from tasks.hygiene import NOTHING, Hygiene, clean, close, drop, fill, within
-from tasks.types import TileData
+from tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
 cells = st.sampled_from([1.0, 0.5, 0.2])
@@ -153,3 +155,17 @@ def test_a_second_source_that_is_missing_is_named():
     mask = np.ones((4, 4), bool)
     with pytest.raises(TaskError, match=r"union needs roads.*--roads"):
         clean(mask, tile(mask.shape), Hygiene(fuse="union"))
+
+
+def test_roads_of_the_catalog_are_such_a_source(tmp_path):
+    import geopandas
+    from shapely.geometry import box
+
+    mask = np.zeros((20, 30), bool)
+    data = tile(mask.shape)
+    west, south, east, _ = data.grid.bounds
+    path = tmp_path / "roads.gpkg"
+    geopandas.GeoDataFrame(geometry=[box(west, south + 5, east, south + 9)], crs=data.grid.crs).to_file(path)
+    found = clean(mask, replace(data, roads=Source("roads", (path,))), Hygiene(fuse="union"))
+    np.testing.assert_array_equal(found[:, 0], [*[False] * 11, *[True] * 4, *[False] * 5])
+    assert (found == found[:, :1]).all()
