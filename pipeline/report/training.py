@@ -100,8 +100,8 @@ def _lines(outcome: Outcome, count: str) -> list[str]:
         f"Method {asked.method}, labels: {asked.labels}. Learnt from {count}, judged by "
         f"{len(split.validate)} in one block apart; not learnt from: cells nearer to it than "
         f"{asked.gap_m:g} m, and nearer to an edge of the labels than {asked.ignore_m:g} m.",
-        "Expect less on land that looks otherwise. dinov2 chooses when to stop and its threshold by the tiles "
-        "to judge by, which flatters it a little; pixels does so by parts of the tiles to learn from.",
+        "Expect less on land that looks otherwise. dinov2 chooses when to stop and its threshold by the "
+        "tiles to judge by, which flatters it a little; pixels does so by parts of the tiles to learn from.",
     ]
 
 
