@@ -33,6 +33,9 @@ class Hygiene(options.Options):
     fuse_with: Literal["roads", "road_mask"] = Field(
         "roads", description="the second source: the catalog's vectors or its road mask"
     )
+    roads: road_vectors.Options = Field(
+        road_vectors.DEFAULTS, description="which of the vectors, and how wide: as with method: vector"
+    )
     corridor_m: float = Field(5.0, ge=0, le=100, description="reach of the corridor around it (m)")
     close_m: float = Field(2.0, ge=0, le=50, description="close gaps up to this width (m)")
     fill_m2: float = Field(10.0, ge=0, description="fill holes up to this area (m2)")
@@ -132,7 +135,7 @@ def _second(data: TileData, options: Hygiene) -> Bools:
     if options.fuse_with == "road_mask" and data.road_mask is not None:
         return data.road_mask
     if options.fuse_with == "roads" and data.roads is not None:
-        return road_vectors.burn(data)
+        return road_vectors.burn(data, options.roads)
     raise TaskError(
         f"hygiene.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
         f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set hygiene.fuse: none",
