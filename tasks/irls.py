@@ -31,9 +31,7 @@ SHARP, FIRST = 0.001, 0.1
 """Temperature of the softmax, as part of the range: in the end, and in the first step."""
 COOLING = 0.6
 """Both fall by this factor from step to step."""
-SETTLING = 4
-"""Steps before a loss that falls no more is a reason to stop."""
-FARTHEST, NEAR = 3.0, 0.1
+FARTHEST, NEAR = 3.0, 0.01
 """Longest step, as a multiple of the way to the parabolas' solution, and how closely its length is sought."""
 
 
@@ -139,10 +137,11 @@ def minimise(convex: Convex, start: Floats, iterations: int, tolerance: float) -
     """
     z, off = start, convex.heights(start) - convex.objective.target
     losses = [convex(start)]
+    sharp_m = convex.huber_m or SHARP_M
     for step in range(iterations):
-        least = max(convex.huber_m or SHARP_M, FIRST_M * COOLING**step)
-        weight = convex.objective.factor / np.maximum(np.abs(off), least)
-        factored, slope = convex.parabola(z, off, weight, max(SHARP, FIRST * COOLING**step))
+        least, softness = FIRST_M * COOLING**step, FIRST * COOLING**step
+        weight = convex.objective.factor / np.maximum(np.abs(off), max(least, sharp_m))
+        factored, slope = convex.parabola(z, off, weight, max(softness, SHARP))
         way = solve(factored, -slope)
         change = convex.heights(way)
         loss = convex.along(z, off, way, change)
@@ -150,7 +149,8 @@ def minimise(convex: Convex, start: Floats, iterations: int, tolerance: float) -
         if found.fun < losses[-1]:
             z, off = z + found.x * way, off + found.x * change
         losses.append(min(float(found.fun), losses[-1]))
-        if step >= SETTLING and losses[-2] - losses[-1] <= tolerance * losses[-2]:
+        cold = least <= sharp_m and (softness <= SHARP or not convex.objective.lambda_reg)
+        if cold and losses[-2] - losses[-1] <= tolerance * losses[-2]:
             break
     return Solution(z, losses, off, weight, factored)
 

@@ -1,0 +1,207 @@
+"""Accuracy against smoothness of the fit's choices, on the benchmark and on two real places.
+
+With the roads that the paper's filter keeps, and with those that a perfect filter would: segmented cells
+within 0.3 m of the truth. Choices are made on every other tile of the benchmark and reported on the rest.
+The real places (FLEXROAD_REAL_DATA) have their canopies added to the DSM; their DTM is the truth with noise
+of 0.1 m and a level shift under each building. Writes the picture of docs/fit.md where a path is given.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.ndimage import label
+
+from catalog import Catalog
+from catalog.sources.rasters import index
+from pipeline.synthesis import write_scenes
+from tasks import ecsrc, evaluate, load, sample
+from tasks.fit import nurbs
+from tasks.segment import mask
+from tasks.types import Bools, RoadClusters, RoadMask, TileData
+
+TILES, SEED = 48, 1
+SOUND_M = 0.3
+NOISE_M, SCAR_M, BUILDING_M = 0.1, 0.3, 2.0
+IRLS = {"weights": "unit", "solver": "irls"}
+PLATE = {**IRLS, "smoothness": "bending"}
+
+
+def grid(n: int) -> dict[str, object]:
+    return {"control_points": (n, n)}
+
+
+CHOICES: dict[str, dict[str, object]] = {
+    "paper: free weights, Adam, 35": {},
+    "unit weights, Adam, 35": {"weights": "unit"},
+    "unit weights, Adam, 50": {"weights": "unit", **grid(50)},
+    **{f"range, {n}": {**IRLS, **grid(n)} for n in (35, 50, 70)},
+    **{f"range, 70, terrain {t}": {**IRLS, **grid(70), "lambda_terrain": t} for t in (0.3,)},
+    **{
+        f"bending {b} all over, 70": {**PLATE, **grid(70), "bending_m3": b, "bending_terrain": 1}
+        for b in (10, 30, 100)
+    },
+    **{f"bending {b} on roads, 70": {**PLATE, **grid(70), "bending_m3": b} for b in (30, 100, 300)},
+    **{
+        f"bending {b} on roads, 70, terrain 0.3": {
+            **PLATE, **grid(70), "bending_m3": b, "lambda_terrain": 0.3,
+        }
+        for b in (30, 50, 100, 200, 300)
+    },
+    **{
+        f"bending {b} on roads, 50, terrain 0.3": {
+            **PLATE, **grid(50), "bending_m3": b, "lambda_terrain": 0.3,
+        }
+        for b in (50, 100, 200)
+    },
+    "bending 100 on roads, 35, terrain 0.3": {**PLATE, "lambda_terrain": 0.3},
+    "bending 100 on roads, 70, terrain 0.5": {**PLATE, **grid(70), "lambda_terrain": 0.5},
+    "bending 100 on roads, 70, terrain 0.3, Huber 0.1": {
+        **PLATE, **grid(70), "lambda_terrain": 0.3, "huber_m": 0.1,
+    },
+    "bending auto on roads, 70, terrain 0.3": {
+        **PLATE, **grid(70), "lambda_terrain": 0.3, "bending_m3": "auto",
+    },
+}  # fmt: skip
+"""Name: options of the fit. The number behind the smoothness is that of control points each way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A tile, ready to be fitted."""
+
+    place: str
+    data: TileData
+    road: RoadMask
+    roads: dict[str, RoadClusters]
+
+
+def case(place: str, data: TileData) -> Case:
+    road = mask.segment(data, mask.Options())
+    kept = ecsrc.ecsrc(data, road, ecsrc.Options())
+    sound: Bools = road.mask & (np.abs(data.dsm - data.reference) <= SOUND_M)
+    if data.reference_road is not None:
+        sound &= data.reference_road
+    return Case(place, data, road, {"paper": kept, "perfect": replace(kept, labels=sound.astype(np.int32))})
+
+
+def made(scratch: Path) -> Iterator[Case]:
+    catalog = Catalog.read(write_scenes(scratch, TILES, SEED, preset="gerod"))
+    for number, tile in enumerate(catalog.tiles):
+        yield case(("chosen on", "reported on")[number % 2], load.load(tile, load.Options()))
+
+
+def surveyed(scratch: Path) -> Iterator[Case]:
+    """Barbican and Gothenburg, as far as they are there."""
+    root = os.environ.get("FLEXROAD_REAL_DATA")
+    places = {
+        "Barbican": (
+            "EPSG:27700",
+            "London_BNG",
+            "dsm_barb*.tif",
+            "dem_barb*.tif",
+            "cdsm_barb*.tif",
+            "landcover*.tif",
+        ),
+        "Gothenburg": (
+            "EPSG:3007",
+            "Goteborg_SWEREF99_1200",
+            "DSM_KR*.tif",
+            "DEM_KR*.tif",
+            "CDSM_KR*.asc",
+            "landcover.tif",
+        ),
+    }
+    for place, (crs, name, dsm, dtm, crowns, cover) in places.items() if root else ():
+        zipfile.ZipFile(Path(str(root)) / "umep" / f"{name}.zip").extractall(scratch)
+        folder = scratch / name
+        layers = {"dsm": dsm, "dtm": dtm, "road_mask": cover, "reference": crowns}
+        for number, tile in enumerate(index(folder, layers, road_values=(1,), crs=crs).tiles):
+            yield case(place, degraded(load.load(tile, load.Options()), number))
+
+
+def degraded(data: TileData, seed: int) -> TileData:
+    """Put the canopies, which came as the reference, on the DSM, and spoil the DTM, which is the truth."""
+    rng = np.random.default_rng(seed)
+    crowned = np.fmax(data.dsm, data.dtm + np.nan_to_num(data.reference))
+    buildings, count = label(data.dsm - data.dtm > BUILDING_M)
+    shifts = np.append(0.0, rng.normal(0, SCAR_M, count))
+    dtm = data.dtm + rng.normal(0, NOISE_M, data.dtm.shape) + shifts[buildings]
+    return replace(data, dsm=crowned, dtm=dtm, reference=data.dtm)
+
+
+def rows(found: Case) -> Iterator[dict[str, float | str]]:
+    for roads, kept in found.roads.items():
+        for name, options in CHOICES.items():
+            start = time.process_time()
+            surface = nurbs.fit(found.data, kept, nurbs.Options(**options))
+            seconds = time.process_time() - start
+            mesh = sample.sample(surface, found.road, kept, sample.Options())
+            figures = evaluate.evaluate(mesh, found.data, found.road, evaluate.Options())
+            yield {
+                "place": found.place,
+                "roads": roads,
+                "choice": name,
+                "road L2 (m)": figures.l2_road_m,
+                "road RMSE (m)": figures.rmse_road_m,
+                "road MAD (deg)": figures.mad_road_deg,
+                "terrain L2 (m)": figures.l2_terrain_m,
+                "T": figures.triangles,
+                "ms": 1e3 * seconds,
+            }
+
+
+def picture(table: pd.DataFrame, path: Path) -> None:
+    """Draw road MAD over road L2, one panel a filter; lines join choices that differ in one number."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    families = {
+        "paper: free weights": ["paper: free weights, Adam, 35"],
+        "range, 35 / 50 / 70 points": [f"range, {n}" for n in (35, 50, 70)],
+        "bending 10 / 30 / 100 m³ all over": [f"bending {b} all over, 70" for b in (10, 30, 100)],
+        "bending 30 / 100 / 300 m³ on roads": [f"bending {b} on roads, 70" for b in (30, 100, 300)],
+        "the same, terrain 0.3": [f"bending {b} on roads, 70, terrain 0.3" for b in (30, 50, 100, 200, 300)],
+        "the same, 50 points": [f"bending {b} on roads, 50, terrain 0.3" for b in (50, 100, 200)],
+        "auto": ["bending auto on roads, 70, terrain 0.3"],
+    }
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
+    for axis, roads in zip(axes, ("paper", "perfect"), strict=True):
+        part = table.loc["reported on"].loc[roads]
+        for name, choices in families.items():
+            line = part.loc[choices]
+            axis.plot(line["road L2 (m)"], line["road MAD (deg)"], "o-", ms=5, lw=1.4, label=name)
+        axis.set(title=f"{roads} filter", xlabel="road L2 (m)")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("road MAD (degrees)")
+    axes[1].legend(fontsize=8, frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        found = [row for source in (made, surveyed) for c in source(folder) for row in rows(c)]
+    table = pd.DataFrame(found).groupby(["place", "roads", "choice"], sort=False).mean()
+    print(f"{TILES} tiles of the benchmark, seed {SEED}, one half chosen on; means over tiles; one thread")
+    print(table.round(4).to_string())
+    if len(sys.argv) > 1:
+        picture(table, Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,282 @@
+"""The convex solver against exact optima, its parts against plain matrices and integrals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.optimize import linprog
+
+from catalog.grid import Grid
+from tasks import adam, irls
+from tasks.bending import plate
+from tasks.errors import TaskError
+from tasks.fit import nurbs
+from tasks.normal import band, factor, gram, pairs, solve
+from tasks.nurbs import basis_matrix, clamped_knots
+from tasks.objective import NEIGHBOURS, objective, range_term
+from tasks.soft_range import add_soft_range
+from tasks.types import RoadClusters, TileData
+
+WEST, NORTH = 295500.0, 5629500.0
+PLATE = {"weights": "unit", "solver": "irls", "smoothness": "bending"}
+
+
+def space(n, m, degree=3):
+    return clamped_knots(n, degree), clamped_knots(m, degree), (degree, degree)
+
+
+def spiky(shape, seed=0):
+    """Waves, noise, spoilers and a hole."""
+    rng = np.random.default_rng(seed)
+    heights = np.sin(np.indices(shape) / 4).sum(axis=0) + rng.normal(0, 0.05, shape)
+    heights[rng.random(shape) < 0.1] += 2
+    heights[2:5, 3:9] = np.nan
+    return heights
+
+
+def convex(shape=(24, 20), n=7, m=8, degree=3, lambda_reg=0.0, **kind):
+    where = space(n, m, degree)
+    factors = np.where(np.random.default_rng(1).random(shape) < 0.5, 1.0, 0.3)
+    return irls.Convex(objective(spiky(shape), factors, where, lambda_reg, False), (m, n), **kind)
+
+
+def full(lower):
+    size, width = lower.shape
+    matrix = np.zeros((size, size))
+    for d in range(min(width, size)):
+        matrix[np.arange(d, size), np.arange(size - d)] = lower[: size - d, d]
+    return matrix + np.tril(matrix, -1).T
+
+
+@pytest.mark.parametrize(("degree", "lags"), [(1, 3), (2, 3), (3, 4), (5, 6)])
+def test_the_band_is_the_normal_matrix(degree, lags):
+    rng = np.random.default_rng(degree)
+    weight = rng.random((30, 26))
+    knots_u, knots_v, _ = space(degree + 4, degree + 3, degree)
+    along_u, along_v = (
+        basis_matrix(k, degree, rng.random(count))[0] for k, count in ((knots_u, 26), (knots_v, 30))
+    )
+    lower = band(gram(weight, pairs(along_v, lags), pairs(along_u, lags), lags))
+    design = np.kron(along_v, along_u)
+    normal = design.T @ (weight.ravel()[:, None] * design)
+    np.testing.assert_allclose(full(lower), normal, atol=1e-12)
+    right = rng.random((along_v.shape[1], along_u.shape[1]))
+    normal += 0.1 * np.eye(len(normal))
+    lower[:, 0] += 0.1
+    np.testing.assert_allclose(
+        solve(factor(lower), right).ravel(), np.linalg.solve(normal, right.ravel()), atol=1e-6
+    )
+
+
+def test_what_nothing_determines_is_an_error():
+    with pytest.raises(TaskError, match="control point 2 of the surface is undetermined"):
+        factor(np.array([[1.0, 3.0], [1.0, 0.0]]))
+
+
+@pytest.mark.parametrize("cells", [(40, 31), (80, 61)])
+def test_the_plate_measures_curvature_in_metres(cells):
+    """z = 0.01 x^2 + 0.02 xy - 0.03 y^2 has z_xx = 0.02, z_xy = 0.02, z_yy = -0.06 everywhere."""
+    rows, cols = cells
+    spans = 2.0 * (cols - 1), 2.0 * (rows - 1)
+    where = space(9, 11)
+    x, y = np.meshgrid(2.0 * np.arange(cols), 2.0 * np.arange(rows)[::-1])
+    along_u = basis_matrix(where[0], 3, np.linspace(0, 1, cols))[0]
+    along_v = basis_matrix(where[1], 3, np.linspace(1, 0, rows))[0]
+    stiffness = np.full(cells, 5.0)
+    stiffness[:, : cols // 2] = 1.0
+    bent = plate(stiffness, where, spans)
+    for ground, curvature in (
+        (0.01 * x**2 + 0.02 * x * y - 0.03 * y**2, 0.02**2 + 2 * 0.02**2 + 0.06**2),
+        (3 + 0.1 * x - 0.2 * y, 0.0),
+    ):
+        z = np.linalg.pinv(along_v) @ ground @ np.linalg.pinv(along_u).T
+        assert bent(z)[0] == pytest.approx(stiffness.mean() * curvature, rel=1e-6, abs=1e-12)
+
+
+def test_the_plates_derivatives():
+    bent = plate(np.random.default_rng(0).random((20, 24)), space(7, 6), (23.0, 19.0))
+    rng = np.random.default_rng(1)
+    z, way = rng.normal(size=(2, 6, 7))
+    energy, slope = bent(z)
+    assert np.vdot(slope, z) == pytest.approx(2 * energy)
+    np.testing.assert_allclose(full(band(bent.hessian(4))) @ way.ravel(), bent(way)[1].ravel(), atol=1e-12)
+    assert bent.times(3)(z)[0] == pytest.approx(3 * energy)
+
+
+def test_the_soft_range_tends_to_the_range():
+    z = np.random.default_rng(0).normal(size=(9, 7))
+    slope, sharp = np.zeros_like(z), np.zeros_like(z)
+    lower = np.zeros((z.size, 2 * (7 + 1) + 1))
+    add_soft_range(z, 0.3, NEIGHBOURS, 1e-5, slope, lower)
+    range_term(z, 0.3, NEIGHBOURS, sharp)
+    np.testing.assert_allclose(slope, sharp, atol=1e-9)
+    add_soft_range(z, 0.3, NEIGHBOURS, 0.3, slope, lower)
+    assert np.linalg.eigvalsh(full(lower)).min() > -1e-9
+
+
+def test_the_least_absolute_loss_is_found():
+    """Against the exact optimum by linear programming."""
+    wanted = convex()
+    found = irls.minimise(wanted, np.zeros(wanted.shape), 100, 1e-7)
+    o = wanted.objective
+    design, size = np.kron(wanted.along_v, wanted.along_u), np.prod(wanted.shape)
+    sides = np.hstack([design, np.eye(len(design)), -np.eye(len(design))])
+    cost = np.concatenate([np.zeros(size), o.factor.ravel(), o.factor.ravel()])
+    free = [(None, None)] * size + [(0, None)] * (2 * len(design))
+    exact = linprog(cost, A_eq=sides, b_eq=o.target.ravel(), bounds=free).fun
+    assert exact <= found.losses[-1] <= 1.003 * exact
+    assert wanted(found.z) == pytest.approx(found.losses[-1], rel=1e-9)
+
+
+def test_a_wide_huber_is_least_squares():
+    wanted = convex(huber_m=1e4)
+    found = irls.minimise(wanted, np.zeros(wanted.shape), 20, 1e-12)
+    root = np.sqrt(wanted.objective.factor.ravel())
+    design = root[:, None] * np.kron(wanted.along_v, wanted.along_u)
+    exact = np.linalg.lstsq(design, root * wanted.objective.target.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(found.z.ravel(), exact, atol=1e-4)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 6])
+def test_it_goes_below_adam(degree):
+    """On the paper's own loss; Adam with ten times its steps, each a tenth as long."""
+    wanted = convex((40, 44), degree + 6, degree + 7, degree, 0.05)
+    found = irls.minimise(wanted, np.zeros(wanted.shape), 100, 1e-6)
+    start, limit = np.zeros((2, *wanted.shape)), np.full((2, 1, 1), np.inf)
+    _, losses = adam.minimise(wanted.objective, start, limit, adam.Schedule(0.01, 2000, 0, 20))
+    assert found.losses[-1] < 1.0005 * min(losses)
+    assert wanted.objective(np.stack([found.z, np.zeros_like(found.z)]))[0] == pytest.approx(found.losses[-1])
+    assert (np.diff(found.losses) <= 0).all()
+
+
+def test_the_freedom_is_the_trace_of_the_hat_matrix():
+    shape, counts = (50, 46), (22, 24)
+    stiff = plate(np.full(shape, 0.1), space(*counts), (45.0, 49.0))
+    wanted = convex(shape, *counts, huber_m=1e4, plate=stiff)
+    found = irls.minimise(wanted, np.zeros(wanted.shape), 5, 0)
+    design = np.kron(wanted.along_v, wanted.along_u)
+    pull = design.T * found.weight.ravel()
+    trace = np.trace(np.linalg.solve(pull @ design + full(band(wanted.stiff)), pull @ design))
+    # One vector of signs: off by the root of twice the trace at the most, as a standard deviation.
+    whole = irls.freedom(wanted, found, np.ones(shape, bool))
+    assert whole == pytest.approx(trace, abs=3 * np.sqrt(2 * trace))
+    assert trace < 0.6 * np.prod(counts)
+
+
+def tile(ground, noise=0.0, size=90):
+    grid = Grid("EPSG:25832", WEST, NORTH, 1.0, size, size)
+    truth = ground(*np.meshgrid(grid.eastings - WEST, NORTH - grid.northings))
+    rng = np.random.default_rng(0)
+    dsm, dtm = (truth + rng.normal(0, noise, truth.shape) for _ in range(2))
+    road = np.zeros(truth.shape, np.int32)
+    road[size // 2 - 5 : size // 2 + 5] = 1
+    return TileData("t", grid, grid, dsm, dtm), RoadClusters(grid, road), truth
+
+
+def fitted(data, clusters, **changes):
+    return nurbs.fit(data, clusters, nurbs.Options(**{"control_points": (25, 25), **PLATE, **changes}))
+
+
+def on_cells(surface, data):
+    return surface.lattice(data.grid.eastings, data.grid.northings)
+
+
+def test_a_plane_is_kept_and_goes_on_under_a_void():
+    data, clusters, truth = tile(lambda e, s: 160 + 0.1 * e - 0.05 * s)
+    data.dtm[:30, 20:60] = np.nan
+    surface = fitted(data, clusters)
+    np.testing.assert_allclose(on_cells(surface, data), truth, atol=1e-4)
+    np.testing.assert_array_equal(surface.W, 1.0)
+
+
+def test_bending_smooths_a_noisy_road_better_than_the_range():
+    def roughness(heights):
+        return np.abs(np.diff(heights[40:50], 2, axis=1)).mean()
+
+    data, clusters, truth = tile(lambda e, s: 160 + 2 * np.sin(e / 25) + np.cos(s / 30), noise=0.1)
+    bent = on_cells(fitted(data, clusters), data)
+    ranged = on_cells(fitted(data, clusters, smoothness="range"), data)
+    adam_ = on_cells(fitted(data, clusters, smoothness="range", solver="adam", weights="free"), data)
+    off = [abs(heights - truth)[40:50].mean() for heights in (bent, ranged, adam_)]
+    assert off[0] < 0.75 * min(off[1:])
+    assert roughness(bent) < 0.75 * min(roughness(ranged), roughness(adam_))
+
+
+def test_the_terrain_beside_a_stiff_road_stays_free():
+    """A bank of 2 m beside the road: stiff all over, it would be smeared into the road's side."""
+    data, clusters, truth = tile(lambda e, s: 160 + 2 / (1 + np.exp(-(s - 58) / 1.5)) + 0 * e)
+    beside = np.s_[52:66]
+    soft, stiff = (
+        abs(on_cells(fitted(data, clusters, bending_m3=1000, bending_terrain=t), data) - truth)[beside].mean()
+        for t in (0.01, 1)
+    )
+    assert soft < 0.5 * stiff
+
+
+def test_auto_is_stiffer_where_the_ground_is_level_and_noisy():
+    level, clusters, _ = tile(lambda e, s: 160 + 0 * e, noise=0.1)
+    waves, _, _ = tile(lambda e, s: 160 + np.sin(e / 5), noise=0.01)
+    for data, same, other in ((level, 1000, 10), (waves, 10, 1000)):
+        heights = on_cells(fitted(data, clusters, bending_m3="auto"), data)
+        gap = [
+            abs(heights - on_cells(fitted(data, clusters, bending_m3=b), data)).max() for b in (same, other)
+        ]
+        assert gap[0] < 0.1 * gap[1]
+
+
+def test_without_road_or_terrain():
+    data, clusters, truth = tile(lambda e, s: 160 + np.sin(e / 20), noise=0.02)
+    bare = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    assert abs(on_cells(fitted(data, bare, bending_m3="auto"), data) - truth).mean() < 0.05
+    alone = on_cells(fitted(data, clusters, terrain=False), data)
+    assert abs(alone - truth)[clusters.mask].mean() < 0.05
+    assert np.isfinite(alone).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"iterations": 40, "learning_rate": 0.5},
+        {"weights": "unit", "solver": "irls"},
+        {**PLATE, "bending_m3": 1.0, "huber_m": 0.1},
+    ],
+    ids=["adam", "range", "bending"],
+)
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**31), road=st.floats(0, 1), missing=st.floats(0, 0.8), scale=st.floats(-3, 3))
+def test_no_pole_and_no_weight_beyond_its_bounds(changes, seed, road, missing, scale):
+    """Any mask and DSM: the surface stays within its control heights, and these near the data."""
+    rng = np.random.default_rng(seed)
+    data, clusters, _ = tile(lambda e, s: 160 + 0 * e, size=40)
+    heights = np.clip(10**scale * rng.standard_t(2, (2, 40, 40)), -3000, 3000)
+    heights[rng.random(heights.shape) < missing] = np.nan
+    clusters.labels[:] = np.kron(rng.random((5, 5)) < road, np.ones((8, 8)))
+    data = replace(data, dsm=heights[0], dtm=heights[1])
+    surface = nurbs.fit(data, clusters, nurbs.Options(control_points=(9, 9), **changes))
+    assert surface.W.min() >= 0.1 - 1e-12
+    assert surface.W.max() <= 10 + 1e-12
+    control = surface.A / surface.W + surface.datum
+    found = surface.lattice(np.linspace(WEST, WEST + 40, 157), np.linspace(NORTH, NORTH - 40, 157)[3:-3])
+    inside = found[:, 3:-3]
+    slack = 1e-9 * (1 + np.abs(control).max())
+    assert control.min() - slack <= inside.min()
+    assert inside.max() <= control.max() + slack
+    spread = np.nanmax(heights) - np.nanmin(heights)
+    assert np.abs(control - np.nanmedian(heights)).max() <= 3 * spread + changes.get("iterations", 0)
+
+
+def test_options_that_cannot_be_are_refused():
+    for wrong, reason in (
+        ({"solver": "irls"}, "weights unit"),
+        ({"solver": "irls", "weights": "unit", "engine": "torch"}, "engine numba"),
+        ({"solver": "irls", "weights": "unit", "iterations": 0}, "at least one iteration"),
+        ({"smoothness": "bending"}, "need solver irls"),
+        ({"huber_m": 0.1}, "need solver irls"),
+        ({**PLATE, "degree": 1}, "needs degree 2"),
+        ({**PLATE, "bending_m3": 0}, "above 0, or auto"),
+    ):
+        with pytest.raises(ValidationError, match=reason):
+            nurbs.Options(**wrong)
