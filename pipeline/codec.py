@@ -60,7 +60,9 @@ def _plain(item: Any) -> Any:
 
 
 def _types() -> dict[str, type]:
-    known: dict[str, type] = {kind.__name__: kind for kind in (Mesh, Metrics, Quality, RoadClusters, RoadMask)}
+    known: dict[str, type] = {
+        kind.__name__: kind for kind in (Mesh, Metrics, Quality, RoadClusters, RoadMask)
+    }
     for module in methods("tasks.fit").values():
         known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
     return known

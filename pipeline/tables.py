@@ -48,6 +48,7 @@ COLUMNS: dict[str, str] = {
     "off_dtm_road": "float64",
     "bounded_weights": "float64",
     "doubt_m": "float64",
+    "doubted_m2": "float64",
     "flags": "str",
 }
 """Columns of metrics.parquet and their types; the fixed ones first."""

@@ -2,7 +2,7 @@
 
 Road is the raw segmented mask, for on it the surface is used. Two witnesses know the ground there: the scan,
 where the filter kept it, and the terrain model. How far the surface is from the nearer of them is the tile's
-doubt; tiles with the most are worth a look first.
+doubt; tiles with the most are worth a look first. A fault in one place shows as a patch of doubted road.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from scipy.ndimage import distance_transform_edt, label, uniform_filter
 from scipy.stats import median_abs_deviation
 
 from tasks import options as base
@@ -25,6 +25,7 @@ AROUND_M = 5.0
 """Side of the square over which the scan's scatter is taken (m): more than a cell, less than a crown."""
 FLAGS = {
     "doubt": "doubt_m",
+    "patch": "doubted_m2",
     "spike": "curvature_per_m",
     "edge-step": "edge_step_m",
     "loose": "residual_p95_m",
@@ -46,6 +47,9 @@ class Options(base.Options):
     )
     doubt_m: float = Field(
         0.1, gt=0, description="flag doubt: mean distance of the surface to its nearer witness (m)"
+    )
+    doubted_m2: float = Field(
+        50.0, gt=0, description="flag patch: largest patch of road doubted by more than agree_m (m2)"
     )
     curvature_per_m: float = Field(
         0.2, gt=0, description="flag spike: largest curvature on the road (1/m); a speed hump has less"
@@ -115,6 +119,7 @@ def assess(
         "off_dtm_road": _mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _bounded(surface),
         "doubt_m": _mean(_finite(doubted[on_road])),
+        "doubted_m2": _patch(on_road & (doubted > options.agree_m)) * cell**2,
     }
     flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
     return Quality(**figures, flags=tuple(flags if on_road.any() else [NO_ROAD]), support=rests_on)
@@ -175,6 +180,12 @@ def _edge_steps(height: Floats, on_road: Bools) -> Floats:
             step = ahead[2:] - 2 * ahead[1:-1] + ahead[:-2]
             found.append(np.abs(step[~there[2:] & there[1:-1] & there[:-2]]))
     return _finite(np.concatenate(found))
+
+
+def _patch(cells: Bools) -> int:
+    """Return how many cells the largest patch of neighbours has."""
+    patches, _ = label(cells)
+    return int(np.bincount(patches[cells], minlength=1).max())
 
 
 def _bounded(surface: Surface) -> float:

@@ -187,6 +187,8 @@ class Quality:
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
     doubt_m: float
     """Mean distance of the surface to the nearer witness, scan or DTM: what its error may be."""
+    doubted_m2: float
+    """Largest patch of road farther from its witness than two heights of one ground may be (m2), or 0."""
     flags: tuple[str, ...]
     """What stands out, by `tasks.assess.FLAGS`."""
     support: NDArray[np.uint8]

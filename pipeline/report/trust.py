@@ -6,6 +6,7 @@ import pandas as pd
 
 FIGURES = {
     "doubt_m": "doubt (m)",
+    "doubted_m2": "largest doubted patch (m²)",
     "residual_p95_m": "p95 to own points (m)",
     "curvature_per_m": "curvature (1/m)",
     "edge_step_m": "edge step (m)",

@@ -77,6 +77,13 @@ def test_a_pole_is_a_spike():
     assert found.curvature_per_m == pytest.approx(4, abs=0.02)
 
 
+def test_a_hump_in_one_place_is_a_patch():
+    hump = STREET & (np.hypot(ROW - 55, COL - 60) < 6)
+    found = told(tile(), Shape(TRUTH + 0.8 * hump))
+    assert "patch" in found.flags
+    assert found.doubted_m2 == hump.sum()
+
+
 def test_curvature_does_not_depend_on_the_size_of_cells():
     fine = Grid(GRID.crs, GRID.west, GRID.north, 0.5, 120, 100)
     bowl = 0.05 * ((COL * 0.5) ** 2 + (ROW * 0.5) ** 2)
@@ -91,7 +98,8 @@ def test_curvature_does_not_depend_on_the_size_of_cells():
 def test_a_filter_that_climbs_a_crown_is_doubted():
     data = tile(dsm=TRUTH + NOISE + np.where(CROWN, DOME, 0))
     climbed, clean = told(data, None), told(data, None, kept=STREET & ~CROWN)
-    assert {"doubt", "loose", "off-dtm"} <= set(climbed.flags)
+    assert {"doubt", "patch", "loose", "off-dtm"} <= set(climbed.flags)
+    assert climbed.doubted_m2 == pytest.approx(CROWN.sum(), rel=0.5)
     assert clean.flags == ()
     assert clean.dtm_road == pytest.approx(CROWN.sum() / STREET.sum())
 
@@ -143,7 +151,7 @@ def test_other_surfaces_tell_what_they_can():
 def test_nothing_to_tell_of_is_no_fault():
     empty = told(tile(), Shape(TRUTH), road=NOWHERE)
     assert empty.flags == (NO_ROAD,)
-    assert np.isnan([getattr(empty, name) for name in FLOATS]).all()
+    assert np.isnan([getattr(empty, name) for name in FLOATS if name != "doubted_m2"]).all()
     unknown = np.full(GRID.shape, np.nan)
     blind = told(tile(unknown, unknown), Shape(TRUTH), kept=NOWHERE)
     assert {"inferred", "doubt", "dropped"} <= set(blind.flags)
