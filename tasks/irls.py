@@ -25,7 +25,7 @@ from tasks.objective import NEIGHBOURS, Objective, range_term
 from tasks.soft_range import add_soft_range
 from tasks.types import Bools, Floats
 
-SHARP_M, FIRST_M = 0.01, 0.1
+SHARP_M, FIRST_M = 0.003, 0.03
 """Smaller differences weigh as if they were this large: under L1 in the end, and in the first step."""
 SHARP, FIRST = 0.001, 0.1
 """Temperature of the softmax, as part of the range: in the end, and in the first step."""
