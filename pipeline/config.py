@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
-import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -20,7 +19,7 @@ import yaml
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from pipeline.errors import ConfigError
-from tasks import assess, ecsrc, evaluate, load, sample
+from tasks import assess, ecsrc, evaluate, grounded, load, sample
 from tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method"}
@@ -84,7 +83,7 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
     return {
         "load": TypeAdapter(load.Options),
         "segment": one_of("tasks.segment"),
-        "ecsrc": TypeAdapter(ecsrc.Options),
+        "ecsrc": TypeAdapter(Annotated[ecsrc.Options | grounded.Options, Field(discriminator="variant")]),
         "fit": one_of("tasks.fit"),
         "sample": TypeAdapter(sample.Options),
         "evaluate": TypeAdapter(evaluate.Options),
@@ -92,7 +91,11 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
     }
 
 
-DEFAULTS: dict[str, dict[str, Any]] = {"segment": {"method": "mask"}, "fit": {"method": "nurbs"}}
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "segment": {"method": "mask"},
+    "ecsrc": {"variant": "paper"},
+    "fit": {"method": "nurbs"},
+}
 """Methods of stages that have several, where a file names none."""
 
 
@@ -228,7 +231,9 @@ def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
         if key in ("variants", "export", "dataset"):
             merged[key] = value
         else:
-            merged[key] = _merge(parent.get(key) or {}, value, TAG.get(key), key)
+            # A parent that names no method has the usual one, and another starts from its own defaults.
+            below = _merge(DEFAULTS.get(key, {}), parent.get(key), TAG.get(key), key)
+            merged[key] = _merge(below, value, TAG.get(key), key)
     return merged
 
 
@@ -280,8 +285,7 @@ def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> A
 
 def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
     # A discriminated union puts the chosen method first in the path; the file has no such level.
-    stage = re.split(r"\W", where)[-1]
-    tags = methods(f"tasks.{stage}") if stage in DEFAULTS else ()
+    tags = model.json_schema().get("discriminator", {}).get("mapping", {})
     path = [str(part) for i, part in enumerate(fault["loc"]) if i or part not in tags]
     key = ".".join([where, *path])
     if fault["type"] == "extra_forbidden":

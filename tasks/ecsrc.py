@@ -24,7 +24,9 @@ class Options(base.Options):
     """What counts as one road."""
 
     variant: Literal["paper", "off"] = Field(
-        "paper", description="paper: Algorithm 1; off: keep every road cell that has a DSM height"
+        "paper",
+        description="paper: Algorithm 1; off: keep every road cell that has a DSM height; "
+        "grounded: for real streets, with options of its own (docs/filter.md)",
     )
     theta_xy_m: float = Field(
         10.0, ge=0, le=100, description="clusters merge across gaps up to this distance in plan (m)"

@@ -247,7 +247,7 @@ def test_config_commands():
     assert "paper" in flexroad("config", "show")
     assert "theta_z_m: 0.5" in flexroad("config", "show", "paper")
     assert "theta_z_m: 0.5" in flexroad("config", "template")
-    assert "theta_z_m" in json.loads(flexroad("config", "schema"))["properties"]["ecsrc"]["properties"]
+    assert "theta_z_m" in json.dumps(json.loads(flexroad("config", "schema"))["properties"]["ecsrc"])
 
 
 def test_catalog_show(made_survey):

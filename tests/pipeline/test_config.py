@@ -5,6 +5,7 @@ import yaml
 
 from pipeline.config import compose, load_config, schema, shipped, template
 from pipeline.errors import ConfigError
+from tasks import grounded
 
 
 def test_every_shipped_configuration_is_valid():
@@ -47,6 +48,14 @@ def test_extends(tmp_path):
     assert config.chains["flexroad"]["fit"].learning_rate == 0.1
 
 
+def test_another_filter_starts_from_its_own_defaults(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: paper\necsrc: grounded\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
+    chains = load_config(path).chains
+    assert chains["flexroad"]["ecsrc"] == grounded.Options()
+    assert chains["bare"]["ecsrc"] == load_config("ablation").chains["wo_ecsrc"]["ecsrc"]
+
+
 @pytest.mark.parametrize(
     ("raw", "message"),
     [
@@ -55,6 +64,7 @@ def test_extends(tmp_path):
         ({"segment": {"method": "vector", "wher": ""}}, "x: segment.wher: unknown key; did you mean where?"),
         ({"fit": {"degre": 2}}, "x: fit.degre: unknown key; did you mean degree?"),
         ({"ecsrc": {"theta_z_m": -1}}, "x: ecsrc.theta_z_m: input should be greater than"),
+        ({"ecsrc": {"variant": "grounded", "bend": 0}}, "x: ecsrc.bend: input should be greater than"),
         ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),
         ({"fit": "nurb"}, "x: fit: "),
         ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),

@@ -1,0 +1,103 @@
+"""Where a surface model is flat as a road is: small square patches that a plane fits.
+
+All comes from differences of heights inside a patch, so a constant or a plane added to the heights changes
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tasks.types import Bools, Floats
+
+PATCH_M = 3.0
+"""Side of a patch (m); at least three cells."""
+STREET_M = 5.0
+"""Half side of the square around a patch whose patches tell the street's slope (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """The flat patches of a tile, by their centres."""
+
+    centres: Bools
+    """``(H, W)``."""
+    trend: Floats
+    """Slope of the street at a centre by row and column, ``(H, W, 2)``, m per cell; 0 elsewhere."""
+    reach: int
+    """Cells from a centre to the edge of its patch."""
+
+
+def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Patches:
+    """Find the flat patches.
+
+    A patch is flat if the residuals to its least-squares plane have a root mean square (over the degrees of
+    freedom) of at most ``roughness_m``, and its slope differs from its street's, the mean of the patches
+    nearby, by at most ``bend``. The second throws out patches over a step: a plane that leans on a car hides
+    half the car's height.
+
+    Parameters
+    ----------
+    heights : (H, W) array
+        Surface model (m).
+    points : (H, W) array of bool
+        Cells that may belong to a patch; all cells of a patch do.
+    cell : float
+        Size of a cell (m).
+    roughness_m : float
+        Largest root mean square of a patch's residuals (m).
+    bend : float
+        Largest difference of slope (m per m).
+    """
+    reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
+    slopes, smooth = _planes(heights, points, reach, roughness_m**2)
+    trend = _trend(slopes, smooth, max(1, math.floor(STREET_M / cell + 1e-9)))
+    centres = smooth & (((slopes - trend) ** 2).sum(axis=2) <= (bend * cell) ** 2)
+    return Patches(centres, trend, reach)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return slopes by row and column (m per cell), ``(H, W, 2)``, and where a plane fits a whole patch."""
+    rows, cols = heights.shape
+    slopes, smooth = np.zeros((rows, cols, 2)), np.zeros((rows, cols), np.bool_)
+    side = 2 * reach + 1
+    n, spread = side * side, side * (reach * (reach + 1) * side / 3)
+    for r in range(reach, rows - reach):
+        for c in range(reach, cols - reach):
+            whole, z, zz, rz, cz = True, 0.0, 0.0, 0.0, 0.0
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    whole = whole and points[r + i, c + j]
+                    up = heights[r + i, c + j] - heights[r, c]
+                    z, zz, rz, cz = z + up, zz + up * up, rz + i * up, cz + j * up
+                if not whole:
+                    break
+            if whole:
+                slopes[r, c] = rz / spread, cz / spread
+                square = zz - z * z / n - (rz * rz + cz * cz) / spread
+                smooth[r, c] = square <= largest * (n - 3)
+    return slopes, smooth
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _trend(slopes: Floats, smooth: Bools, around: int) -> Floats:
+    """Return the mean slope of the smooth patches around each of them, ``(H, W, 2)``."""
+    rows, cols = smooth.shape
+    trend = np.zeros((rows, cols, 2))
+    for r in range(rows):
+        for c in range(cols):
+            if not smooth[r, c]:
+                continue
+            n, down, across = 0, 0.0, 0.0
+            for i in range(max(r - around, 0), min(r + around + 1, rows)):
+                for j in range(max(c - around, 0), min(c + around + 1, cols)):
+                    if smooth[i, j]:
+                        n, down, across = n + 1, down + slopes[i, j, 0], across + slopes[i, j, 1]
+            trend[r, c] = down / n, across / n
+    return trend
