@@ -69,7 +69,7 @@ class Convex:
     @property
     def lags(self) -> int:
         """How far apart control points may be that one term joins, and one more; neighbours of a third: 2."""
-        return max(self.objective.along_u.shape[0], self.objective.along_v.shape[1], 3)
+        return int(max(len(self.objective.along_u), self.objective.along_v.shape[1], 3))
 
     def __call__(self, z: Floats) -> float:
         """Return the loss (m) at control heights ``(m, n)``."""

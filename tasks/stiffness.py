@@ -41,7 +41,8 @@ def stiffest(
     """
     known = flat.objective.factor > 0
     cells = road & known if (road & known).any() else known
-    solutions, scores = [], []
+    solutions: list[Solution] = []
+    scores: list[float] = []
     for stiffness in CANDIDATES_M3:
         convex = replace(flat, plate=unit.times(stiffness))
         # From the stiffer surface: the next one lies near.
