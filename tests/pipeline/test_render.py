@@ -76,6 +76,14 @@ def test_filter_picture_tells_kept_from_dropped():
     assert np.ptp(neutral) < 20
 
 
+def test_support_picture_tells_three_kinds_on_the_road_alone():
+    road = np.abs(COL - 60) < 12
+    png = render.support_picture(RELIEF, (1 + ROW // 84).astype(np.uint8), road, GRID)
+    for row, colour in ((40, render.KEPT), (125, render.BY_DTM), (210, render.DROPPED)):
+        assert near(on_map(png, row, 60), colour, 75)
+    assert np.ptp(on_map(png, 125, 180)) < 20
+
+
 def test_error_map_is_red_where_too_high_and_blue_where_too_low():
     error = np.where(ROW < 125, 0.08, -0.08)
     error[:, 200:] = np.nan
