@@ -67,7 +67,7 @@ def plate(
     Parameters
     ----------
     stiffness : ndarray, (H, W)
-        Cost of squared curvature (m3), before the division by the number of cells.
+        Cost of squared curvature in each cell (m3).
     space : tuple
         Knots along easting and northing, and the degrees, 2 and more.
     spans_m : tuple
@@ -77,7 +77,7 @@ def plate(
     knots_u, knots_v, (p, q) = space
     along_u = _derivatives(knots_u, p, np.linspace(0, 1, cols), spans_m[0])
     along_v = _derivatives(knots_v, q, np.linspace(1, 0, rows), spans_m[1])
-    return Plate(stiffness / stiffness.size, along_u, along_v)
+    return Plate(stiffness, along_u, along_v)
 
 
 def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Derivatives:

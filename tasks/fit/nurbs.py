@@ -120,7 +120,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     start, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
     if options.solver == "irls":
-        z = _irls(data.grid, clusters.mask, loss, start - datum, space, options)
+        z = _irls(data, clusters.mask, loss, start - datum, space, options)
         weights = np.ones_like(z)
     else:
         z, weights = _adam(loss, start - datum, options)
@@ -152,7 +152,9 @@ def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Flo
     return z, np.exp(rho)
 
 
-def _irls(grid: Grid, road: Bools, loss: Objective, start: Floats, space: Space, options: Options) -> Floats:
+def _irls(
+    data: TileData, road: Bools, loss: Objective, start: Floats, space: Space, options: Options
+) -> Floats:
     """Return control heights above the datum (m)."""
     flat = irls.Convex(loss, start.shape, options.huber_m)
 
@@ -161,8 +163,10 @@ def _irls(grid: Grid, road: Bools, loss: Objective, start: Floats, space: Space,
 
     if options.smoothness == "range":
         return solved(flat, start).z
-    west, south, east, north = grid.hull
-    unit = plate(np.where(road, 1.0, options.bending_terrain), space, (east - west, north - south))
+    west, south, east, north = data.grid.hull
+    # Per cell that has a height, like the differences: voids do not make the rest of the tile softer.
+    stiffness = np.where(road, 1.0, options.bending_terrain) / _cells(data, road)
+    unit = plate(stiffness, space, (east - west, north - south))
     if options.bending_m3 == "auto":
         return stiffest(flat, unit, start, road, solved).z
     return solved(replace(flat, plate=unit.times(options.bending_m3)), start).z
@@ -204,8 +208,7 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
     TaskError
         If fewer cells have a height than there are control points.
     """
-    heights = np.where(road, data.dsm, data.dtm)
-    cells = np.count_nonzero(np.isfinite(heights))
+    heights, cells = np.where(road, data.dsm, data.dtm), _cells(data, road)
     n, m = (len(knots) - options.degree - 1 for knots in space[:2])
     if cells < n * m:
         raise TaskError(_too_few(f"{cells} cells with a height", n, m))
@@ -213,6 +216,11 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
     factor = np.where(road, 1.0, terrain)
     lambda_reg = options.lambda_reg if options.smoothness == "range" else 0.0
     return objective(heights - datum, factor, space, lambda_reg, options.weights == "free")
+
+
+def _cells(data: TileData, road: Bools) -> int:
+    """Return the number of cells that have a height to fit."""
+    return int(np.count_nonzero(np.isfinite(np.where(road, data.dsm, data.dtm))))
 
 
 def start_heights(data: TileData, road: Bools, space: Space, terrain: bool) -> tuple[Floats, float]:

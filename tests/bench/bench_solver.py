@@ -70,7 +70,7 @@ def compare(points: int, smoothness: str) -> float:
     objective = nurbs.objective_of(data, clusters.mask, space, datum, options)
     start, shape = heights - datum, (points, points)
     west, south, east, north = data.grid.hull
-    stiffness = STIFFNESS_M3 * np.where(clusters.mask, 1.0, TERRAIN)
+    stiffness = STIFFNESS_M3 * np.where(clusters.mask, 1.0, TERRAIN) / clusters.mask.size
     bent = plate(stiffness, space, (east - west, north - south)) if smoothness == "bending" else None
     way = with_plate(objective, bent) if bent else objective
     variables, limit = np.stack([start, np.zeros_like(start)]), np.full((2, 1, 1), np.inf)
