@@ -387,7 +387,7 @@ def test_a_tile_id_that_makes_no_file_name(tile_id, run, flexroad, survey, tmp_p
     assert (said.code, said.errors) == (0, [])
     assert {path for path in tmp_path.rglob("*") if tmp_path / "run" not in (path, *path.parents)} == before
     (folder,) = (tmp_path / "run" / "tiles").iterdir()
-    assert len(list(folder.iterdir())) == 6
+    assert len(list(folder.iterdir())) == 7
     assert all(path.is_file() for path in folder.iterdir())
     assert list(read_metrics(tmp_path / "run").tile_id.unique()) == [tile_id]
     again = flexroad("rerun", tmp_path / "run", "--tile", tile_id, "--executor", "serial")
