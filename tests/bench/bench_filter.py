@@ -1,0 +1,255 @@
+"""The filters beside each other: what they keep of each kind of cell, and what the fit makes of it.
+
+``PYTHONPATH=. python tests/bench/bench_filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
+number. The default options of `tasks.grounded` were chosen on seeds 5 to 7; here is seed 1. With
+FLEXROAD_REAL_DATA two real towns follow, with their canopies laid over the surface model.
+
+A cell is sound if the surface model shows the ground, with noise, or is within `SOUND_M` of it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import rasterio
+from scipy.interpolate import griddata
+from scipy.ndimage import binary_dilation, label
+
+from catalog import Grid
+from tasks import ecsrc, evaluate, grounded, sample
+from tasks.fit import nurbs
+from tasks.synthetic import Scene, gerod, make_scene
+from tasks.synthetic.spoilers import BARE, Kind
+from tasks.types import Floats, RoadClusters, RoadMask, TileData
+
+TILES, SEED = 2, 1
+HALO_M = 50
+"""As in production; only the core counts."""
+SOUND_M = 0.15
+SPOILERS = (
+    Kind.PARKED_CAR, Kind.MOVING_CAR, Kind.CROWN, Kind.BUILDING,
+    Kind.PLANTS, Kind.RAIL, Kind.WIRE, Kind.MIXED,
+)  # fmt: skip
+NOISE_M, OFFSET_M, SCAR_M, SCAR_SHARE_M2 = 0.1, 0.5, 0.5, 2500
+"""Of a worse terrain model: white noise, an offset, the depth of a scar, the area that has one scar."""
+DECK_M, BEYOND = 0.5, 3
+"""A deck is so high over the terrain model; so many cells beyond it are interpolated or unknown."""
+LEVEL_M, STEEP, LARGE = 0.3, 0.3, 60
+"""Of the filter of two lines: cells this level; or high, not steep, in patches of so many."""
+PLACES = {
+    "Barbican": ("London_BNG", "dsm_barb*.tif", "dem_barb*.tif", "cdsm_barb*.tif", "landcover*.tif"),
+    "Gothenburg": ("Goteborg", "DSM_KRbig.tif", "DEM_KRbig.tif", "CDSM_KRbig.asc", "landcover.tif"),
+}
+PAVED = 1
+
+Filter = Callable[[TileData, RoadMask], RoadClusters]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A tile of which all is known."""
+
+    data: TileData
+    road: RoadMask
+    kind: np.ndarray
+
+    @property
+    def core(self) -> tuple[slice, slice]:
+        return self.data.grid.window(self.data.core)
+
+
+def two_lines(data: TileData, road: RoadMask) -> RoadClusters:
+    """Near the DTM, or high but flat over 60 cells."""
+    points, up = road.mask & np.isfinite(data.dsm), data.dsm - data.dtm
+    patches, _ = label(points & (up > LEVEL_M) & (np.hypot(*np.gradient(data.dsm)) < STEEP), np.ones((3, 3)))
+    large = np.bincount(patches.ravel()) > LARGE
+    large[0] = False
+    return RoadClusters(data.grid, (points & ((np.abs(up) <= LEVEL_M) | large[patches])).astype(np.int32))
+
+
+def of(module, options) -> Filter:
+    return lambda data, road: module.ecsrc(data, road, options)
+
+
+FILTERS: dict[str, Filter] = {
+    "off": of(ecsrc, ecsrc.Options(variant="off")),
+    "paper": of(ecsrc, ecsrc.Options(keep_largest=None)),
+    "two lines": two_lines,
+    "grounded": of(grounded, grounded.Options()),
+}
+
+
+def main() -> None:
+    tiles = int(sys.argv[1]) if len(sys.argv) > 1 else TILES
+    cases = [synthetic(*place) for place in gerod.survey(tiles, SEED)]
+    for function in FILTERS.values():
+        function(cases[0].data, cases[0].road)
+    print(f"{tiles} tiles of the benchmark, seed {SEED}; cells kept (%), by what the surface model shows")
+    for worse in WORSE:
+        show(
+            worse,
+            *(kept(degraded(case, worse, i), f) for f in FILTERS.values() for i, case in enumerate(cases)),
+        )
+    print("\nroads fitted with unit weights and with the paper's; L2 and RMSE (m), MAD (degrees)")
+    for worse in ("as given", "noise and scars"):
+        fitted_table(worse, [degraded(case, worse, i) for i, case in enumerate(cases)])
+    if folder := os.environ.get("FLEXROAD_REAL_DATA"):
+        real(Path(folder) / "umep")
+
+
+def show(name: str, *rows: pd.Series) -> None:
+    """Print one line a filter: the rows are its cases, one filter after the other."""
+    each = len(rows) // len(FILTERS)
+    sums = {f: sum(rows[i * each : (i + 1) * each]) for i, f in enumerate(FILTERS)}
+    table = pd.DataFrame({f: 100 * row.xs("kept") / row.xs("all") for f, row in sums.items()}).T
+    table["ms"] = table.pop("ms") / 100
+    table = table.dropna(axis=1)
+    cells = next(iter(sums.values())).xs("all")[table.columns].drop(["precision", "ms"])
+    print(f"\nDTM {name}; cells: {', '.join(f'{k} {n:.0f}' for k, n in cells.items())}")
+    print(table.round(1).to_string(), flush=True)
+
+
+def kept(case: Case, function: Filter) -> pd.Series:
+    """Return how many cells of each kind there are and are kept; under precision, of those kept the sound."""
+    start = time.process_time()
+    mask = function(case.data, case.road).mask[case.core]
+    ms = 1e3 * (time.process_time() - start)
+    kind, points = case.kind[case.core], (case.road.mask & np.isfinite(case.data.dsm))[case.core]
+    off = np.abs(case.data.dsm - case.data.reference)[case.core]
+    sound = points & (np.isin(kind, BARE) | (off <= SOUND_M))
+    found = {"precision": (np.sum(mask & sound), np.sum(mask))}
+    found |= {"recall": (np.sum(mask & sound), np.sum(sound))}
+    parts = {"decks": points & (kind == Kind.DECK)}
+    parts |= {k.name.lower().replace("_", " "): points & (kind == k) & (off > SOUND_M) for k in SPOILERS}
+    found |= {name: (np.sum(mask & part), np.sum(part)) for name, part in parts.items()}
+    table = pd.DataFrame({**found, "ms": (ms, 1)}, index=["kept", "all"])
+    return table.stack()
+
+
+def fitted_table(name: str, cases: Sequence[Case]) -> None:
+    fits = {
+        "unit": nurbs.Options(weights="unit", solver="irls", spacing_m=7.3),
+        "paper": nurbs.Options(spacing_m=7.3),
+    }
+    rows = {
+        (weights, f): pd.DataFrame([fitted(case, function, options) for case in cases]).mean()
+        for weights, options in fits.items()
+        for f, function in FILTERS.items()
+    }
+    print(f"\nDTM {name}\n{pd.DataFrame(rows).T.round(3).to_string()}", flush=True)
+
+
+def fitted(case: Case, function: Filter, options: nurbs.Options) -> dict[str, float]:
+    """Return the figures of the mesh, and the surface's mean distance to the true road below crowns."""
+    data, road = case.data, case.road
+    clusters = function(data, road)
+    surface = nurbs.fit(data, clusters, options)
+    found = evaluate.evaluate(
+        sample.sample(surface, road, clusters, sample.Options()), data, road, evaluate.Options()
+    )
+    at = surface.lattice(data.core.eastings, data.core.northings)
+    truth = data.reference[case.core]
+    true_road = road.mask if data.reference_road is None else data.reference_road
+    below = (case.kind == Kind.CROWN)[case.core] & true_road[case.core] & np.isfinite(truth)
+    return {
+        "road L2": found.l2_road_m,
+        "road RMSE": found.rmse_road_m,
+        "road MAD": found.mad_road_deg,
+        "terrain L2": found.l2_terrain_m,
+        "road L2 below crowns": float(np.abs(at - truth)[below].mean()) if below.any() else np.nan,
+    }
+
+
+def synthetic(tile_id: str, core: Grid, stratum: str, options) -> Case:
+    grid = core.buffered(HALO_M)
+    scene: Scene = make_scene(grid, SEED, stratum, options)
+    data = TileData(
+        tile_id, grid, core, scene.dsm, scene.dtm, scene.road_mask, scene.reference, scene.reference_road
+    )
+    return Case(data, RoadMask(grid, core, scene.road_mask, np.zeros(grid.shape, np.bool_)), scene.kind)
+
+
+def degraded(case: Case, worse: str, seed: int) -> Case:
+    dtm = WORSE[worse](case, np.random.default_rng(seed))
+    return replace(case, data=replace(case.data, dtm=dtm))
+
+
+def with_scars(case: Case, rng: np.random.Generator) -> Floats:
+    """Noise, and tilted patches of 8 to 20 m that are off, as houses taken out leave them."""
+    dtm = case.data.dtm + NOISE_M * rng.standard_normal(case.data.dtm.shape)
+    row, col = np.indices(dtm.shape)
+    for _ in range(dtm.size // SCAR_SHARE_M2):
+        i, j = rng.uniform(0, 1, 2) * dtm.shape
+        turn, (length, width) = rng.uniform(0, np.pi), rng.uniform(4, 10, 2)
+        u = (col - j) * np.cos(turn) + (row - i) * np.sin(turn)
+        v = (row - i) * np.cos(turn) - (col - j) * np.sin(turn)
+        off = rng.normal(0, SCAR_M) + rng.normal(0, SCAR_M / 2) * u / length
+        dtm += np.where((np.abs(u) < length) & (np.abs(v) < width), off, 0)
+    return dtm
+
+
+def below_decks(case: Case, rng: np.random.Generator) -> Floats:
+    """The terrain model has no height under bridges."""
+    deck = binary_dilation(case.data.reference - case.data.dtm > DECK_M, iterations=BEYOND)
+    return np.where(deck, np.nan, case.data.dtm)
+
+
+def across_decks(case: Case, rng: np.random.Generator) -> Floats:
+    """The terrain model is interpolated across what lies under bridges."""
+    dtm = below_decks(case, rng)
+    gap = np.isnan(dtm)
+    if gap.any():
+        rim = binary_dilation(gap, iterations=2) & ~gap
+        way = {m: griddata(np.argwhere(rim), dtm[rim], np.argwhere(gap), m) for m in ("linear", "nearest")}
+        dtm[gap] = np.where(np.isnan(way["linear"]), way["nearest"], way["linear"])
+    return dtm
+
+
+WORSE: dict[str, Callable[[Case, np.random.Generator], Floats]] = {
+    "as given": lambda case, rng: case.data.dtm,
+    "noise and scars": with_scars,
+    "interpolated across bridges": across_decks,
+    "unknown under bridges": below_decks,
+    f"{OFFSET_M} m too high": lambda case, rng: case.data.dtm + OFFSET_M,
+}
+
+
+def real(folder: Path) -> None:
+    for name, files in PLACES.items():
+        case = town(folder, *files)
+        print(f"\n{name}: DSM and canopies; truth is the DTM as it was, roads are all that is paved")
+        for worse in ("as given", "noise and scars", f"{OFFSET_M} m too high"):
+            show(worse, *(kept(degraded(case, worse, 0), f) for f in FILTERS.values()))
+        fitted_table("noise and scars", [degraded(case, "noise and scars", 0)])
+
+
+def town(folder: Path, name: str, *patterns: str) -> Case:
+    with tempfile.TemporaryDirectory() as scratch:
+        with zipfile.ZipFile(next(folder.glob(f"{name}*.zip"))) as archive:
+            archive.extractall(scratch)
+        dsm, dem, canopy, cover = (_read(next(Path(scratch).rglob(pattern))) for pattern in patterns)
+    grid = Grid("EPSG:25832", 0.0, float(dem.shape[0]), 1.0, dem.shape[1], dem.shape[0])
+    covered = (canopy > 0) & (dem + canopy > dsm)
+    kind = np.where(dsm - dem > SOUND_M, Kind.BUILDING, Kind.GROUND)
+    mask = (cover == PAVED) & np.isfinite(dsm) & np.isfinite(dem)
+    data = TileData(name, grid, grid, np.where(covered, dem + canopy, dsm), dem, mask, dem)
+    return Case(data, RoadMask(grid, grid, mask, ~np.isfinite(dem)), np.where(covered, Kind.CROWN, kind))
+
+
+def _read(path: Path) -> Floats:
+    with rasterio.open(path) as raster:
+        values: Floats = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+        return values
+
+
+if __name__ == "__main__":
+    main()
