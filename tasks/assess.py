@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt, label, uniform_filter
-from scipy.stats import median_abs_deviation
 
 from tasks import options as base
 from tasks.fit.nurbs import MAX_LOG_WEIGHT
 from tasks.nurbs import NurbsSurface
+from tasks.spread import mean, nmad
 from tasks.support import AGREE_M, Support, rise, support
 from tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
@@ -107,18 +107,18 @@ def assess(
     residuals, to_dtm = _finite(off_dsm[kept]), _finite(off_dtm[on_road])
     figures = {
         "residual_median_m": _quantile(residuals, 50),
-        "residual_nmad_m": _nmad(residuals),
+        "residual_nmad_m": nmad(residuals),
         "residual_p95_m": _quantile(np.abs(residuals), 95),
         "curvature_per_m": _largest(_bends(height, on_road) / cell**2),
         "edge_step_m": _quantile(_edge_steps(height, on_road), 95),
-        "measured_road": _mean(rests_on[on_road] == Support.MEASURED),
-        "dtm_road": _mean(rests_on[on_road] == Support.DTM),
-        "inferred_road": _mean(rests_on[on_road] == Support.INFERRED),
-        "dropped_road": _mean(~kept[on_road]),
+        "measured_road": mean(rests_on[on_road] == Support.MEASURED),
+        "dtm_road": mean(rests_on[on_road] == Support.DTM),
+        "inferred_road": mean(rests_on[on_road] == Support.INFERRED),
+        "dropped_road": mean(~kept[on_road]),
         "off_dtm_m": _quantile(to_dtm, 50),
-        "off_dtm_road": _mean(np.abs(to_dtm) > options.agree_m),
+        "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _bounded(surface),
-        "doubt_m": _mean(_finite(doubted[on_road])),
+        "doubt_m": mean(_finite(doubted[on_road])),
         "doubted_m2": _patch(on_road & (doubted > options.agree_m)) * cell**2,
     }
     flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
@@ -191,15 +191,11 @@ def _patch(cells: Bools) -> int:
 def _bounded(surface: Surface) -> float:
     if not isinstance(surface, NurbsSurface):
         return float("nan")
-    return _mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))
+    return mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))
 
 
 def _finite(values: Floats) -> Floats:
     return values[np.isfinite(values)]
-
-
-def _mean(values: Floats | Bools) -> float:
-    return float(values.mean()) if values.size else float("nan")
 
 
 def _largest(values: Floats) -> float:
@@ -208,7 +204,3 @@ def _largest(values: Floats) -> float:
 
 def _quantile(values: Floats, percent: float) -> float:
     return float(np.percentile(values, percent)) if values.size else float("nan")
-
-
-def _nmad(values: Floats) -> float:
-    return float(median_abs_deviation(values, scale="normal")) if values.size else float("nan")

@@ -16,12 +16,10 @@ from tasks import options as base
 from tasks.drape import drape
 from tasks.mad import mean_angles
 from tasks.nearest import nearest
+from tasks.spread import mean, nmad
 from tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, TileData
 
 VERSION = 1
-
-GAUSSIAN = 1.4826
-"""Standard deviation of a normal distribution by its median absolute deviation."""
 
 
 class Options(base.Options):
@@ -67,29 +65,20 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
     in_space = _in_space(mesh, data, heights, off) if options.nearest else np.full(off.shape, np.nan)
     angles = _angles(mesh, data, is_road)
     return Metrics(
-        l2_road_m=_mean(np.abs(on_road)),
-        l2_terrain_m=_mean(np.abs(on_terrain)),
-        rmse_road_m=float(np.sqrt(_mean(on_road**2))),
-        rmse_terrain_m=float(np.sqrt(_mean(on_terrain**2))),
-        nmad_road_m=_nmad(on_road),
+        l2_road_m=mean(np.abs(on_road)),
+        l2_terrain_m=mean(np.abs(on_terrain)),
+        rmse_road_m=float(np.sqrt(mean(on_road**2))),
+        rmse_terrain_m=float(np.sqrt(mean(on_terrain**2))),
+        nmad_road_m=nmad(on_road),
         p95_road_m=float(np.percentile(np.abs(on_road), 95)) if on_road.size else float("nan"),
-        nearest_road_m=_mean(in_space[both & classes[0]]),
-        nearest_terrain_m=_mean(in_space[both & classes[1]]),
+        nearest_road_m=mean(in_space[both & classes[0]]),
+        nearest_terrain_m=mean(in_space[both & classes[1]]),
         mad_road_deg=angles[0],
         mad_terrain_deg=angles[1],
         triangles=len(mesh.faces),
-        road_fraction=_mean(is_road[window][known]),
-        completeness=_mean(both[known]),
+        road_fraction=mean(is_road[window][known]),
+        completeness=mean(both[known]),
     )
-
-
-def _mean(values: Floats | Bools) -> float:
-    return float(values.mean()) if values.size else float("nan")
-
-
-def _nmad(off: Floats) -> float:
-    """Return the standard deviation of the signed distances, from their median absolute deviation (m)."""
-    return float(GAUSSIAN * np.median(np.abs(off - np.median(off)))) if off.size else float("nan")
 
 
 def _in_space(mesh: Mesh, data: TileData, heights: Floats, off: Floats) -> Floats:
@@ -115,5 +104,5 @@ def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
     for faces, cells in ((face_is_road, core_is_road), (~face_is_road, ~core_is_road)):
         chosen = per_face[faces] if faces.any() else per_face
         chosen = chosen[np.isfinite(chosen)]
-        found.append(_mean(chosen) if cells.any() else float("nan"))
+        found.append(mean(chosen) if cells.any() else float("nan"))
     return found[0], found[1]
