@@ -60,9 +60,15 @@ CHOICES: dict[str, dict[str, object]] = {
     },
     "bending 100 on roads, 50, terrain 0.3": {**PLATE, **grid(50), **LESS},
     "bending 100 on roads, 35, terrain 0.3": {**PLATE, **LESS},
-    "the same with 70, Huber 0.1": {**PLATE, **grid(70), **LESS, "huber_m": 0.1},
-    "the same with 70, auto": {**PLATE, **grid(70), **LESS, "bending_m3": "auto"},
-}
+    "bending auto on roads, 70, terrain 0.3": {**PLATE, **grid(70), **LESS, "bending_m3": "auto"},
+    **{
+        f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1": {**PLATE, **grid(n), **LESS, "huber_m": 0.1}
+        for n in (50, 70)
+    },
+    "bending 100 on roads, 50, terrain 0.5, Huber 0.1": {
+        **PLATE, **grid(50), "lambda_terrain": 0.5, "huber_m": 0.1,
+    },
+}  # fmt: skip
 """Name: options of the fit. The number behind the smoothness is that of control points each way."""
 
 
@@ -169,9 +175,12 @@ def picture(table: pd.DataFrame, path: Path) -> None:
         "bending 100 m³, 35 / 50 / 70, terrain 0.3": [
             f"bending 100 on roads, {n}, terrain 0.3" for n in (35, 50, 70)
         ],
-        "auto": ["the same with 70, auto"],
+        "the same, 50 / 70, Huber 0.1": [
+            f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1" for n in (50, 70)
+        ],
+        "auto": ["bending auto on roads, 70, terrain 0.3"],
     }
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(10, 5.2), sharey=True, layout="constrained")
     for axis, roads in zip(axes, ("paper", "perfect"), strict=True):
         part = table.loc["reported on"].loc[roads]
         for name, choices in families.items():
@@ -180,7 +189,7 @@ def picture(table: pd.DataFrame, path: Path) -> None:
         axis.set(title=f"{roads} filter", xlabel="road L2 (m)")
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("road MAD (degrees)")
-    axes[1].legend(fontsize=8, frameon=False)
+    figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.savefig(path, dpi=110)
 
 
