@@ -72,7 +72,7 @@ def _photo(data: TileData, about: About, path: Path) -> Photo | None:
     if photo is None:
         raise TaskError(
             f"the tile has no orthophoto (layer dop), and {path.name} was trained with colours: give --dop "
-            "to `flexroad catalog rasters`, or train a model on heights alone (photo: false)",
+            "to `flexroad catalog rasters`, or train a model on heights alone (--set photo=false)",
             layer="dop",
         )
     return photo

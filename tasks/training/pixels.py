@@ -231,7 +231,7 @@ def _draw(samples: Sequence[Sample], options: Options, name: str) -> _Cells:
         if wanted and photo is None:
             raise TaskError(
                 f"tile {data.tile_id} has no orthophoto (layer dop): give --dop to `flexroad catalog "
-                "rasters`, leave the tile out, or learn from heights alone (photo: false)",
+                "rasters`, leave the tile out, or learn from heights alone (--set photo=false)",
                 layer="dop",
             )
         found = features(data, photo)
