@@ -22,6 +22,7 @@ from tasks import options as base
 from tasks.flat_patches import Patches, flat_patches
 from tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
 from tasks.local_plane import ALONE, ON, against_known
+from tasks.support import unsound
 from tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 1
@@ -86,7 +87,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     -------
     RoadClusters
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
-        no cluster is large enough.
+        no cluster is large enough. With them, the dropped cells where the DTM is not the road's either:
+        under a car on a bridge it is the valley's.
     """
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
@@ -97,7 +99,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     near = against_known(data.dsm, data.dtm, ground, points & ~ground, reach, theta)
     level = np.abs(data.dsm - data.dtm) <= theta
     kept = ground | (near == ON) | (points & ~ground & (near == ALONE) & level)
-    return RoadClusters(data.grid, _labels(kept, cell, options))
+    labels = _labels(kept, cell, options)
+    return RoadClusters(data.grid, labels, unsound(data, road, labels > 0))
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

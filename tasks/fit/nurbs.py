@@ -24,6 +24,7 @@ from tasks.objective import Objective, objective
 from tasks.options import Options as BaseOptions
 from tasks.planes import least_squares_plane
 from tasks.stiffness import stiffest
+from tasks.support import without_unsound
 from tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
@@ -108,7 +109,7 @@ class Options(BaseOptions):
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
-    """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere.
+    """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere, where that is sound.
 
     Raises
     ------
@@ -116,7 +117,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         If there are fewer cells with a height than control points, if there is nothing to start from, or if
         the device is not there.
     """
-    space = spline_space(data.grid, options)
+    data, space = without_unsound(data, clusters), spline_space(data.grid, options)
     start, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
     if options.solver == "irls":

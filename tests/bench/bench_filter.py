@@ -1,8 +1,9 @@
 """The filters beside each other: what they keep of each kind of cell, and what the fit makes of it.
 
 ``PYTHONPATH=. python tests/bench/bench_filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
-number. The default options of `tasks.grounded` were chosen on seeds 5 to 7; here is seed 1. With
-FLEXROAD_REAL_DATA two real towns follow, with their canopies laid over the surface model.
+number; with a second word, the file of that page's figure is drawn instead. The default options of
+`tasks.grounded` were chosen on seeds 5 to 7; here is seed 1. With FLEXROAD_REAL_DATA two real towns follow,
+with their canopies laid over the surface model.
 
 A cell is sound if the surface model shows the ground, with noise, or is within `SOUND_M` of it.
 """
@@ -91,6 +92,9 @@ FILTERS: dict[str, Filter] = {
 def main() -> None:
     tiles = int(sys.argv[1]) if len(sys.argv) > 1 else TILES
     cases = [synthetic(*place) for place in gerod.survey(tiles, SEED)]
+    if len(sys.argv) > 2:
+        picture(cases, Path(sys.argv[2]))
+        return
     for function in FILTERS.values():
         function(cases[0].data, cases[0].road)
     print(f"{tiles} tiles of the benchmark, seed {SEED}; cells kept (%), by what the surface model shows")
@@ -167,6 +171,50 @@ def fitted(case: Case, function: Filter, options: nurbs.Options) -> dict[str, fl
         "terrain L2": found.l2_terrain_m,
         "road L2 below crowns": float(np.abs(at - truth)[below].mean()) if below.any() else np.nan,
     }
+
+
+def picture(cases: Sequence[Case], path: Path) -> None:
+    """Draw the street with the most spoiled cells around a deck: what each filter keeps."""
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    case, window = _busiest(cases)
+    data, mask = case.data, case.road.mask[window]
+    sound = np.isin(case.kind, BARE) | (np.abs(data.dsm - data.reference) <= SOUND_M)
+    colours = ["white", "#b8c4cc", "#3b5568", "#e6d9a8", "#c8102e"]
+    figure, axes = plt.subplots(1, 4, figsize=(13, 3.7), layout="constrained")
+    up = axes[0].imshow((data.dsm - data.dtm)[window], cmap="magma", vmin=0, vmax=8)
+    axes[0].set_title("DSM over DTM (m)")
+    axes[0].contour(mask, levels=[0.5], colors="white", linewidths=0.6)
+    figure.colorbar(up, ax=axes[0], shrink=0.8)
+    for axis, name in zip(axes[1:], ("paper", "two lines", "grounded"), strict=True):
+        keeps = FILTERS[name](data, case.road).mask[window]
+        shown = np.select([~mask, keeps & sound[window], keeps, sound[window]], [0, 2, 4, 1], 3)
+        axis.imshow(shown, cmap=ListedColormap(colours), vmin=0, vmax=4, interpolation="nearest")
+        axis.set_title(name)
+    names = ["", "road lost", "road kept", "spoiled cell dropped", "spoiled cell kept"]
+    key = [Patch(color=colours[i], label=names[i]) for i in (2, 1, 3, 4)]
+    figure.legend(handles=key, loc="outside lower center", ncols=4, frameon=False)
+    for axis in axes:
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.savefig(path, dpi=110)
+
+
+def _busiest(cases: Sequence[Case], half: int = 35) -> tuple[Case, tuple[slice, slice]]:
+    """Return the square of 70 m with a deck in it and the most spoiled road cells."""
+    best = (-1.0, cases[0], (slice(0), slice(0)))
+    for case in cases:
+        spoiled = case.road.mask & ~np.isin(case.kind, BARE)
+        deck = case.road.mask & (case.kind == Kind.DECK)
+        for r in range(half, spoiled.shape[0] - half, 10):
+            for c in range(half, spoiled.shape[1] - half, 10):
+                window = (slice(r - half, r + half), slice(c - half, c + half))
+                inner = (slice(r - half // 2, r + half // 2), slice(c - half // 2, c + half // 2))
+                count = float(spoiled[window].sum()) * (deck[inner].sum() > 80)
+                best = max(best, (count, case, window), key=lambda found: found[0])
+    return best[1:]
 
 
 def synthetic(tile_id: str, core: Grid, stratum: str, options) -> Case:
