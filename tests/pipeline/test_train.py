@@ -70,7 +70,10 @@ def test_the_report_tells_what_the_segmenter_does_on_the_judged_tiles(land, trai
     assert {*told["asked"]["judged by"], *told["asked"]["learnt from"]} == {
         t.id for t in Catalog.read(land).tiles
     }
-    assert len(told["history"]) == 15
+    # At most the rounds asked for: how many, strips of the training tiles decide.
+    losses = [entry["train_loss"] for entry in told["history"]]
+    assert 1 < len(losses) <= 15
+    assert losses[-1] < losses[0]
 
 
 def test_the_page_stands_alone_and_shows_tiles(trained):
