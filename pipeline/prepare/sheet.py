@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import compress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -207,8 +208,9 @@ class Sheet:
             # Whether a date is assumed is told once, of the tiles that stay.
             notes = tuple(note for note in indexed.notes if "--date" not in note)
         with rasterio.open(self.scratch / "dsm.tif") as dsm:
-            kept = tuple(tile for tile in tiles if _share(dsm, self.grid, tile.grid) >= MIN_COVER)
-        thin = [tile.id for tile in tiles if tile not in kept]
+            enough = [_share(dsm, self.grid, tile.grid) >= MIN_COVER for tile in tiles]
+        kept = tuple(compress(tiles, enough))
+        thin = [tile.id for tile, stays in zip(tiles, enough, strict=True) if not stays]
         if not kept:
             raise ConfigError(
                 f"no tile of {self.out} would have heights in {MIN_COVER:.0%} of its cells; "
