@@ -1,5 +1,9 @@
-"""What the pipeline itself complains about, before any tile is touched."""
+"""What the pipeline itself complains about: before any tile is touched, and when nobody is left to do them."""
 
 
 class ConfigError(Exception):
     """A configuration or run folder that cannot be used; one line naming file, key, value and remedy."""
+
+
+class ClusterLost(Exception):
+    """Scheduler or workers went away in mid-run and stayed away; the same command goes on from there."""

@@ -1,8 +1,4 @@
-"""Run jobs one after the other or on Dask; the only file that knows Dask.
-
-One Dask task is one tile: its graph is pulled inside a single process, so that no raster ever travels
-(``docs/decisions.md`` has the measurement against one task per stage).
-"""
+"""Many jobs at once, on Dask: a window of them in flight, the rest not yet made."""
 
 from __future__ import annotations
 
@@ -13,37 +9,11 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from pipeline import ONE_THREAD
 from pipeline.errors import ConfigError
-
-J = TypeVar("J")
-R = TypeVar("R")
-
-
-class Executor(Protocol):
-    """Runs a function over jobs."""
-
-    def map(
-        self,
-        function: Callable[[J], R],
-        jobs: Iterable[J],
-        lost: Callable[[J, str], R],
-    ) -> Iterator[R]:
-        """Yield results as they come, in any order, with a bounded number of jobs in flight.
-
-        ``lost`` makes the result of a job whose process died more often than is bearable.
-        """
-
-
-class SerialExecutor:
-    """One job after the other in this process; the one to debug with."""
-
-    def map(self, function: Callable[[J], R], jobs: Iterable[J], lost: Callable[[J, str], R]) -> Iterator[R]:
-        """Yield results in the jobs' order."""
-        for job in jobs:
-            yield function(job)
+from pipeline.execute.executor import J, R
 
 
 class DaskExecutor:
@@ -64,7 +34,13 @@ class DaskExecutor:
         self.scheduler = scheduler
         self.tries = tries
 
-    def map(self, function: Callable[[J], R], jobs: Iterable[J], lost: Callable[[J, str], R]) -> Iterator[R]:
+    def map(
+        self,
+        function: Callable[[J], R],
+        jobs: Iterable[J],
+        lost: Callable[[J, str], R],
+        probe: Callable[[], None] | None = None,
+    ) -> Iterator[R]:
         """Yield results as tiles finish."""
         from distributed import as_completed
 
