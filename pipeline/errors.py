@@ -1,4 +1,4 @@
-"""What the pipeline itself complains about: before any tile is touched, and when nobody is left to do them."""
+"""What the pipeline itself complains about: before any tile is touched, or when nobody is left to work."""
 
 
 class ConfigError(Exception):
