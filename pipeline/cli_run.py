@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,10 +13,9 @@ import typer
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from catalog import Tile
     from pipeline.execute import Executor
-    from pipeline.graph import TileGraph
     from pipeline.run import Run
-    from pipeline.work import TileResult
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")]
@@ -57,9 +57,10 @@ def run(
             typer.echo(line)
         return
     some = bool(tile) or bbox is not None
-    opened = Run.create(out, chosen, asked(out, whole, tiles) if some else whole, store, checksum)
-    only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
-    _carry_out(opened, _executor(executor, workers, scheduler), only)
+    with _alone(out, make=True):
+        opened = Run.create(out, chosen, asked(out, whole, tiles) if some else whole, store, checksum)
+        only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
+        _carry_out(opened, _executor(executor, workers, scheduler), only)
 
 
 def rerun(
@@ -80,9 +81,24 @@ def rerun(
     if from_stage is not None and from_stage not in STAGE_NAMES:
         raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
     anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
-    opened = Run.open(path)
-    only = select(opened, tile or (), failed)
-    _carry_out(opened, _executor(executor, workers, scheduler), only, anew)
+    with _alone(path):
+        opened = Run.open(path)
+        only = select(opened, tile or (), failed)
+        _carry_out(opened, _executor(executor, workers, scheduler), only, anew)
+
+
+@contextlib.contextmanager
+def _alone(path: Path, make: bool = False) -> Iterator[None]:
+    """Keep other runs out of the folder; ``make`` it if it is not there."""
+    from pipeline.lock import held
+
+    try:
+        if make:
+            path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
+    with held(path, lambda line: typer.echo(f"note: {line}", err=True)):
+        yield
 
 
 def _executor(name: str, workers: int | None, scheduler: str | None) -> Executor:
@@ -98,7 +114,7 @@ def _executor(name: str, workers: int | None, scheduler: str | None) -> Executor
 def _carry_out(
     run: Run,
     executor: Executor,
-    only: Callable[[TileGraph], bool],
+    only: Callable[[Tile], bool],
     anew: frozenset[str] = frozenset(),
 ) -> None:
     import signal
@@ -106,28 +122,26 @@ def _carry_out(
     from rich.console import Console
 
     from pipeline.progress import Watch
-    from pipeline.run import execute, summary
+    from pipeline.run import execute
 
     # An operator's `kill` ends the run as Ctrl-C does: workers gone, tables written.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    total = sum(1 for graph in run.graphs() if only(graph))
+    total = sum(map(only, run.catalog.tiles))
     folder = shlex.quote(str(run.path))
-    results: list[TileResult]
     try:
         with Watch(total, Console(stderr=True)) as watch:
-            results = execute(run, executor, only, anew, watch)
+            how = execute(run, executor, only, anew, watch)
     except KeyboardInterrupt:
         typer.echo("interrupted; the same command goes on from here", err=True)
         raise typer.Exit(130) from None
     except OSError as error:
         typer.echo(f"error: {error}; make room, then `flexroad rerun {folder}` goes on from here", err=True)
         raise typer.Exit(1) from None
-    how = summary(run, results)
     typer.echo(
         f"{how.tiles} tiles: {how.done} done ({how.cached} cached), {how.failed} failed, "
         f"{how.pending} pending; results in {run.path}"
     )
-    if results and all(result.status == "cached" for result in results):
+    if set(watch.status) == {"cached"}:
         typer.echo("nothing had changed; `flexroad rerun RUN --from load` computes all anew")
     if how.failed:
         typer.echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")

@@ -27,7 +27,7 @@ from typing import Any
 
 import yaml
 
-from catalog import Catalog
+from catalog import Catalog, Tile
 from pipeline.config import Config, load_config
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
@@ -141,7 +141,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a run went, over all its tiles."""
+    """How a run stands, over all its tiles."""
 
     tiles: int
     done: int
@@ -150,16 +150,24 @@ class Summary:
     cached: int
     """Of those done, how many the last run found done already."""
     pending: int
+    new: int
+    """Tiles the last run saw for the first time."""
+    changed: int
+    """Tiles whose sources or options the last run found changed."""
+    vanished: int
+    """Tiles that the catalog no longer had when the last run began."""
+    seconds: float
+    """How long the last run took."""
     failures: tuple[Failure, ...]
 
 
 def execute(
     run: Run,
     executor: Executor,
-    only: Callable[[TileGraph], bool] = lambda graph: True,
+    only: Callable[[Tile], bool] = lambda tile: True,
     anew: frozenset[str] = frozenset(),
     watch: Callable[[TileResult], None] = lambda result: None,
-) -> list[TileResult]:
+) -> Summary:
     """Bring the run's tiles up to date and write the tables.
 
     Parameters
@@ -192,7 +200,7 @@ def execute(
         cold = True
         # Unlike `Run.graphs`: who wants a tile done wants to know that its sources are gone.
         for graph in tile_graphs(run.catalog, run.config, run.checksum):
-            if not only(graph):
+            if not only(graph.tile):
                 continue
             if not anew and run.folder(graph.tile.id).done(graph):
                 note(TileResult(graph.tile.id, "cached", ()))
@@ -210,7 +218,7 @@ def execute(
         # Also after an interruption: what is done is in the tables.
         write_tables(run.path, *outcome(run, results))
         run.log("end", seconds=round(time.perf_counter() - start, 3))
-    return results
+    return summary(run, results)
 
 
 def check_models(config: Config) -> None:
@@ -266,11 +274,20 @@ def summary(run: Run, results: Sequence[TileResult] = ()) -> Summary:
     total = len(run.catalog.tiles)
     cached = _cached(run.path / "log.jsonl") & done
     return Summary(
-        total, len(done), len(failed), len(cached), total - len(done) - len(failed), tuple(failures)
+        total,
+        len(done),
+        len(failed),
+        len(cached),
+        total - len(done) - len(failed),
+        0,
+        0,
+        0,
+        0.0,
+        tuple(failures),
     )
 
 
-def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[TileGraph], bool]:
+def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
     """Return which tiles a rerun means: those named, those failed, both, or all.
 
     Raises
@@ -280,11 +297,11 @@ def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[TileGraph]
     """
     named = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
 
-    def chosen(graph: TileGraph) -> bool:
-        if graph.tile.id in named or not (named or failed):
+    def chosen(tile: Tile) -> bool:
+        if tile.id in named or not (named or failed):
             return True
         # Whatever it failed of: a file mended since is why it is tried again.
-        return failed and run.folder(graph.tile.id).gave_up()
+        return failed and run.folder(tile.id).gave_up()
 
     return chosen
 

@@ -65,17 +65,19 @@ def brief(name):
 def test_stages_in_common_run_once(one_tile, tmp_path):
     store = tmp_path / "store"
     run = Run.create(tmp_path / "ours", brief("ablation"), one_tile, store)
-    (result,) = execute(run, SerialExecutor())
+    results = []
+    execute(run, SerialExecutor(), watch=results.append)
+    (result,) = results
     assert result.failures == ()
     assert {stage: result.computed[stage] for stage in NODES} == NODES
     assert len(read_metrics(run.path)) == VARIANTS
 
     true = Run.create(tmp_path / "true", brief("ablation_true"), one_tile, store)
-    (again,) = execute(true, SerialExecutor())
+    execute(true, SerialExecutor(), watch=results.append)
+    again = results[-1]
     # Rasters are not stored, as `load` reads them anyway, and of meshes only the exported one.
     rasters = 2
     once_more = {"load": 1, "fit": rasters, "sample": VARIANTS - 1, "evaluate": VARIANTS, "export": 1}
     assert again.computed == once_more
 
-    (third,) = execute(run, SerialExecutor())
-    assert third.status == "cached"
+    assert execute(run, SerialExecutor()).cached == 1

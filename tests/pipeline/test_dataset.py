@@ -12,7 +12,7 @@ from pipeline.run import Run, execute
 
 def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
-    execute(run, SerialExecutor(), only=lambda graph: graph.tile == run.catalog.tiles[0])
+    execute(run, SerialExecutor(), only=lambda tile: tile == run.catalog.tiles[0])
     tile = run.catalog.tiles[0]
     found = open_tile(run.path, tile.id)
     assert set(found.data_vars) == {

@@ -14,6 +14,7 @@ from pipeline.errors import ConfigError
 from pipeline.run import Run, execute, select, summary
 from pipeline.store import Store
 from pipeline.tables import read_metrics
+from pipeline.work import TileResult
 
 FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
@@ -35,6 +36,12 @@ def computed(results) -> Counter:
     return total
 
 
+def results_of(run, executor, *how) -> list[TileResult]:
+    results = []
+    execute(run, executor, *how, watch=results.append)
+    return results
+
+
 def times(n: int, counts=EACH) -> Counter:
     return Counter({stage: n * count for stage, count in counts.items()})
 
@@ -53,7 +60,7 @@ def spoil(run: Run, tile: int, layer: str = "dsm") -> tuple[str, bytes]:
 
 
 def test_rows_are_complete_and_what_is_shared_is_computed_once(run, executor):
-    results = execute(run, executor)
+    results = results_of(run, executor)
     assert computed(results) == times(4)
     rows = read_metrics(run.path)
     assert list(rows.columns[: len(FIXED)]) == FIXED
@@ -83,7 +90,7 @@ def test_executors_agree(survey, quick_config, tmp_path, cluster):
 def test_the_same_again_computes_nothing(run, executor):
     execute(run, executor)
     before = read_metrics(run.path)
-    results = execute(Run.open(run.path), executor)
+    results = results_of(Run.open(run.path), executor)
     assert {result.status for result in results} == {"cached"}
     assert computed(results) == Counter()
     pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
@@ -93,17 +100,17 @@ def test_the_same_again_computes_nothing(run, executor):
 
 def test_a_changed_option_computes_what_hangs_on_it(run, executor):
     execute(run, executor)
-    again = execute(changed(run, evaluate={"nearest": True}), executor)
+    again = results_of(changed(run, evaluate={"nearest": True}), executor)
     # What load reads is not kept, nor are meshes that are not exported: they are made again on the way.
     assert computed(again) == times(4, {"load": 1, "sample": 2, "fit": 1, "evaluate": 3, "export": 1})
     assert read_metrics(run.path).nearest_road_m.notna().all()
-    back = execute(changed(run), executor)
+    back = results_of(changed(run), executor)
     assert computed(back) == times(4, {"export": 1})
 
 
 def test_a_changed_filter_leaves_the_segmentation_alone(run, executor):
     execute(run, executor)
-    again = execute(changed(run, ecsrc={"theta_z_m": 0.1}), executor)
+    again = results_of(changed(run, ecsrc={"theta_z_m": 0.1}), executor)
     assert computed(again) == times(4, EACH) - times(4, {"segment": 1})
 
 
@@ -114,7 +121,7 @@ def test_a_changed_source_costs_its_own_tile(run, executor):
     with rasterio.open(path, "r+") as raster:
         heights = raster.read(1)
         raster.write(heights + 0.5, 1)
-    results = execute(Run.open(run.path), executor)
+    results = results_of(Run.open(run.path), executor)
     assert {r.tile_id: r.status for r in results if r.status != "cached"} == {tile.id: "done"}
     assert computed(results) == times(1)
 
@@ -122,7 +129,7 @@ def test_a_changed_source_costs_its_own_tile(run, executor):
 def test_a_shared_store_serves_another_run(run, executor, tmp_path):
     execute(run, executor)
     other = Run.create(tmp_path / "other", run.config, run.catalog, run.store)
-    assert computed(execute(other, executor)) == times(4, {"export": 1})
+    assert computed(results_of(other, executor)) == times(4, {"export": 1})
     assert not (tmp_path / "other" / "store").exists()
     left, right = (read_metrics(r.path) for r in (run, other))
     pd.testing.assert_frame_equal(left, right, check_exact=True)
@@ -131,7 +138,7 @@ def test_a_shared_store_serves_another_run(run, executor, tmp_path):
 
 def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
     broken, whole = spoil(run, 2)
-    results = execute(run, executor)
+    results = results_of(run, executor)
     assert {r.tile_id for r in results if r.status == "failed"} == {broken}
     rows = read_metrics(run.path)
     assert len(rows) == 12
@@ -149,9 +156,9 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
 
     tile = run.catalog.tiles[2]
     tile.paths(tile.layer("dsm"))[0].write_bytes(whole)
-    fixed = execute(run, executor, select(run, (), failed=True))
+    fixed = results_of(run, executor, select(run, (), failed=True))
     # The mended file has another time, so the failure on record is of another graph: it is pending.
-    fixed = fixed or execute(run, executor)
+    fixed = fixed or results_of(run, executor)
     assert computed(fixed) == times(1)
     assert summary(run).failed == 0
 
@@ -159,9 +166,9 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
 def test_rerun_means_the_tiles_named_or_failed(run, executor):
     broken, _ = spoil(run, 0)
     execute(run, executor)
-    assert [r.tile_id for r in execute(run, executor, select(run, (), failed=True))] == [broken]
+    assert [r.tile_id for r in results_of(run, executor, select(run, (), failed=True))] == [broken]
     one = run.catalog.tiles[3].id
-    results = execute(run, executor, select(run, (one,), failed=False))
+    results = results_of(run, executor, select(run, (one,), failed=False))
     assert [(r.tile_id, r.status) for r in results] == [(one, "cached")]
     assert len(read_metrics(run.path)) == 12
 
@@ -170,7 +177,7 @@ def test_from_a_stage_on_computes_it_and_what_follows(run, executor):
     execute(run, executor)
     one = run.catalog.tiles[3].id
     anew = frozenset({"fit", "sample", "evaluate"})
-    results = execute(run, executor, select(run, (one,), failed=False), anew)
+    results = results_of(run, executor, select(run, (one,), failed=False), anew)
     assert computed(results) == times(1, {"load": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1})
 
 
@@ -182,7 +189,7 @@ def test_a_damaged_artefact_is_made_again(run, executor):
         path.write_bytes(path.read_bytes()[:-40])
     for folder in (run.path / "tiles").iterdir():
         (folder / "item.json").unlink()
-    results = execute(run, executor)
+    results = results_of(run, executor)
     assert computed(results)["evaluate"] == 12
     assert computed(results)["ecsrc"] == 0
     after = read_metrics(run.path)
@@ -196,7 +203,7 @@ def test_a_lost_product_is_written_again(run, executor):
     (mesh,) = folder.glob("*.glb")
     whole = mesh.read_bytes()
     mesh.unlink()
-    assert computed(execute(run, executor)) == times(1, {"export": 1})
+    assert computed(results_of(run, executor)) == times(1, {"export": 1})
     assert mesh.read_bytes() == whole
 
 
@@ -211,12 +218,12 @@ def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
         put(self, node, value, seconds)
 
     monkeypatch.setattr(Store, "put", full)
-    results = execute(run, SerialExecutor())
+    results = results_of(run, SerialExecutor())
     failed = [r for r in results if r.status == "failed"]
     assert 0 < len(failed) < 4
     assert "No space left on device" in failed[0].failures[0].line
     monkeypatch.undo()
-    assert {r.status for r in execute(run, SerialExecutor())} == {"done", "cached"}
+    assert {r.status for r in results_of(run, SerialExecutor())} == {"done", "cached"}
     assert not list(run.path.rglob("*.tmp"))
 
 

@@ -43,7 +43,9 @@ def done(place, **segment):
     config = place / "config.yaml"
     config.write_text(yaml.safe_dump({**QUICK, "segment": options}, sort_keys=False))
     run = Run.create(place / "run", load_config(config), Catalog.read(place / "scenes" / "catalog.parquet"))
-    return {result.tile_id: result for result in execute(run, SerialExecutor())}
+    results = []
+    execute(run, SerialExecutor(), watch=results.append)
+    return {result.tile_id: result for result in results}
 
 
 def test_one_line_of_the_config_chooses_dinov2(place):
