@@ -372,9 +372,8 @@ def config_show(
         variant: {stage: options.model_dump(mode="json") for stage, options in chain.items()}
         for variant, chain in found.chains.items()
     }
-    _say(
-        yaml.safe_dump({"export": found.export.model_dump(mode="json"), "variants": chains}, sort_keys=False)
-    )
+    sections = {name: getattr(found, name).model_dump(mode="json") for name in ("export", "cluster")}
+    _say(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
 
 
 @configs.command("template")

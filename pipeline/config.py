@@ -18,12 +18,13 @@ from typing import Annotated, Any, Literal, Union
 import yaml
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
+from pipeline.cluster import Cluster
 from pipeline.errors import ConfigError
 from tasks import assess, ecsrc, evaluate, grounded, load, sample
 from tasks.options import Options
 
-TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method"}
-"""The option that a bare word stands for, by stage."""
+TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method", "cluster": "kind"}
+"""The option that a bare word stands for, by stage or section."""
 
 Chain = Mapping[str, Options]
 """The options of one variant, by stage, in the paper's order."""
@@ -46,7 +47,7 @@ class Export(Options):
 
 
 class Config(BaseModel):
-    """A whole run: the chain of every variant, and what is exported."""
+    """A whole run: the chain of every variant, what is exported, and who works."""
 
     model_config = {"frozen": True, "arbitrary_types_allowed": True}
 
@@ -54,6 +55,7 @@ class Config(BaseModel):
     chains: dict[str, dict[str, Any]]
     """Variant -> stage -> options (`Options`), in the file's and the paper's order."""
     export: Export
+    cluster: Cluster
     dataset: dict[str, Any]
     """Where a published dataset's files lie: for `catalog.sources`, which checks it."""
     raw: dict[str, Any]
@@ -121,7 +123,7 @@ def load_config(name: str | Path) -> Config:
 def compose(raw: Mapping[str, Any], name: str) -> Config:
     """Validate a configuration already read; ``name`` is what errors call it."""
     stages = list(stage_models())
-    known = ["dataset", *stages, "export", "variants"]
+    known = ["dataset", *stages, "export", "cluster", "variants"]
     _refuse_unknown(raw, known, name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
@@ -149,8 +151,10 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     for variant in export.variants:
         if variant not in chains:
             raise ConfigError(f"{name}: export.variants: no variant {variant!r}, only {', '.join(chains)}")
+    workers = _merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
+    cluster = _validate(TypeAdapter(Cluster), workers, f"{name}: cluster")
     dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
-    return Config(name=name, chains=chains, export=export, dataset=dataset, raw=dict(raw))
+    return Config(name=name, chains=chains, export=export, cluster=cluster, dataset=dataset, raw=dict(raw))
 
 
 def schema() -> dict[str, Any]:
@@ -163,6 +167,7 @@ def schema() -> dict[str, Any]:
         "dataset": {"type": "object", "description": "where a dataset's files lie: layers, road_values, crs"},
         **stages,
         "export": Export.model_json_schema(),
+        "cluster": {"anyOf": [{"type": "string"}, Cluster.model_json_schema()]},
         "variants": {"type": "object", "additionalProperties": variant},
     }
     return {"type": "object", "properties": properties, "additionalProperties": False}
@@ -182,7 +187,8 @@ def template() -> str:
                 lines.append(f"  # other methods: {', '.join(others)}")
         else:
             lines += _option_lines(importlib.import_module(f"tasks.{stage}").Options)
-    lines += ["export:", *_option_lines(Export), "variants:", "  flexroad: {}"]
+    lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
+    lines += ["variants:", "  flexroad: {}"]
     return "\n".join(lines) + "\n"
 
 

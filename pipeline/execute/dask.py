@@ -12,8 +12,11 @@ from itertools import chain, islice
 from typing import Any
 
 from pipeline import ONE_THREAD
+from pipeline.cluster import Cluster
 from pipeline.errors import ConfigError
 from pipeline.execute.executor import J, R
+
+LOCAL = Cluster()
 
 
 class DaskExecutor:
@@ -22,17 +25,32 @@ class DaskExecutor:
     Parameters
     ----------
     workers : int, optional
-        Number of processes; by default one per core.
+        Number of processes; by default what ``cluster`` says.
     scheduler : str, optional
         Address of a running Dask scheduler, used instead.
-    tries : int
-        How often a job may lose its worker before it counts as lost.
+    cluster : Cluster
+        Who works, and how long is waited for them.
+    dashboard : bool
+        Serve Dask's dashboard for local workers; where it is goes to ``say``.
+    say : callable
+        Told in one line what whoever watches wants to know: the dashboard, who is waited for.
     """
 
-    def __init__(self, workers: int | None = None, scheduler: str | None = None, tries: int = 2) -> None:
+    tries = 2
+
+    def __init__(
+        self,
+        workers: int | None = None,
+        scheduler: str | None = None,
+        cluster: Cluster = LOCAL,
+        dashboard: bool = False,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
         self.workers = workers
         self.scheduler = scheduler
-        self.tries = tries
+        self.cluster = cluster
+        self.dashboard = dashboard
+        self.say = say
 
     def map(
         self,

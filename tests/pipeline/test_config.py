@@ -105,7 +105,7 @@ def test_schema_knows_every_stage_and_option():
     properties = schema()["properties"]
     assert list(properties) == [
         "extends", "dataset", "load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export",
-        "variants",
+        "cluster", "variants",
     ]  # fmt: skip
     assert "theta_z_m" in json.dumps(properties["ecsrc"])
     assert "control_points" in json.dumps(properties["fit"])
