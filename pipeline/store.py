@@ -1,7 +1,7 @@
 """The only writer of results: artefacts by fingerprint, and tiles whose marker is written last.
 
-Everything is written to a temporary name in the same folder and then renamed, so that a reader sees a whole
-file or none, whatever killed the writer. ::
+Everything is written to a temporary name in the same folder and then renamed, or put into a bucket by one
+request, so that a reader sees a whole file or none, whatever killed the writer. ::
 
     STORE/<stage>/<ab>/<fingerprint>.npz
     RUN/tiles/<tile>/<tile>_<variant>.glb ...   the products
@@ -11,12 +11,10 @@ file or none, whatever killed the writer. ::
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
 import os
-import uuid
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -24,31 +22,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from catalog import places
+from catalog.places import Place
 from pipeline import codec
 from pipeline.graph import Node, TileGraph
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all.
+def write_atomic(where: Place, data: bytes) -> None:
+    """Write a file whole or not at all, on disk or in a bucket.
 
     Raises
     ------
     OSError
         If the disk is full or the folder cannot be written; it names the file, and nothing is left behind.
     """
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    except OSError as error:
-        # A full disk names no file, a failed renaming the temporary one.
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    places.write(where, data)
 
 
 @dataclass(frozen=True)
