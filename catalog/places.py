@@ -121,7 +121,7 @@ def stat(where: Place) -> Seen | None:
             return None
         return Seen(found.st_size, found.st_mtime_ns)
     try:
-        with _named(where):
+        with named(where):
             return _seen(where.fs.info(where.path))
     except FileNotFoundError:
         return None
@@ -134,7 +134,7 @@ def listing(folder: Place) -> dict[str, Seen]:
     """
     if isinstance(folder, Path):
         return dict(_swept(folder, ""))
-    with _named(folder):
+    with named(folder):
         return _files(folder, folder.fs.find(folder.path, detail=True))
 
 
@@ -167,7 +167,7 @@ class Sightings:
         folder = where.parent
         if str(folder) not in self._folders:
             try:
-                with _named(folder):
+                with named(folder):
                     there = {found["name"]: found for found in folder.fs.ls(folder.path, detail=True)}
             except FileNotFoundError:
                 there = {}
@@ -179,7 +179,7 @@ def exists(where: Place) -> bool:
     """Tell whether there is such a file, or in a bucket anything below such a name."""
     if isinstance(where, Path):
         return where.exists()
-    with _named(where):
+    with named(where):
         return bool(where.fs.exists(where.path))
 
 
@@ -193,7 +193,7 @@ def read(where: Place) -> bytes:
     """
     if isinstance(where, Path):
         return where.read_bytes()
-    with _named(where):
+    with named(where):
         data: bytes = where.fs.cat_file(where.path, max_concurrency=1)
         return data
 
@@ -208,7 +208,7 @@ def write(where: Place, data: bytes) -> None:
     """
     if not isinstance(where, Path):
         # A bucket shows a file when all of it has come, and not before.
-        with _named(where):
+        with named(where):
             where.fs.pipe_file(where.path, data)
         return
     temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
@@ -239,7 +239,7 @@ def create(where: Place, data: bytes) -> None:
         with where.open("xb") as file:
             file.write(data)
         return
-    with _named(where):
+    with named(where):
         where.fs.pipe_file(where.path, data, mode="create")
 
 
@@ -254,7 +254,7 @@ def modified(where: Place) -> float | None:
     try:
         if isinstance(where, Path):
             return where.stat().st_mtime
-        with _named(where):
+        with named(where):
             return float(where.fs.modified(where.path).timestamp())
     except FileNotFoundError:
         return None
@@ -265,7 +265,7 @@ def remove(where: Place) -> None:
     if isinstance(where, Path):
         where.unlink(missing_ok=True)
         return
-    with _named(where), contextlib.suppress(FileNotFoundError):
+    with named(where), contextlib.suppress(FileNotFoundError):
         where.fs.rm_file(where.path)
 
 
@@ -323,7 +323,7 @@ def _s3_options() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _named(where: UPath) -> Iterator[None]:
+def named(where: UPath) -> Iterator[None]:
     """Turn what goes wrong with object storage into an OSError that names the file."""
     from botocore.exceptions import BotoCoreError
 
