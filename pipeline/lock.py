@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from catalog.places import Place, read
 from pipeline.errors import ConfigError
 from pipeline.lock_file import LockFile, OnDisk, Sight
 
@@ -90,14 +91,14 @@ class Holder:
 
 @contextlib.contextmanager
 def held(
-    run: Path, say: Callable[[str], None] = lambda line: None, pace: Pace | None = None
+    run: Place, say: Callable[[str], None] = lambda line: None, pace: Pace | None = None
 ) -> Iterator[None]:
     """Hold a run folder's lock.
 
     Parameters
     ----------
-    run : Path
-        The folder, which must be there.
+    run : Place
+        The folder, which must be there if it is on disk.
     say : callable
         Told, in one line, of a dead holder's lock taken over.
 
@@ -106,7 +107,7 @@ def held(
     ConfigError
         If another process holds it, or nothing can be written there.
     """
-    lock = _Lock(run, OnDisk(run / NAME), Holder.me(), say, pace or Pace())
+    lock = _Lock(run, _file(run / NAME), Holder.me(), say, pace or Pace())
     try:
         lock.take()
     except FileNotFoundError as error:
@@ -126,10 +127,10 @@ def held(
         lock.release()
 
 
-def holder(run: Path) -> Holder | None:
+def holder(run: Place) -> Holder | None:
     """Return who holds a run's lock, dead or alive, or None if nobody does; takes and writes nothing."""
     try:
-        return Holder.of((run / NAME).read_bytes())
+        return Holder.of(read(run / NAME))
     except OSError:
         return None
 
@@ -159,7 +160,7 @@ def _hidden(pid: int) -> int | None:
 
 @dataclass(frozen=True)
 class _Lock:
-    run: Path
+    run: Place
     file: LockFile
     me: Holder
     say: Callable[[str], None]
@@ -173,6 +174,9 @@ class _Lock:
             seen = self.file.look()
             if seen is None:
                 continue
+            if seen.data == self.me.data:
+                # The bucket's answer was lost, and what was asked again was refused.
+                return
             who = Holder.of(seen.data)
             why = self._dead(who, seen)
             if why and self.file.replace(seen, self.me.data):
@@ -230,6 +234,14 @@ class _Lock:
             f"{text}, last sign of life {abs(seen.age_s):.0f} s ago; "
             f"if it is dead, the same command takes over {self.pace.stale_s:.0f} s after the last one"
         )
+
+
+def _file(path: Place) -> LockFile:
+    if isinstance(path, Path):
+        return OnDisk(path)
+    from pipeline.lock_bucket import InBucket
+
+    return InBucket(path)
 
 
 def _name(who: Holder | None) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.store import write_atomic
+from catalog.places import write
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class OnDisk:
         with contextlib.ExitStack() as stack:
             same = self._guarded(stack, seen)
             if same:
-                write_atomic(self.path, data)
+                write(self.path, data)
         return same
 
     def beat(self, seen: Sight) -> None:

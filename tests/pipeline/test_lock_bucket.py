@@ -1,0 +1,120 @@
+"""The lock of a run in object storage: conditional requests to a server that speaks S3."""
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+
+from catalog.places import place, read, write
+from pipeline.errors import ConfigError
+from pipeline.lock import Holder, Pace, held, holder
+
+ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
+QUICK = Pace(beat_s=0.05, stale_s=0.5)
+
+
+@pytest.fixture(scope="module")
+def server():
+    from moto.server import ThreadedMotoServer
+
+    made = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    made.start()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def run(server, monkeypatch, request):
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    made = place("s3://runs/" + request.node.name.replace("[", "/").strip("]"))
+    made.fs.mkdirs("runs", exist_ok=True)
+    return made
+
+
+def test_one_holds_it_and_gives_it_back(run):
+    with held(run):
+        assert holder(run).token != ELSEWHERE.token
+        with pytest.raises(ConfigError, match="is in use by pid"), held(run):
+            pass
+    assert holder(run) is None
+    with held(run):
+        pass
+
+
+def test_a_dead_holder_of_this_machine_is_taken_over_at_once(run):
+    write(run / "lock.json", replace(Holder.me(), boot="before").data)
+    said = []
+    with held(run, said.append):
+        assert holder(run).pid == Holder.me().pid
+    assert "was restarted since" in said[0]
+
+
+def test_of_another_machine_the_heartbeat_tells(run):
+    write(run / "lock.json", ELSEWHERE.data)
+    with pytest.raises(ConfigError, match="the same command takes over"), held(run, pace=Pace(stale_s=60)):
+        pass
+    said = []
+    # A bucket's times are whole seconds.
+    time.sleep(1.1)
+    with held(run, said.append, QUICK):
+        assert holder(run).token != "t7"
+    assert said[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
+
+
+def test_a_living_holder_gives_signs_of_life(run):
+    with held(run, pace=QUICK):
+        first = _time(run)
+        while _time(run) == first:
+            time.sleep(0.1)
+
+
+@pytest.mark.parametrize("stale", [False, True])
+def test_of_many_that_race_exactly_one_wins(stale, run):
+    if stale:
+        write(run / "lock.json", replace(Holder.me(), boot="before").data)
+    start, tried, outcomes = threading.Barrier(4), threading.Semaphore(0), []
+
+    def race() -> None:
+        start.wait()
+        try:
+            with held(run):
+                outcomes.append("won")
+                # Until all others have been refused.
+                for _ in range(3):
+                    tried.acquire()
+        except ConfigError as error:
+            outcomes.append(str(error))
+            tried.release()
+
+    racers = [threading.Thread(target=race, daemon=True) for _ in range(4)]
+    for racer in racers:
+        racer.start()
+    for racer in racers:
+        racer.join(60)
+    assert len(outcomes) == 4
+    assert outcomes.count("won") == 1
+    assert sum("is in use by pid" in outcome for outcome in outcomes) == 3
+
+
+def test_a_lost_answer_is_no_second_holder(run, monkeypatch):
+    """It was taken, but the answer was lost: what is sent again is refused because of ourselves."""
+    from pipeline.lock_bucket import InBucket
+
+    create = InBucket.create
+    monkeypatch.setattr(InBucket, "create", lambda self, data: create(self, data) and create(self, data))
+    with held(run):
+        assert holder(run).pid == Holder.me().pid
+
+
+def test_a_bucket_that_is_not_there_is_said(run):
+    with pytest.raises(ConfigError, match="s3://nowhere/run"), held(place("s3://nowhere/run")):
+        pass
+
+
+def _time(run):
+    assert Holder.of(read(run / "lock.json"))
+    return run.fs.info((run / "lock.json").path)["LastModified"]
