@@ -7,22 +7,24 @@ opens both. Projection fields follow the STAC projection extension; fields of ou
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import json
-import os
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
+from catalog import places
 from catalog.errors import CatalogError
 from catalog.grid import Bounds, Grid
+from catalog.places import Place, absolute, joined, normal, place
 from catalog.tile import LAYERS, Layer, Tile
 
 Item = dict[str, Any]
@@ -45,29 +47,34 @@ class Catalog:
             raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} stand more than once")
 
     @classmethod
-    def read(cls, path: Path | str) -> Catalog:
-        """Read a catalog that `write` wrote.
+    def read(cls, path: Place | str) -> Catalog:
+        """Read a catalog that `write` wrote, on disk or in a bucket.
 
         Raises
         ------
         CatalogError
             If the file is missing or is no catalog; the line names the file.
         """
-        path = Path(path)
-        if not path.exists():
-            raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`")
-        if path.is_dir():
-            raise CatalogError(f"catalog {path} is a folder; name its file, as in {path / 'catalog.parquet'}")
+        path = _at(path)
         try:
-            items = _read_json(path) if path.suffix in JSON_SUFFIXES else _read_parquet(path)
-            folder = str(path.resolve().parent)
+            data = places.read(path)
+        except FileNotFoundError as error:
+            raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`") from error
+        except IsADirectoryError as error:
+            example = path / "catalog.parquet"
+            raise CatalogError(f"catalog {path} is a folder; name its file, as in {example}") from error
+        except OSError as error:
+            raise CatalogError(f"cannot read catalog {path}: {error.strerror or error}") from error
+        try:
+            items = _from_json(data) if path.suffix in JSON_SUFFIXES else _from_parquet(data)
+            folder = str(absolute(path).parent)
             return cls(tuple(_tile(item, folder) for item in items))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CatalogError(
                 f"{path} is not a FlexRoad catalog: {error!r}; make one with `flexroad catalog`"
             ) from error
 
-    def write(self, path: Path | str, movable: bool = True) -> None:
+    def write(self, path: Place | str, movable: bool = True) -> None:
         """Write the catalog.
 
         Parameters
@@ -83,21 +90,16 @@ class Catalog:
         CatalogError
             If the name ends neither in .parquet nor in .json or .geojson, or the file cannot be written.
         """
-        path = Path(path)
+        path = _at(path)
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, unlike {path.name}")
-        folder = path.resolve().parent
+        folder = absolute(path).parent
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            (_write_json if path.suffix in JSON_SUFFIXES else _write_parquet)(items, temporary)
-            temporary.replace(path)
+            places.write(path, make(items))
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
-        finally:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
 
     def select(self, ids: Sequence[str] = (), bbox: Bounds | None = None) -> Catalog:
         """Return the tiles named (all if none is) that touch ``bbox`` (m, in the tiles' CRS).
@@ -124,16 +126,22 @@ def _overlap(a: Bounds, b: Bounds) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _rooted(tile: Tile, root: Path) -> Tile:
+def _at(path: Place | str) -> Place:
+    try:
+        return place(path)
+    except OSError as error:
+        raise CatalogError(f"catalog {path}: {error.strerror or error}") from error
+
+
+def _rooted(tile: Tile, root: Place) -> Tile:
     """Return the tile with its files relative to ``root`` where they lie below it, else absolute."""
-
-    def name(path: Path) -> str:
-        # normpath, not resolve: a folder of links should stay a folder of links.
-        path = Path(os.path.normpath(path.absolute()))
-        return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-
+    above = str(root).rstrip("/") + "/"
     layers = tuple(
-        replace(layer, files=tuple(name(path) for path in tile.paths(layer))) for layer in tile.layers
+        # A folder of links should stay a folder of links.
+        replace(
+            layer, files=tuple(normal(joined(tile.root, file)).removeprefix(above) for file in layer.files)
+        )
+        for layer in tile.layers
     )
     return replace(tile, layers=layers, root=str(root))
 
@@ -189,7 +197,7 @@ def item(tile: Tile, root: str = "") -> Item:
 
 def _asset(layer: Layer, root: str) -> Item:
     return {
-        "href": str(Path(root) / layer.files[0]) if root else layer.files[0],
+        "href": joined(root, layer.files[0]) if root else layer.files[0],
         "roles": ["data"],
         "flexroad:files": list(layer.files),
         "flexroad:values": list(layer.values),
@@ -208,7 +216,7 @@ def _tile(item: Item, folder: str) -> Tile:
         grid=Grid(crs, west, north, cell, int(width), int(height)),
         layers=tuple(_layer(name, assets[name]) for name in LAYERS if assets.get(name)),
         root=properties["flexroad:root"] or folder,
-        datetime=datetime.fromisoformat(properties["datetime"]),
+        datetime=_when(properties["datetime"]),
         datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
         stratum=properties["flexroad:stratum"],
         # Catalogs written before reports named their data lack it.
@@ -225,30 +233,56 @@ def _layer(name: str, asset: Item) -> Layer:
     )
 
 
-def _read_json(path: Path) -> Iterable[Item]:
-    features: list[Item] = json.loads(path.read_text())["features"]
+def _when(told: str | datetime) -> datetime:
+    return told if isinstance(told, datetime) else datetime.fromisoformat(told)
+
+
+def _from_json(data: bytes) -> Iterable[Item]:
+    features: list[Item] = json.loads(data)["features"]
     return features
 
 
-def _write_json(items: Iterable[Item], path: Path) -> None:
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": list(items)}, indent=1))
+def _to_json(items: list[Item]) -> bytes:
+    return json.dumps({"type": "FeatureCollection", "features": items}, indent=1).encode()
 
 
-def _read_parquet(path: Path) -> Iterable[Item]:
+def _from_parquet(data: bytes) -> Iterable[Item]:
+    """Return of each item what `_tile` needs; whole items take many times as long."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
-    from stac_geoparquet.arrow import stac_table_to_items
 
-    items: Iterable[Item] = stac_table_to_items(pq.read_table(path))
-    return items
+    table = pq.read_table(pa.BufferReader(data))
+    plain = [name for name in table.column_names if name.startswith(("proj:", "flexroad:", "datetime"))]
+    rows = table.select(["id", "assets", *plain]).to_pylist()
+    return ({"id": row["id"], "assets": row["assets"], "properties": row} for row in rows)
 
 
-def _write_parquet(items: list[Item], path: Path) -> None:
+def _to_parquet(items: list[Item]) -> bytes:
+    """Return the items as stac-geoparquet lays them out; its own way takes many times as long."""
+    import pyarrow as pa
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
 
-    # Columns are inferred from what the items hold. A first item that has everything, cut off again,
-    # makes the schema the same for every catalog.
-    table = parse_stac_items_to_arrow([_everything(), *items]).read_all().slice(1)
-    to_parquet(table, path)
+    # Columns are inferred from what an item holds. One that has everything makes the schema the same for
+    # every catalog.
+    schema = parse_stac_items_to_arrow([_everything()]).read_all().schema
+    with tempfile.TemporaryDirectory() as folder:
+        # It writes to files alone.
+        file = Path(folder) / "catalog.parquet"
+        to_parquet(pa.Table.from_pylist([_row(item) for item in items], schema), file)
+        return file.read_bytes()
+
+
+def _row(item: Item) -> Item:
+    """Return an item as a row: properties beside the rest, the outline as WKB."""
+    row: Item = {name: value for name, value in item.items() if name != "properties"} | item["properties"]
+    (ring,) = item["geometry"]["coordinates"]
+    corners = ("xmin", "ymin", "xmax", "ymax")
+    row |= {
+        "geometry": shapely.to_wkb(shapely.Polygon(ring)),
+        "bbox": dict(zip(corners, item["bbox"], strict=True)),
+        "datetime": _when(item["properties"]["datetime"]),
+    }
+    return row
 
 
 def _everything() -> Item:

@@ -80,6 +80,19 @@ def absolute(where: Place) -> Place:
     return where.resolve() if isinstance(where, Path) else where
 
 
+def joined(folder: str, name: str) -> str:
+    """Return what a file is called whose name is relative to a folder, a whole path or an address."""
+    return name if _BUCKET.match(name) else os.path.join(folder, name)  # noqa: PTH118 (places are slow)
+
+
+def normal(name: str) -> str:
+    """Return an absolute path or address without ``..``, by the name alone: links are not followed."""
+    bucket = _BUCKET.match(name)
+    if bucket is None:
+        return os.path.normpath(name if name.startswith("/") else Path(name).absolute())
+    return "s3:/" + os.path.normpath("/" + name[bucket.end() :])
+
+
 def gdal_name(where: Place) -> str:
     """Return what GDAL calls a file."""
     return str(where) if isinstance(where, Path) else f"/vsis3/{where.path}"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 
 from catalog.grid import Grid
+from catalog.places import Place, joined, place
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and
@@ -54,6 +54,6 @@ class Tile:
         """Return the named layer, or None if the tile has none."""
         return next((layer for layer in self.layers if layer.name == name), None)
 
-    def paths(self, layer: Layer) -> tuple[Path, ...]:
-        """Return the layer's files as paths that can be opened."""
-        return tuple(Path(self.root) / file for file in layer.files)
+    def paths(self, layer: Layer) -> tuple[Place, ...]:
+        """Return the layer's files as places that can be opened."""
+        return tuple(place(joined(self.root, file)) for file in layer.files)

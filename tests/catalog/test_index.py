@@ -117,3 +117,18 @@ def test_what_cannot_be_read_is_named(tmp_path):
 def test_doubled_ids_are_refused(tmp_path):
     with pytest.raises(CatalogError, match="295500_5629250 stand more than once"):
         Catalog((tile(295500, tmp_path), tile(295500, tmp_path)))
+
+
+def test_rows_and_tables_are_those_of_stac_geoparquet(tmp_path):
+    """Its own way takes many times as long; it is the oracle for ours."""
+    from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
+
+    from catalog.index import _everything, _tile, item
+
+    tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS), tile(296000, tmp_path, layers=()))
+    Catalog(tiles).write(tmp_path / "c.parquet")
+    table = pq.read_table(tmp_path / "c.parquet")
+    items = [_everything(), *(item(one) for one in tiles)]
+    assert table.equals(parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks())
+    slowly = tuple(_tile(found, str(tmp_path)) for found in stac_table_to_items(table))
+    assert Catalog.read(tmp_path / "c.parquet").tiles == slowly
