@@ -1,26 +1,31 @@
-"""Many jobs at once, on Dask: a window of them in flight, the rest not yet made."""
+"""Many jobs at once, on Dask: connect, see that the workers are fit, fly, and connect again if need be."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import signal
-import tempfile
+import time
+import uuid
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pipeline import ONE_THREAD
 from pipeline.cluster import Cluster
-from pipeline.errors import ConfigError
+from pipeline.errors import ClusterLost, ConfigError
+from pipeline.execute.clusters import Place, opened
 from pipeline.execute.executor import J, R
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 LOCAL = Cluster()
+ANSWER_S = 10.0
+"""How long a scheduler may take to answer."""
 
 
 class DaskExecutor:
-    """Local worker processes of one thread each, or a running cluster.
+    """Local worker processes of one thread each, a running cluster, or one that is asked for.
 
     Parameters
     ----------
@@ -31,12 +36,10 @@ class DaskExecutor:
     cluster : Cluster
         Who works, and how long is waited for them.
     dashboard : bool
-        Serve Dask's dashboard for local workers; where it is goes to ``say``.
+        Serve Dask's dashboard; where it is goes to ``say``.
     say : callable
         Told in one line what whoever watches wants to know: the dashboard, who is waited for.
     """
-
-    tries = 2
 
     def __init__(
         self,
@@ -60,86 +63,141 @@ class DaskExecutor:
         probe: Callable[[], None] | None = None,
     ) -> Iterator[R]:
         """Yield results as tiles finish."""
-        from distributed import as_completed
-
         queue = iter(jobs)
         first = list(islice(queue, 1))
         if not first:
             # Nothing to do needs no workers.
             return
-        queue = chain(first, queue)
-        with self._client() as client:
-            # Twice the threads keeps every worker busy while constant memory holds the rest back.
-            window = max(2, 2 * sum(client.nthreads().values()))
-            flying: dict[Any, J] = {}
-            running = as_completed(raise_errors=False)
-            for job in islice(queue, window):
-                flying[_submit(client, function, job, running)] = job
-            for future in running:
-                job = flying.pop(future)
-                yield _result(future, job, lost)
-                future.release()
-                for following in islice(queue, 1):
-                    flying[_submit(client, function, following, running)] = following
+        from pipeline.execute.session import SchedulerGone, Session, Todo
+
+        todo = Todo(chain(first, queue))
+        with _quiet(), opened(self.cluster, self.workers, self.scheduler, self.dashboard) as place:
+            connect = self._first
+            while True:
+                with connect(place) as client:
+                    guard = _guard(client, place, probe)
+                    session = Session(client, guard, function, todo, lost, self.cluster.patience_s, self.say)
+                    try:
+                        yield from session.results()
+                        return
+                    except SchedulerGone:
+                        session.give_back()
+                connect = self._again
 
     @contextlib.contextmanager
-    def _client(self) -> Iterator[Any]:
-        import dask
-        from distributed import Client, LocalCluster
+    def _first(self, place: Place) -> Iterator[Client]:
+        from distributed import Client
 
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": self.tries - 1}))
-            if self.scheduler:
-                try:
-                    client = stack.enter_context(Client(self.scheduler, timeout=10))
-                except OSError as error:
-                    raise ConfigError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
-                if not client.nthreads():
-                    raise ConfigError(f"the Dask scheduler at {self.scheduler} has no workers")
-            else:
-                scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
-                cluster = LocalCluster(
-                    n_workers=self.workers or os.cpu_count() or 1,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address=None,
-                    local_directory=scratch,
-                    env=ONE_THREAD,
-                    silence_logs=logging.CRITICAL,
+        try:
+            client = Client(place.target, timeout=ANSWER_S, set_as_default=False)
+        except OSError as error:
+            raise ConfigError(f"{place.name} does not answer: {error}") from error
+        with client:
+            if self.dashboard:
+                self.say(_dashboard(client))
+            if not _any_worker(client, time.monotonic() + place.start_s):
+                raise ConfigError(
+                    f"{place.name} has no workers; start some (`dask worker ADDRESS --nthreads 1`)"
                 )
-                stack.enter_context(cluster)
-                client = stack.enter_context(Client(cluster))
-                client.register_plugin(_deaf_to_ctrl_c())
+            yield client
+
+    @contextlib.contextmanager
+    def _again(self, place: Place) -> Iterator[Client]:
+        from distributed import Client
+
+        patience = self.cluster.patience_s
+        end = time.monotonic() + patience
+        self.say(f"{place.name} is gone; waiting up to {patience:g} s for it")
+        while True:
+            try:
+                client = Client(place.target, timeout=min(ANSWER_S, max(patience, 1)), set_as_default=False)
+                break
+            except OSError as error:
+                if time.monotonic() > end:
+                    raise ClusterLost(f"{place.name} was gone for {patience:g} s") from error
+                time.sleep(0.2)
+        with client:
+            if not _any_worker(client, end):
+                raise ClusterLost(f"{place.name} came back, but no worker within {patience:g} s")
+            self.say(f"{place.name} is back")
             yield client
 
 
-def _deaf_to_ctrl_c() -> Any:
-    """Return a plugin for workers of one's own terminal, which sends Ctrl-C to all of its processes.
+def _any_worker(client: Client, end: float) -> bool:
+    while not client.nthreads():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.2)
+    return True
 
-    The client hears it and ends them; they would only print tracebacks.
+
+def _guard(client: Client, place: Place, probe: Callable[[], None] | None) -> str:
+    """Compare versions, put plugins on scheduler and workers, and probe; return the guard's name.
+
+    Raises
+    ------
+    ConfigError
+        If a worker is not fit for the work.
     """
-    from distributed import WorkerPlugin
+    from pipeline.execute import workers
+    from pipeline.execute.scheduler import no_second_try
 
-    class DeafToCtrlC(WorkerPlugin):  # type: ignore[misc]
-        def setup(self, worker: Any) -> None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    return DeafToCtrlC()
-
-
-def _submit(client: Any, function: Callable[[J], R], job: J, running: Any) -> Any:
-    # Not pure: the store, not Dask, knows what is done already.
-    future = client.submit(function, job, pure=False)
-    running.add(future)
-    return future
-
-
-def _result(future: Any, job: J, lost: Callable[[J, str], R]) -> R:
-    from distributed import KilledWorker
-
+    here = workers.versions()
+    _compare(client, here)
+    name = uuid.uuid4().hex[:8]
     try:
-        result: R = future.result()
-    except KilledWorker as error:
-        times = error.allowed_failures + 1
-        return lost(job, f"the worker process died {times} times here; too little memory is the usual cause")
-    return result
+        client.register_plugin(no_second_try(client.id, name), name=f"flexroad-{name}")
+        client.register_plugin(workers.Guard(here, probe, deaf=place.own), name=name)
+    except Exception as error:
+        # Of whatever kind unpickling gave; only a line of it helps.
+        told = " ".join(str(error).split()) or repr(error)
+        raise ConfigError(
+            f"{place.name} cannot load flexroad ({told}); install it for the workers, and let the scheduler "
+            "take plugins (distributed.scheduler.pickle)"
+        ) from error
+    for fault in client.run(workers.find_fault, name).values():
+        if fault:
+            raise ConfigError(fault)
+    return name
+
+
+def _compare(client: Client, here: dict[str, str]) -> None:
+    """Compare versions by Dask's own message: what differs too much could not load anything of ours."""
+    from pipeline.execute.workers import PICKLING
+
+    found = client.get_versions(packages=[name for name in here if name != "python"])
+    _refuse("the scheduler", found["scheduler"], {name: here[name] for name in PICKLING})
+    for address, worker in found["workers"].items():
+        _refuse(f"worker {address}", worker, here)
+
+
+def _refuse(who: str, found: Any, here: dict[str, str]) -> None:
+    from pipeline.execute.workers import difference, unlike
+
+    there = {name: found["packages"].get(name) or "missing" for name in here}
+    there["python"] = ".".join(found["host"]["python"].split(".")[:3])
+    other = difference(there, here)
+    if other:
+        raise ConfigError(unlike(who, other))
+
+
+def _dashboard(client: Client) -> str:
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        return "no dashboard: it needs bokeh (pip install bokeh)"
+    return f"dashboard: {client.dashboard_link}"
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Dask's own words about what is told in one's own: lost workers, schedulers, versions."""
+    logger = logging.getLogger("distributed")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="distributed")
+            yield
+    finally:
+        logger.setLevel(before)

@@ -1,0 +1,235 @@
+"""A window of jobs in flight on a scheduler, for as long as it can be reached.
+
+A worker that dies takes with it every job it had been given. Which of them killed it nobody knows, so all
+of them are suspects and are done last, one at a time on a worker: whoever loses its worker there is lost.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, field
+from itertools import count, islice
+from typing import Generic
+
+from dask.utils import format_bytes
+from distributed import Client, Future
+from distributed.scheduler import KilledWorker, NoWorkerError
+
+from pipeline.errors import ClusterLost, ConfigError
+from pipeline.execute.executor import J, R
+from pipeline.execute.workers import Unfit, work
+
+TICK_S = 1.0
+"""How long nothing must happen before one looks whether scheduler and workers are there."""
+
+
+class SchedulerGone(Exception):
+    """The connection to the scheduler broke; what flew is unknown."""
+
+
+@dataclass
+class Todo(Generic[J]):
+    """Jobs not done yet; outlives the connection."""
+
+    jobs: Iterator[J]
+    back: deque[J] = field(default_factory=deque)
+    """Taken, but not done."""
+    suspects: deque[J] = field(default_factory=deque)
+    """Were on a worker that died."""
+
+    def take(self) -> Iterable[J]:
+        """Return the next job, if there is one."""
+        if self.back:
+            return (self.back.popleft(),)
+        return islice(self.jobs, 1)
+
+
+@dataclass(frozen=True)
+class Flight(Generic[J]):
+    """A job on its way."""
+
+    job: J
+    alone: str = ""
+    """Address of the worker it has for itself, being suspect."""
+
+
+class Session(Generic[J, R]):
+    """Does jobs over one connection.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        With a `Guard` on every worker and a `no_second_try` on the scheduler.
+    guard : str
+        The guard's name; makes keys this run's own, too.
+    patience_s : float
+        How long one waits for a worker when there is none.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        guard: str,
+        function: Callable[[J], R],
+        todo: Todo[J],
+        lost: Callable[[J, str], R],
+        patience_s: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self.client = client
+        self.guard = guard
+        self.function = function
+        self.todo = todo
+        self.lost = lost
+        self.patience_s = patience_s
+        self.say = say
+        self.flying: dict[Future, Flight[J]] = {}
+        self.landed: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self.numbers = count(1)
+        self.crew: dict[str, int] = {}
+        """Threads by worker, as they were at ``looked``."""
+        self.looked = 0.0
+        self.deserted: float | None = None
+        """Since when there has been no worker."""
+
+    def results(self) -> Iterator[R]:
+        """Yield results as jobs finish, until nothing is left to do.
+
+        Raises
+        ------
+        SchedulerGone
+            If the connection broke; `give_back` what flew and connect anew.
+        ClusterLost
+            If there was no worker for longer than one waits.
+        ConfigError
+            If a worker is not fit for the work.
+        """
+        while True:
+            self._look()
+            self._send()
+            if not (self.flying or self.todo.suspects):
+                return
+            for future in self._landed():
+                yield from self._outcome(future, self.flying.pop(future))
+                future.release()
+
+    def give_back(self) -> None:
+        """Take down again as undone all that flew."""
+        for flight in self.flying.values():
+            self._put_back(flight)
+        self.flying.clear()
+
+    def _send(self) -> None:
+        apart = {flight.alone for flight in self.flying.values() if flight.alone}
+        if not apart:
+            # Twice the threads keeps every worker busy while constant memory holds the rest back.
+            room = max(2, 2 * sum(self.crew.values())) - len(self.flying)
+            for _ in range(room):
+                for job in self.todo.take():
+                    self._fly(Flight(job))
+        if len(self.flying) == len(apart):
+            for address in [address for address in self.crew if address not in apart]:
+                if self.todo.suspects:
+                    self._fly(Flight(self.todo.suspects.popleft(), address))
+
+    def _fly(self, flight: Flight[J]) -> None:
+        name = getattr(flight.job, "key", self.function.__name__.strip("_"))
+        # Numbered: a key that failed must not come back. Not pure: the store knows what is done already.
+        future = self.client.submit(
+            work,
+            self.function,
+            flight.job,
+            self.guard,
+            key=f"{name}-{self.guard}-{next(self.numbers)}",
+            pure=False,
+            workers=[flight.alone] if flight.alone else None,
+        )
+        self.flying[future] = flight
+        future.add_done_callback(self.landed.put)
+
+    def _landed(self) -> list[Future]:
+        try:
+            found = [self.landed.get(timeout=TICK_S)]
+        except queue.Empty:
+            return []
+        while not self.landed.empty():
+            found.append(self.landed.get())
+        return [future for future in found if future in self.flying]
+
+    def _look(self) -> None:
+        """See, but not more often than every second, who is there."""
+        if self.crew and time.monotonic() < self.looked + TICK_S:
+            return
+        try:
+            self.crew = self.client.nthreads()
+        except OSError as error:
+            raise SchedulerGone(str(error)) from error
+        if self.client.status != "running":
+            raise SchedulerGone
+        self.looked = time.monotonic()
+        self._wait_for_workers()
+        for future, flight in list(self.flying.items()):
+            if flight.alone and flight.alone not in self.crew and not future.done():
+                # Its worker went before it got there.
+                self._put_back(self.flying.pop(future))
+                future.release()
+
+    def _wait_for_workers(self) -> None:
+        if self.crew:
+            self.deserted = None
+        elif self.deserted is None:
+            self.deserted = self.looked
+            self.say(f"no worker is left; waiting up to {self.patience_s:g} s for one")
+        elif self.looked > self.deserted + self.patience_s:
+            raise ClusterLost(f"no worker was left for {self.patience_s:g} s")
+
+    def _outcome(self, future: Future, flight: Flight[J]) -> Iterator[R]:
+        error = future.exception() if future.status == "error" else None
+        if isinstance(error, KilledWorker):
+            yield from self._died(flight, error)
+        elif isinstance(error, NoWorkerError):
+            # A scheduler may be set to give up what waits for workers; patience is this side's.
+            self._put_back(flight)
+        elif isinstance(error, Unfit):
+            raise ConfigError(str(error))
+        elif future.status in ("finished", "error"):
+            yield from self._fetched(future, flight)
+        else:
+            self._put_back(flight)
+            raise SchedulerGone
+
+    def _fetched(self, future: Future, flight: Flight[J]) -> Iterator[R]:
+        try:
+            result = future.result()
+        except KilledWorker as error:
+            # The worker died between doing the job and handing over the result.
+            yield from self._died(flight, error)
+        except CancelledError as error:
+            self._put_back(flight)
+            raise SchedulerGone from error
+        else:
+            yield result
+
+    def _died(self, flight: Flight[J], error: KilledWorker) -> Iterator[R]:
+        if flight.alone:
+            yield self.lost(flight.job, self._why(error))
+        else:
+            self.todo.suspects.append(flight.job)
+
+    def _put_back(self, flight: Flight[J]) -> None:
+        (self.todo.suspects if flight.alone else self.todo.back).append(flight.job)
+
+    def _why(self, error: KilledWorker) -> str:
+        worker = error.last_worker
+        for _, event in self.client.get_events("worker-restart-memory"):
+            if event["worker"] == worker.address:
+                used, limit = format_bytes(event["rss"]), format_bytes(worker.memory_limit)
+                return (
+                    f"the worker process died 2 times here, at last for memory: it used {used} and may use "
+                    f"{limit}; give each more (cluster: memory, fewer --workers)"
+                )
+        return "the worker process died 2 times here; too little memory is the usual cause"

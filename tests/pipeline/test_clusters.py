@@ -1,0 +1,373 @@
+"""Clusters that run already, in real processes on loopback; and what is asked of SLURM and Kubernetes."""
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import cloudpickle
+import pytest
+
+from pipeline.cluster import Cluster
+from pipeline.config import load_config
+from pipeline.errors import ClusterLost, ConfigError
+from pipeline.execute import DaskExecutor
+from pipeline.execute.clusters import kubernetes_options, opened, slurm_options
+
+# Workers have no tests to import.
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+IMPATIENT = Cluster(patience_s=1)
+
+
+class Processes:
+    """A scheduler and workers, each a process started by Dask's own commands."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.started: list[subprocess.Popen] = []
+        self.address = ""
+
+    def scheduler(self) -> subprocess.Popen:
+        """Start one, where it was before if there was one; its settings are others than one's own."""
+        file = self.folder / "scheduler.json"
+        file.unlink(missing_ok=True)
+        port = self.address.rpartition(":")[2] or "0"
+        options = ["--host", "127.0.0.1", "--port", port, "--scheduler-file", file, "--no-dashboard"]
+        process = self._start("scheduler", *options, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="7")
+        self.address = until(lambda: file.exists() and json.loads(file.read_text() or "{}")).get("address")
+        return process
+
+    def worker(self, *options: str, **env: str) -> subprocess.Popen:
+        options = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder), *options)
+        return self._start("worker", self.address, *options, **env)
+
+    def end(self) -> None:
+        for process in self.started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+    def _start(self, *words, **env: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", "dask", *map(str, words)]
+        with (self.folder / "said.txt").open("a") as said:
+            process = subprocess.Popen(
+                command, env={**os.environ, **env}, stdout=said, stderr=said, start_new_session=True
+            )
+        self.started.append(process)
+        return process
+
+
+def until(condition, seconds: float = 60):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.02)
+    raise AssertionError("waited in vain")
+
+
+@pytest.fixture
+def processes(tmp_path):
+    found = Processes(tmp_path)
+    yield found
+    found.end()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A cluster of two workers that tests share; whoever kills a worker gets it back from its nanny."""
+    found = Processes(tmp_path_factory.mktemp("running"))
+    found.scheduler()
+    found.worker("--nworkers", "2")
+    wait_for(found.address, 2)
+    yield found
+    found.end()
+
+
+def wait_for(address: str, workers: int) -> None:
+    from distributed import Client
+
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(workers, 60)
+
+
+def lost(job, why):
+    return (job, why)
+
+
+def double(job):
+    return 2 * job
+
+
+def deadly(job):
+    """Die of the jobs that say so."""
+    if str(job).startswith("segfault"):
+        ctypes.string_at(0)
+    if str(job).startswith("exit"):
+        os._exit(3)
+    time.sleep(0.02)
+    return job
+
+
+def test_jobs_are_made_as_there_is_room(running):
+    taken, done = [], []
+
+    def jobs():
+        for job in range(40):
+            taken.append(job)
+            yield job
+
+    for result in DaskExecutor(scheduler=running.address).map(double, jobs(), lost):
+        done.append(result)
+        # Two for each thread, one in hand.
+        assert len(taken) <= len(done) + 5
+    assert sorted(done) == [2 * job for job in range(40)]
+
+
+def threads(job):
+    """Tell what the process computes with, having loaded some more of it."""
+    import numpy  # noqa: F401
+    import torch
+    from threadpoolctl import threadpool_info
+
+    time.sleep(0.05)
+    pools = [pool["num_threads"] for pool in threadpool_info()]
+    return os.getpid(), max(pools), torch.get_num_threads(), os.environ["OMP_NUM_THREADS"]
+
+
+def test_threads_are_pinned_also_of_a_worker_that_joins_later(processes):
+    many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2")
+    processes.scheduler()
+    processes.worker("--preload", "numpy", **many)
+    wait_for(processes.address, 1)
+
+    def jobs():
+        yield from range(3)
+        processes.worker("--preload", "numpy", **many)
+        wait_for(processes.address, 2)
+        while len({pid for pid, *_ in found}) < 2:
+            yield 0
+
+    found = []
+    for result in DaskExecutor(scheduler=processes.address).map(threads, jobs(), lost):
+        found.append(result)
+    assert len({pid for pid, *_ in found}) == 2
+    assert {result[1:] for result in found} == {(1, 1, "1")}
+
+
+@pytest.fixture
+def other_numpy(tmp_path) -> dict[str, str]:
+    """An environment in which numpy is said to be another."""
+    (tmp_path / "numpy-1.0.dist-info").mkdir()
+    (tmp_path / "numpy-1.0.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.0\n")
+    return {"PYTHONPATH": str(tmp_path)}
+
+
+def refused(processes, jobs=(1, 2, 3), **options) -> str:
+    with pytest.raises(ConfigError) as caught:
+        list(DaskExecutor(scheduler=processes.address).map(double, jobs, lost, **options))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy):
+    processes.scheduler()
+    assert f"{processes.address} has no workers; start some" in refused(processes)
+    unlike = processes.worker(**other_numpy)
+    wait_for(processes.address, 1)
+    told = refused(processes)
+    assert "worker tcp://127.0.0.1" in told
+    assert "numpy is 1.0 there and" in told
+    assert "install the same there" in told
+    unlike.terminate()
+    unlike.wait(20)
+
+    # One that joins later gets nothing to do, either.
+    processes.worker()
+    wait_for(processes.address, 1)
+
+    def jobs():
+        yield 1
+        processes.worker(**other_numpy)
+        wait_for(processes.address, 2)
+        while True:
+            yield 1
+
+    assert "numpy is 1.0 there and" in refused(processes, jobs())
+
+
+def test_a_store_that_workers_cannot_write_is_refused(running):
+    here = os.getpid()
+
+    def probe():
+        if os.getpid() != here:
+            raise OSError(30, "Read-only file system", "/store")
+
+    told = refused(running, probe=probe)
+    assert "worker tcp://127.0.0.1" in told
+    assert "cannot use the store: /store: Read-only file system; mount it" in told
+
+
+def test_nobody_answers(monkeypatch):
+    monkeypatch.setattr("pipeline.execute.dask.ANSWER_S", 1)
+    with pytest.raises(ConfigError, match=r"scheduler at tcp://127.0.0.1:9 does not answer"):
+        list(DaskExecutor(scheduler="tcp://127.0.0.1:9").map(double, [1], lost))
+
+
+@pytest.mark.parametrize("poison", [["segfault"], ["exit 1", "segfault 2"]])
+def test_a_job_that_kills_its_worker_is_lost_and_no_other(running, poison):
+    """However patient the scheduler is, whose limit is 7 deaths."""
+    jobs = [*range(10), *poison, *range(10, 20)]
+    results = list(DaskExecutor(scheduler=running.address).map(deadly, jobs, lost))
+    told = [result for result in results if isinstance(result, tuple)]
+    assert sorted(job for job, _ in told) == poison
+    assert all("died 2 times here" in why for _, why in told)
+    assert sorted(result for result in results if isinstance(result, int)) == list(range(20))
+
+
+def greedy(job):
+    if job == "greedy":
+        hoard = []
+        while True:
+            hoard.append(b"x" * 20_000_000)
+            time.sleep(0.02)
+    return job
+
+
+def test_too_much_memory_on_a_single_worker_of_this_machine():
+    small = Cluster(workers=1, memory="700 MiB")
+    results = list(DaskExecutor(cluster=small).map(greedy, [1, "greedy", 2, 3], lost))
+    ((job, why),) = [result for result in results if isinstance(result, tuple)]
+    assert job == "greedy"
+    assert "at last for memory: it used" in why
+    assert "may use 700.00 MiB" in why
+    assert sorted(result for result in results if isinstance(result, int)) == [1, 2, 3]
+
+
+def slow(job):
+    time.sleep(0.1)
+    return job
+
+
+def test_a_scheduler_that_goes_away_is_waited_for(processes):
+    scheduler = processes.scheduler()
+    processes.worker()
+    wait_for(processes.address, 1)
+    said, found = [], []
+
+    def back():
+        scheduler.wait()
+        processes.scheduler()
+        processes.worker()
+
+    friend = threading.Thread(target=back)
+    friend.start()
+    executor = DaskExecutor(scheduler=processes.address, say=said.append)
+    for result in executor.map(slow, range(20), lost):
+        found.append(result)
+        if len(found) == 5:
+            scheduler.kill()
+    friend.join()
+    assert sorted(found) == list(range(20))
+    assert [line.split(";")[0].removeprefix("the Dask scheduler at ") for line in said] == [
+        f"{processes.address} is gone",
+        f"{processes.address} is back",
+    ]
+
+
+@pytest.mark.parametrize("who", ["scheduler", "workers"])
+def test_whoever_stays_away_ends_the_run(processes, who):
+    scheduler = processes.scheduler()
+    worker = processes.worker("--no-nanny")
+    wait_for(processes.address, 1)
+    found = []
+
+    def go_on():
+        for result in DaskExecutor(scheduler=processes.address, cluster=IMPATIENT).map(slow, range(20), lost):
+            found.append(result)
+            if len(found) == 5:
+                (scheduler if who == "scheduler" else worker).kill()
+
+    with pytest.raises(ClusterLost, match="for 1 s"):
+        go_on()
+    assert found[:5] == [0, 1, 2, 3, 4]
+    assert len(found) < 20
+
+
+def kept(dask_scheduler) -> list[str]:
+    return [*dask_scheduler.tasks, *dask_scheduler.worker_plugins, *dask_scheduler.plugins]
+
+
+def test_nothing_of_a_run_stays_on_a_cluster(running):
+    from distributed import Client
+
+    with Client(running.address, set_as_default=False) as client:
+        before = client.run_on_scheduler(kept)
+        during = []
+        for _ in DaskExecutor(scheduler=running.address).map(double, range(3), lost):
+            during.append(client.run_on_scheduler(kept))
+        assert len(during[0]) > len(before)
+        assert client.run_on_scheduler(kept) == before
+
+
+def test_the_section_reaches_slurm():
+    jobqueue = pytest.importorskip("dask_jobqueue")
+    cluster = Cluster(
+        kind="slurm", workers=6, per_job=3, memory="2 GiB", walltime_h=2.5, queue="night", account="roads",
+        job_extra=["--exclusive"], prologue=["module load gdal"],
+    )  # fmt: skip
+    with jobqueue.SLURMCluster(**slurm_options(cluster, dashboard=False)) as made:
+        script = made.job_script()
+    lines = script.splitlines()
+    assert {
+        "#SBATCH -p night", "#SBATCH -A roads", "#SBATCH -n 1", "#SBATCH --cpus-per-task=3",
+        "#SBATCH --mem=6G", "#SBATCH -t 02:30:00", "#SBATCH --exclusive", "module load gdal",
+        "export OMP_NUM_THREADS=1", "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",
+    } <= set(lines)  # fmt: skip
+    assert "--nthreads 1 --memory-limit 2.00GiB --nworkers 3 --nanny" in lines[-1]
+    assert "--lifetime 8700s" in lines[-1]
+
+
+def test_the_section_reaches_kubernetes():
+    operator = pytest.importorskip("dask_kubernetes.operator")
+    cluster = Cluster(kind="kubernetes", workers=5, memory="2 GiB", image="roads:1")
+    spec = operator.make_cluster_spec(**kubernetes_options(cluster))["spec"]
+    assert spec["worker"]["replicas"] == 5
+    (container,) = spec["worker"]["spec"]["containers"]
+    assert container["image"] == "roads:1"
+    assert container["resources"]["limits"] == {"cpu": "1", "memory": str(2 * 1024**3)}
+    assert {"name": "OMP_NUM_THREADS", "value": "1"} in container["env"]
+    assert container["args"][:4] == ["dask", "worker", "--nthreads", "1"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [("slurm", "there is no sbatch here"), ("kubernetes", r"pip install 'flexroad\[kubernetes\]'")],
+)
+def test_what_is_missing_is_named(kind, remedy, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "dask_kubernetes.operator", None)
+    with pytest.raises(ConfigError, match=remedy), opened(Cluster(kind=kind), None, None, False):
+        pass
+
+
+def test_who_works_changes_no_fingerprint(made_survey, tmp_path):
+    from catalog import Catalog
+    from pipeline.graph import tile_graphs
+
+    text = "extends: paper\ncluster: {kind: slurm, queue: night}\n"
+    (tmp_path / "night.yaml").write_text(text)
+    (tmp_path / "heir.yaml").write_text("extends: night.yaml\ncluster: {workers: 9}\n")
+    heir = load_config(tmp_path / "heir.yaml")
+    assert (heir.cluster.queue, heir.cluster.workers) == ("night", 9)
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    plain = [graph.fingerprint for graph in tile_graphs(catalog, load_config("paper"))]
+    assert [graph.fingerprint for graph in tile_graphs(catalog, heir)] == plain
