@@ -18,6 +18,7 @@ from rasterio.warp import transform_bounds
 from catalog.crs import in_plan, plan_unit, short, utm_of
 from catalog.errors import CatalogError
 from catalog.grid import Bounds
+from catalog.places import gdal_options
 
 GDAL = {
     # A folder of 10,000 files is not listed anew for each of them; side-car files are still found.
@@ -52,7 +53,7 @@ class RasterFile:
 @contextmanager
 def quiet() -> Iterator[None]:
     """Open rasters as both the catalog and the tasks do; files without a georeference warn of nothing."""
-    with rasterio.Env(**GDAL), warnings.catch_warnings():
+    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from rasterio.windows import Window
 
 from catalog.crs import same, short
 from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from catalog.places import Place, gdal_name, is_remote, stat
 from tasks.errors import TaskError
 from tasks.types import Floats
 
@@ -109,12 +109,12 @@ class Patch:
     """CRS of the file, else the one it was given."""
 
 
-def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patch | None:
+def read(path: Place, name: str, grid: Grid, core: Grid, crs: str | None) -> Patch | None:
     """Read what a file has under a grid.
 
     Parameters
     ----------
-    path, name : Path, str
+    path, name : Place, str
         The file, and how messages call it: ``dsm a.tif``.
     grid : Grid
     core : Grid
@@ -145,16 +145,29 @@ def read(path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Patc
 
 
 @contextmanager
-def opened(path: Path, name: str) -> Iterator[Any]:
-    """Open a raster; what goes wrong with it inside is `Unreadable`."""
+def opened(path: Place, name: str) -> Iterator[Any]:
+    """Open a raster; what goes wrong with it inside is `Unreadable`; in a bucket, a `TaskError`.
+
+    Of a file in a bucket nobody can tell whether it is broken or the storage was, so that a tile had better
+    fail and be tried again than do without it.
+    """
     try:
-        with rasterio.open(path) as src:
+        with rasterio.open(gdal_name(path)) as src:
             yield src
     except (RasterioError, OSError) as error:
-        if not path.exists():
+        if not _there(path, name):
             raise Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
         reason = str(error.__cause__ or error).partition("\n")[0]
+        if is_remote(path):
+            raise TaskError(f"{name} cannot be read: {reason}; run again, or mend it", str(path)) from error
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
+
+
+def _there(path: Place, name: str) -> bool:
+    try:
+        return stat(path) is not None
+    except OSError as error:
+        raise TaskError(f"{name} cannot be read: {error.strerror}; run again", str(path)) from error
 
 
 def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
@@ -197,7 +210,7 @@ def misfit(lattice: Lattice, grid: Grid) -> str:
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
 
 
-def place(src: Any, path: Path, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
+def place(src: Any, path: Place, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
     """Return where a file lies, or None if it is in another CRS and elsewhere; parameters as for `read`.
 
     Raises

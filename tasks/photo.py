@@ -7,7 +7,6 @@ interpolated. What a file declares as nodata, masks or makes transparent is unkn
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.vrt import WarpedVRT
 
 from catalog.grid import LATTICE_TOLERANCE, Grid
+from catalog.places import Place
 from catalog.raster_files import quiet
 from tasks.acquire.types import Photo
 from tasks.errors import TaskError
@@ -102,7 +102,7 @@ def _reached(lattice: Lattice, grid: Grid) -> Bools:
 
 
 def _read(
-    path: Path, name: str, grid: Grid, gsd_m: float | None, crs: str | None
+    path: Place, name: str, grid: Grid, gsd_m: float | None, crs: str | None
 ) -> tuple[Photo, Lattice] | None:
     """Return what one file shows of the ground, and where the file lies; None if it lies elsewhere."""
     with opened(path, name) as src:
@@ -118,7 +118,7 @@ def _read(
     return Photo(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
 
 
-def _depth(src: Any, path: Path, name: str) -> int:
+def _depth(src: Any, path: Place, name: str) -> int:
     """Return how many bits the colours have."""
     kind = src.dtypes[0]
     if src.colorinterp[0] == ColorInterp.palette:

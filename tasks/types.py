@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from catalog.grid import Bounds, Grid
+from catalog.places import Place
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -21,7 +21,7 @@ class Source:
 
     name: str
     """One of `catalog.LAYERS`."""
-    paths: tuple[Path, ...]
+    paths: tuple[Place, ...]
     """Files that reach the tile; of those that overlap, the first with a value wins."""
     crs: str | None = None
     """CRS of files that carry none."""

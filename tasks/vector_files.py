@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from pyproj.exceptions import ProjError
 from catalog.crs import short, transformer
 from catalog.errors import CatalogError
 from catalog.grid import Bounds
+from catalog.places import Place, Seen, gdal_name, gdal_options, stat
 from tasks.errors import TaskError
 
 SQUARE_M = 4000.0
@@ -38,7 +38,7 @@ TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 class Asked:
     """What is asked of a file."""
 
-    path: Path
+    path: Place
     layer: str | None
     """None where the file has only one, or is of OSM's own format."""
     where: str | None
@@ -76,12 +76,11 @@ def near(asked: Asked, bounds: Bounds) -> Any:
     import pandas
 
     try:
-        stat = asked.path.stat()
+        version = stat(asked.path)
     except OSError as error:
-        raise _fault(
-            asked, f"cannot be opened ({error.strerror}); put it back, or build the catalog anew"
-        ) from error
-    version = (stat.st_size, stat.st_mtime_ns)
+        raise _fault(asked, f"cannot be read: {error.strerror}; run again") from error
+    if version is None:
+        raise _fault(asked, "cannot be opened (no such file); put it back, or build the catalog anew")
     found = []
     for layer in _layers(asked, version):
         squares = list(_squares(bounds)) if layer.indexed else [None]
@@ -108,12 +107,13 @@ def _touching(part: Any, bounds: Bounds) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _layers(asked: Asked, version: tuple[int, int]) -> tuple[_Layer, ...]:
+def _layers(asked: Asked, version: Seen) -> tuple[_Layer, ...]:
     """Return the layers to read; ``version`` tells a changed file from the one that was seen before."""
     import pyogrio
 
     try:
-        kinds = dict(pyogrio.list_layers(asked.path))
+        pyogrio.set_gdal_config_options(gdal_options())
+        kinds = dict(pyogrio.list_layers(gdal_name(asked.path)))
         # Styles and other tables may lie beside the features.
         spatial = [name for name, kind in kinds.items() if kind is not None]
         names = [asked.layer] if asked.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
@@ -121,7 +121,8 @@ def _layers(asked: Asked, version: tuple[int, int]) -> tuple[_Layer, ...]:
             raise _fault(asked, f"has no layer {asked.layer!r}; there are {', '.join(kinds)}")
         if not names or (len(names) > 1 and names != list(OSM)):
             raise _fault(asked, f"has the layers {', '.join(kinds)}; name one with segment.layer")
-        return tuple(_described(asked, name, pyogrio.read_info(asked.path, layer=name)) for name in names)
+        file = gdal_name(asked.path)
+        return tuple(_described(asked, name, pyogrio.read_info(file, layer=name)) for name in names)
     except (RuntimeError, ValueError) as error:
         raise _fault(asked, f"cannot be read as vectors: {error}") from error
 
@@ -145,7 +146,7 @@ def _described(asked: Asked, name: str, info: Any) -> _Layer:
 
 
 @lru_cache(maxsize=KEPT)
-def _part(asked: Asked, version: tuple[int, int], layer: _Layer, square: Bounds | None) -> Any:
+def _part(asked: Asked, version: Seen, layer: _Layer, square: Bounds | None) -> Any:
     """Return a layer's features, or those that touch a square of the tiles' plane, with their index."""
     try:
         bbox = square and transformer(asked.crs, layer.crs).transform_bounds(*square, densify_pts=21)
@@ -168,7 +169,7 @@ def _read(asked: Asked, layer: _Layer, bbox: Bounds | None) -> Any:
 
     def read(**more: str) -> Any:
         return pyogrio.read_dataframe(
-            asked.path,
+            gdal_name(asked.path),
             layer=layer.name,
             columns=list(layer.columns),
             where=layer.where,
