@@ -14,12 +14,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
+import uuid
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from catalog import places
@@ -45,25 +44,27 @@ def write_atomic(where: Place, data: bytes) -> None:
 class Store:
     """Results of stages by fingerprint; may be shared by runs."""
 
-    root: Path
+    root: Place
 
     def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
         """Return a result and what each stage up to it took, or None if it is not there or damaged."""
         try:
-            return codec.decode(self._path(node).read_bytes())
+            return codec.decode(places.read(self._path(node)))
         except DAMAGED:
             # What cannot be read is as good as absent: it is computed and written anew.
             return None
 
-    def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> None:
-        """Keep a result and what each stage up to it took."""
-        write_atomic(self._path(node), codec.encode(value, seconds))
+    def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
+        """Keep a result and what each stage up to it took; return how many bytes that is."""
+        data = codec.encode(value, seconds)
+        write_atomic(self._path(node), data)
+        return len(data)
 
     def has(self, node: Node) -> bool:
         """Tell whether a result is there, unread."""
-        return self._path(node).exists()
+        return places.exists(self._path(node))
 
-    def _path(self, node: Node) -> Path:
+    def _path(self, node: Node) -> Place:
         return self.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
 
 
@@ -71,10 +72,10 @@ class Store:
 class TileFolder:
     """The products of one tile in a run, and the marker that says they are whole."""
 
-    path: Path
+    path: Place
 
     @classmethod
-    def of(cls, run: Path, tile_id: str) -> TileFolder:
+    def of(cls, run: Place, tile_id: str) -> TileFolder:
         """Return the tile's folder in a run."""
         return cls(run / "tiles" / plain_name(tile_id))
 
@@ -86,13 +87,21 @@ class TileFolder:
                 return None
             # A marker without its rows is damaged, whatever else it holds.
             iter(item["properties"]["flexroad:rows"])
-            whole = all(
-                (self.path / asset["href"]).stat().st_size == asset["file:size"]
-                for asset in item["assets"].values()
-            )
+            files = places.listing(self.path)
+            whole = all(files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values())
         except (OSError, KeyError, TypeError, AttributeError):
             return None
         return item if whole else None
+
+    def verified(self, item: dict[str, Any]) -> bool:
+        """Tell whether the products that an item names are as they were written, byte for byte."""
+        try:
+            return all(
+                _checksum(places.read(self.path / asset["href"])) == asset["file:checksum"]
+                for asset in item["assets"].values()
+            )
+        except (OSError, KeyError, TypeError, AttributeError):
+            return False
 
     def sources(self) -> list[Any] | None:
         """Return the sources of the tile when it was last done, as `TileGraph.sources` names them."""
@@ -102,7 +111,7 @@ class TileFolder:
 
     def gave_up(self) -> bool:
         """Tell whether the tile failed when it was last tried, with whatever files and options."""
-        return (self.path / "failed.json").exists()
+        return places.exists(self.path / "failed.json")
 
     def failed(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return what is known of the tile's last failure, if it was of this graph."""
@@ -110,20 +119,24 @@ class TileFolder:
         return failure if failure and failure.get("fingerprint") == graph.fingerprint else None
 
     def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
-        """Write the products, then the item that says so."""
+        """Write the products, then the item that says so.
+
+        An item of before goes first: until the new one is there, nothing vouches for a mixture of files.
+        """
+        places.remove(self.path / "item.json")
         for name, data in products.items():
             write_atomic(self.path / name, data)
         write_atomic(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
-        (self.path / "failed.json").unlink(missing_ok=True)
+        places.remove(self.path / "failed.json")
 
     def fail(self, failure: dict[str, Any]) -> None:
         """Write down a failure; the tile no longer counts as done."""
-        (self.path / "item.json").unlink(missing_ok=True)
+        places.remove(self.path / "item.json")
         write_atomic(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
-            found = json.loads((self.path / name).read_bytes())
+            found = json.loads(places.read(self.path / name))
         except (OSError, ValueError):
             return None
         return found if isinstance(found, dict) else None
@@ -141,8 +154,12 @@ def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
         "href": name,
         "type": media_type,
         "file:size": len(data),
-        "file:checksum": "1220" + hashlib.sha256(data).hexdigest(),
+        "file:checksum": _checksum(data),
     }
+
+
+def _checksum(data: bytes) -> str:
+    return "1220" + hashlib.sha256(data).hexdigest()
 
 
 def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,7 +167,7 @@ def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
-def check_writable(folder: Path) -> None:
+def check_writable(folder: Place) -> None:
     """Fail early if nothing can be written below ``folder``.
 
     Raises
@@ -158,6 +175,6 @@ def check_writable(folder: Path) -> None:
     OSError
         With the reason and the path.
     """
-    probe = folder / f".probe-{os.getpid()}"
+    probe = folder / f".probe-{uuid.uuid4().hex}"
     write_atomic(probe, b"")
-    probe.unlink()
+    places.remove(probe)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from catalog import Catalog
-from pipeline import codec
+from pipeline import codec, store
 from pipeline.config import compose
 from pipeline.graph import tile_graph
-from pipeline.store import Store, TileFolder, write_atomic
-from pipeline.work import Pull
+from pipeline.pull import Pull
+from pipeline.store import DAMAGED, Store, TileFolder, file_entry, write_atomic
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
@@ -62,6 +62,56 @@ def test_damage_counts_as_absence(pull):
     for damaged in (b"", whole[:100], whole[:-1], bytes(flipped)):
         path.write_bytes(damaged)
         assert pull.store.get(node) is None
+
+
+def test_every_damaged_byte_and_every_cut_is_noticed(pull):
+    """Also where the zip keeps no checksum of its own: in its names, dates and directory."""
+    node = pull.graph.nodes[pull.graph.variants["plane"]["evaluate"]]
+    pull(node.fingerprint)
+    (path,) = pull.store.root.rglob(f"{node.fingerprint}.npz")
+    whole = path.read_bytes()
+    assert codec.decode(whole)
+    flips = (whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole)))
+    cuts = (whole[:i] for i in range(len(whole)))
+    for damaged in (*flips, *cuts, whole + b"0"):
+        with pytest.raises(DAMAGED):
+            codec.decode(damaged)
+
+
+def test_an_artefact_opens_without_us(pull):
+    fingerprint = pull.graph.variants["flexroad"]["segment"]
+    mask = pull(fingerprint).mask
+    (path,) = pull.store.root.rglob(f"{fingerprint}.npz")
+    with np.load(path) as archive:
+        assert np.array_equal(archive["mask"], mask)
+
+
+def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
+    folder = TileFolder(tmp_path / "tile")
+    item = {"assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
+    folder.finish(item, {"mesh.glb": b"abc"})
+    assert folder.verified(item)
+    for damaged in (b"abd", b"ab", b""):
+        (folder.path / "mesh.glb").write_bytes(damaged)
+        assert not folder.verified(item)
+    (folder.path / "mesh.glb").unlink()
+    assert not folder.verified(item)
+
+
+def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeypatch):
+    """A run that is killed between two products, or denied the second, leaves a tile that is not done."""
+    folder = TileFolder(tmp_path / "tile")
+    folder.finish({"was": 1}, {"a": b"old", "b": b"old"})
+
+    def denied(path, data):
+        if path.name == "b":
+            raise PermissionError(13, "denied", str(path))
+        path.write_bytes(data)
+
+    monkeypatch.setattr(store, "write_atomic", denied)
+    with pytest.raises(PermissionError):
+        folder.finish({"is": 1}, {"a": b"new", "b": b"new"})
+    assert sorted(path.name for path in folder.path.iterdir()) == ["a", "b"]
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
