@@ -25,8 +25,10 @@ from upath import UPath
 
 Place = Path | UPath
 
-TRIES = 8
+TRIES = 5
 """How often a request is sent before it counts as failed, unless AWS_MAX_ATTEMPTS says otherwise."""
+ROUNDS = 3
+"""How often s3fs, which alone sees an answer break off in the middle, begins with that anew."""
 # Path("s3://bucket") has lost a slash.
 _BUCKET = re.compile(r"s3:/{1,2}(?=[^/])")
 # s3fs raises some without their number.
@@ -63,6 +65,7 @@ def place(where: str | Place) -> Place:
         return Path(where)
     try:
         remote: UPath = UPath("s3://" + text[bucket.end() :], **_s3_options())
+        remote.fs.retries = ROUNDS
     except ImportError as error:
         raise OSError(
             errno.ENOTSUP, "object storage needs s3fs; install it with pip install 'flexroad[s3]'", text

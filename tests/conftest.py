@@ -67,3 +67,41 @@ def executor(request):
     if request.param == "serial":
         return SerialExecutor()
     return DaskExecutor(scheduler=request.getfixturevalue("cluster").scheduler_address)
+
+
+@pytest.fixture(scope="session")
+def storage_server():
+    from tests.s3_server import storage
+
+    with storage() as server:
+        yield server
+
+
+@pytest.fixture
+def storage(storage_server, monkeypatch):
+    """Object storage on loopback that can be told to fail; what speaks S3 in this process finds it."""
+    from botocore.retries.standard import ExponentialBackoff
+
+    storage_server.fail()
+    settings = {
+        "AWS_ENDPOINT_URL": storage_server.url,
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "GDAL_HTTP_RETRY_DELAY": "0.01",
+    }
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(ExponentialBackoff, "delay_amount", lambda self, context: 0.01)
+    yield storage_server
+    storage_server.fail()
+
+
+@pytest.fixture
+def bucket(storage, request):
+    """A folder in a bucket of one's own."""
+    from catalog.places import place
+
+    made = place(f"s3://{abs(hash(request.node.nodeid)):x}/area")
+    made.fs.mkdir(made.parent.path)
+    return made

@@ -1,0 +1,125 @@
+"""A file behaves alike on disk and in a bucket."""
+
+from pathlib import Path
+
+import pytest
+
+from catalog import places
+from catalog.places import Sightings, place
+from tests.s3_server import Fault
+
+
+@pytest.fixture(params=["disk", "bucket"])
+def folder(request, tmp_path):
+    return tmp_path if request.param == "disk" else request.getfixturevalue("bucket")
+
+
+def test_what_is_written_is_seen_listed_and_read(folder):
+    assert places.listing(folder) == {}
+    for name in ("a.bin", "b/c.bin", "b/d/e.bin"):
+        places.write(folder / name, name.encode())
+    found = places.listing(folder)
+    assert {name: seen.size for name, seen in found.items()} == {"a.bin": 5, "b/c.bin": 7, "b/d/e.bin": 9}
+    look = Sightings()
+    for name, seen in found.items():
+        assert places.read(folder / name) == name.encode()
+        assert places.stat(folder / name) == look(folder / name) == seen
+    assert places.listing(folder / "b").keys() == {"c.bin", "d/e.bin"}
+    for name in ("no.bin", "b/no.bin", "no/no.bin"):
+        assert look(folder / name) is places.stat(folder / name) is None
+        assert not places.exists(folder / name)
+    assert places.exists(folder / "a.bin")
+
+
+def test_other_bytes_are_another_version(folder):
+    places.write(folder / "a", b"one")
+    before = places.stat(folder / "a")
+    places.write(folder / "a", b"two")
+    after = places.stat(folder / "a")
+    assert before.size == after.size
+    assert before.version != after.version
+
+
+def test_what_is_missing_is_named(folder):
+    with pytest.raises(FileNotFoundError) as caught:
+        places.read(folder / "no")
+    assert caught.value.filename in (str(folder / "no"), folder / "no")
+    places.write(folder / "there", b"")
+    places.remove(folder / "there")
+    places.remove(folder / "there")
+    assert places.listing(folder) == {}
+
+
+def test_of_those_who_create_a_file_one_does(folder):
+    places.create(folder / "lock", b"mine")
+    with pytest.raises(FileExistsError):
+        places.create(folder / "lock", b"theirs")
+    assert places.read(folder / "lock") == b"mine"
+
+
+def test_a_place_says_what_it_was_called(tmp_path, bucket):
+    assert place(str(tmp_path)) == tmp_path
+    assert type(place(str(tmp_path))) is type(tmp_path)
+    assert not places.is_remote(place("a/s3:/b"))
+    address = f"{bucket}/a/b.tif"
+    # A path has lost a slash on its way through a command line.
+    for told in (address, Path(address), bucket / "a" / "b.tif"):
+        assert str(place(told)) == address
+        assert places.is_remote(place(told))
+    assert places.gdal_name(place(address)) == address.replace("s3://", "/vsis3/")
+
+
+def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):
+    (tmp_path / "link").symlink_to("/")
+    assert places.normal(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
+    assert places.normal("s3://one/a/../b/c") == "s3://one/b/c"
+    # Out of the bucket is another bucket, and no longer below the folder.
+    assert places.normal("s3://one/a/../../../two/c") == "s3://two/c"
+
+
+def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
+    for i in range(20):
+        places.write(bucket / "data" / f"{i}.tif", b"x")
+    storage.requests()
+    look = Sightings()
+    assert all(look(bucket / "data" / f"{i}.tif") for i in range(20))
+    assert len(storage.requests()) == 1
+
+
+def test_a_write_is_one_request(bucket, storage):
+    storage.requests()
+    places.write(bucket / "a", b"x" * 1_000_000)
+    assert [method for method, _ in storage.requests()] == ["PUT"]
+    places.read(bucket / "a")
+    assert [method for method, _ in storage.requests()] == ["GET"]
+
+
+@pytest.mark.parametrize("answer", ["slow", "error", "cut"])
+def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
+    storage.fail(Fault(answer, first=2))
+    places.write(bucket / "a" / "b", b"whole")
+    assert places.read(bucket / "a" / "b") == b"whole"
+    assert places.stat(bucket / "a" / "b").size == 5
+    assert list(places.listing(bucket)) == ["a/b"]
+
+
+def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
+    data = bytes(range(256)) * 1000
+    places.write(bucket / "a", data)
+    storage.fail(Fault("half", method="GET", first=1))
+    assert places.read(bucket / "a") == data
+
+
+@pytest.mark.parametrize("answer", ["slow", "denied"])
+def test_storage_that_never_answers_is_named(bucket, storage, answer):
+    storage.fail(Fault(answer))
+    for attempt in (
+        lambda: places.write(bucket / "a", b""),
+        lambda: places.read(bucket / "a"),
+        lambda: places.stat(bucket / "a"),
+        lambda: places.listing(bucket),
+        lambda: Sightings()(bucket / "a"),
+    ):
+        with pytest.raises(OSError, match=str(bucket)) as caught:
+            attempt()
+        assert isinstance(caught.value, PermissionError) == (answer == "denied")
