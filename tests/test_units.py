@@ -1,0 +1,120 @@
+"""The units of docs/operations are what their programs take, and the commands in them what FlexRoad takes."""
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import typer
+import yaml
+
+from pipeline.cli import app, spread
+
+UNITS = Path(__file__).parent.parent / "docs" / "operations"
+JOB = yaml.safe_load((UNITS / "cronjob.yaml").read_text())
+POD = JOB["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+
+
+def text(name: str) -> str:
+    return (UNITS / name).read_text()
+
+
+def command(name: str) -> list[str]:
+    """The words of the flexroad command in a unit, as its shell would give them."""
+    if name == "cronjob.yaml":
+        return POD["containers"][0]["command"][1:]
+    (line,) = re.findall(r"^[^#\n]*/bin/flexroad (.*)$", text(name), flags=re.MULTILINE)
+    return shlex.split(line.replace("$SLURM_CPUS_PER_TASK", "32").split(" >> ")[0])
+
+
+@pytest.mark.parametrize("name", ["flexroad.service", "flexroad.cron", "cronjob.yaml", "flexroad.sbatch"])
+def test_its_command_runs(name, made_survey, tmp_path, capsys):
+    words = command(name)
+    words[words.index("--catalog") + 1] = str(made_survey / "catalog.parquet")
+    words[words.index("--out") + 1] = str(tmp_path / "run")
+    typer.main.get_command(app)(spread([*words, "--dry-run"]), standalone_mode=False)
+    assert "to do" in capsys.readouterr().out
+
+
+def test_no_command_needs_flock():
+    # The lock is FlexRoad's own: on another machine's disk and in a bucket, too.
+    for unit in UNITS.iterdir():
+        assert not re.search(r"^[^#]*\bflock\b", unit.read_text(), flags=re.MULTILINE)
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd is not installed")
+def test_systemd_takes_service_and_timer(tmp_path):
+    there = shutil.which("true")
+    (tmp_path / "flexroad.service").write_text(
+        text("flexroad.service").replace("/opt/flexroad/bin/flexroad", there)
+    )
+    (tmp_path / "flexroad.timer").write_text(text("flexroad.timer"))
+    units = [tmp_path / "flexroad.service", tmp_path / "flexroad.timer"]
+    done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, check=False)
+    # Of the machine's own units it may complain, too.
+    complaints = [line for line in done.stderr.splitlines() if "flexroad" in line]
+    assert not complaints
+    assert done.returncode == 0, done.stderr
+    when = re.search(r"OnCalendar=(.*)", text("flexroad.timer"))[1]
+    subprocess.run(["systemd-analyze", "calendar", when], capture_output=True, check=True)
+
+
+def test_service_and_timer_leave_the_run_the_time_it_needs():
+    service = text("flexroad.service")
+    assert "Type=oneshot" in service
+    assert "KillMode=mixed" in service
+    assert "Restart=" not in service
+    assert "Persistent=true" in text("flexroad.timer")
+
+
+def test_cron_takes_the_line():
+    (line,) = [line for line in text("flexroad.cron").splitlines() if re.match(r"[\d*]", line)]
+    *when, user, what = line.split(maxsplit=6)[:7]
+    assert user == "flexroad"
+    for field, most in zip(when, (59, 23, 31, 12, 7), strict=True):
+        assert field == "*" or 0 <= int(field) <= most
+    # In a crontab it would end the line.
+    assert "%" not in what
+    subprocess.run(["sh", "-n", "-c", what], check=True)
+
+
+def test_the_job_of_kubernetes_runs_alone_and_ends():
+    assert (JOB["apiVersion"], JOB["kind"]) == ("batch/v1", "CronJob")
+    spec = JOB["spec"]
+    assert spec["concurrencyPolicy"] == "Forbid"
+    assert len(spec["schedule"].split()) == 5
+    job = spec["jobTemplate"]["spec"]
+    assert job["activeDeadlineSeconds"] > 0
+    # Kubernetes takes a policy on failures only of pods that are not restarted.
+    assert POD["restartPolicy"] == "Never"
+    rules = job["podFailurePolicy"]["rules"]
+    assert {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]} in rules
+    (codes,) = [rule["onExitCodes"] for rule in rules if "onExitCodes" in rule]
+    assert codes["values"] == [1, 2]
+    assert POD["terminationGracePeriodSeconds"] >= 60
+
+
+def test_the_pod_of_kubernetes_asks_for_what_its_workers_need():
+    (container,) = POD["containers"]
+    assert container["name"] == "flexroad"
+    limits = container["resources"]["limits"]
+    assert limits == container["resources"]["requests"]
+    words = container["command"]
+    assert words[words.index("--workers") + 1] == limits["cpu"]
+    assert {mount["name"] for mount in container["volumeMounts"]} == {
+        volume["name"] for volume in POD["volumes"]
+    }
+
+
+def test_slurm_takes_the_script():
+    subprocess.run(["bash", "-n", UNITS / "flexroad.sbatch"], check=True)
+    options = dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)$", text("flexroad.sbatch"), flags=re.MULTILINE))
+    assert len(options) == text("flexroad.sbatch").count("\n#SBATCH ")
+    # To the batch script alone, which the run has replaced.
+    assert re.fullmatch(r"B:TERM@\d+", options["signal"])
+    assert "\nexec " in text("flexroad.sbatch")
+    assert options["nodes"] == options["ntasks"] == "1"
+    # Directives after the first command are comments.
+    assert text("flexroad.sbatch").rindex("#SBATCH ") < text("flexroad.sbatch").index("set -euo")
