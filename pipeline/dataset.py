@@ -7,13 +7,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from catalog.places import Place, place
 from pipeline.errors import ConfigError
+from pipeline.look import look_at
+from pipeline.pull import Pull, StageError
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull, StageError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
 HEIGHTS = {"units": "m"}
 
 
-def open_tile(run: Path | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
+def open_tile(run: Place | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
     """Return what went into a tile and what came out of it, on the tile's core.
 
     Parameters
     ----------
-    run : Path
+    run : Place or str
         The run's folder.
     tile_id : str
         A tile of its catalog.
@@ -51,13 +52,13 @@ def open_tile(run: Path | str, tile_id: str, variant: str | None = None) -> xr.D
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
 
-    opened = Run.open(Path(run))
+    opened = Run.open(place(run))
     variant = variant or opened.config.export.variants[0]
     if variant not in opened.config.chains:
         raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")
     (tile,) = opened.catalog.select([tile_id]).tiles
-    (graph,) = (graph for graph in opened.graphs() if graph.tile.id == tile.id)
-    pull, made = Pull(graph, Store(opened.store)), graph.variants[variant]
+    (stand,) = look_at(opened, [tile])
+    pull, made = Pull(stand.graph, Store(opened.store)), stand.graph.variants[variant]
     try:
         data, road, clusters, surface = (pull(made[stage]) for stage in ("load", "segment", "ecsrc", "fit"))
     except StageError as error:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,8 +26,12 @@ from types import ModuleType
 from typing import Any
 
 from catalog import Catalog, Layer, Tile
+from catalog.places import Place, Seen, read, stat
 from pipeline.config import Config, Export
 from tasks.options import Options
+
+Look = Callable[[Place], Seen | None]
+Recorded = Sequence[Any]
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,8 @@ class TileGraph:
     export: Export
     sources: list[Any]
     """The source layers as they are named in fingerprints, or were."""
+    seen: dict[str, Seen | None]
+    """How each file looked when the graph was made, by its path; None if it was not there."""
     fingerprint: str
     """Of everything asked for; the tile is done when its item carries it."""
 
@@ -100,78 +106,128 @@ def stage_function(stage: str, options: Options) -> Callable[..., Any]:
     return function
 
 
-def digest(value: Any) -> str:
-    """Return a name for anything that JSON can hold."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+def _json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def _hash(text: str) -> str:
+    """Return a name for anything, told as JSON."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A node as it is in every tile: all that makes its fingerprint but for the tile's own."""
+
+    stage: str
+    options: Options
+    head: str
+    """What all tiles have in common, as the JSON that is hashed."""
+    inputs: tuple[int, ...]
+    """Numbers of the steps whose results it takes."""
+    reads: tuple[str, ...]
+    """Source layers that it reads."""
+    files: tuple[Path, ...]
+    """Files that only its options name."""
+    stored: bool
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What the graphs of all tiles of a run have in common, worked out once."""
+
+    steps: tuple[Step, ...]
+    variants: dict[str, dict[str, int]]
+    """Variant -> stage -> number of its step."""
+    export: Export
+    exported: str
+    """The export as the JSON that is hashed."""
+
+    @classmethod
+    def of(cls, config: Config) -> Pattern:
+        """Work out which steps there are: variants that agree up to a stage share its step."""
+        steps: dict[tuple[str, tuple[int, ...]], Step] = {}
+        numbers: dict[tuple[str, tuple[int, ...]], int] = {}
+        variants: dict[str, dict[str, int]] = {}
+        for variant, chain in config.chains.items():
+            made: dict[str, int] = {}
+            for stage in STAGES:
+                inputs = tuple(made[name] for name in stage.inputs)
+                step = _step(stage, chain[stage.name], inputs, variant in config.export.variants)
+                key = step.head, inputs
+                made[stage.name] = numbers.setdefault(key, len(numbers))
+                if key not in steps or step.stored:
+                    steps[key] = step
+            variants[variant] = made
+        exported = _json(config.export.model_dump(mode="json"))
+        return cls(tuple(steps[key] for key in numbers), variants, config.export, exported)
+
+    def graph(
+        self, tile: Tile, checksum: bool = False, look: Look = stat, recorded: Recorded = ()
+    ) -> TileGraph:
+        """Return the graph of one tile.
+
+        Parameters
+        ----------
+        checksum : bool
+            Name sources by their bytes instead of size and time.
+        look : callable
+            Tells size and time of a source file, None if it is gone.
+        recorded : sequence
+            `TileGraph.sources` of earlier, which stand in for files that are gone.
+        """
+        seen = {str(path): look(path) for layer in tile.layers for path in tile.paths(layer)}
+        sources = [_layer(tile, layer, seen, checksum) for layer in tile.layers]
+        if recorded:
+            sources = _as_they_were(sources, recorded)
+        names: list[str] = []
+        nodes: dict[str, Node] = {}
+        texts = [(source[0], _json(source)) for source in sources]
+        for step in self.steps:
+            inputs = tuple(names[number] for number in step.inputs)
+            # The first stage takes the tile itself.
+            given = _json(inputs) if inputs else _json(asdict(tile.grid))
+            read = ",".join(text for layer, text in texts if layer in step.reads)
+            seen |= {str(path): stat(path) for path in step.files}
+            files = _json([_bytes(path, seen[str(path)]) for path in step.files])
+            name = _hash(f"[{step.head},{given},[{read}],{files}]")
+            names.append(name)
+            nodes[name] = Node(name, step.stage, step.options, inputs, step.stored)
+        variants = {
+            variant: {stage: names[number] for stage, number in made.items()}
+            for variant, made in self.variants.items()
+        }
+        fingerprint = self._fingerprint(tile, variants)
+        return TileGraph(tile, nodes, variants, self.export, sources, seen, fingerprint)
+
+    def _fingerprint(self, tile: Tile, variants: Mapping[str, Mapping[str, str]]) -> str:
+        asked = [
+            tile.id,
+            tile.stratum,
+            [[variant, made["evaluate"], made["assess"]] for variant, made in variants.items()],
+            [variants[variant]["sample"] for variant in self.export.variants],
+        ]
+        return _hash(f"{_json(asked)[:-1]},{self.exported}]")
+
+
+def _step(stage: Stage, options: Options, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
+    module = stage_module(options)
+    head = [stage.name, module.__name__, module.VERSION, options.model_dump(mode="json")]
+    stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
+    reads = getattr(module, "READS", ())
+    return Step(stage.name, options, _json(head)[1:-1], inputs, reads, model_files(options), stored)
 
 
 def tile_graphs(catalog: Catalog, config: Config, checksum: bool = False) -> Iterator[TileGraph]:
     """Yield the graph of every tile, in the catalog's order."""
+    pattern = Pattern.of(config)
     for tile in catalog.tiles:
-        yield tile_graph(tile, config, checksum)
+        yield pattern.graph(tile, checksum)
 
 
-def tile_graph(
-    tile: Tile,
-    config: Config,
-    checksum: bool = False,
-    recorded: Callable[[], list[Any] | None] = lambda: None,
-) -> TileGraph:
-    """Build one tile's graph.
-
-    Parameters
-    ----------
-    checksum : bool
-        Name sources by their bytes instead of size and time.
-    recorded : callable
-        Gives the `TileGraph.sources` of earlier, for files that are gone.
-    """
-    sources = [_layer(tile, layer, checksum) for layer in tile.layers]
-    if any(size is None for _, files, *_ in sources for _, size, *_ in files):
-        sources = _as_they_were(sources, recorded())
-    nodes: dict[str, Node] = {}
-    variants: dict[str, dict[str, str]] = {}
-    for variant, chain in config.chains.items():
-        made: dict[str, str] = {}
-        for stage in STAGES:
-            inputs = tuple(made[name] for name in stage.inputs)
-            node = _node(stage, chain[stage.name], inputs, tile, sources, variant in config.export.variants)
-            known = nodes.get(node.fingerprint)
-            if known is None or (node.stored and not known.stored):
-                nodes[node.fingerprint] = node
-            made[stage.name] = node.fingerprint
-        variants[variant] = made
-    exported = [variants[variant]["sample"] for variant in config.export.variants]
-    asked = [tile.id, tile.stratum, _names(variants), exported, config.export.model_dump(mode="json")]
-    return TileGraph(tile, nodes, variants, config.export, sources, digest(asked))
-
-
-def _names(variants: Mapping[str, Mapping[str, str]]) -> list[list[str]]:
-    return [[variant, made["evaluate"], made["assess"]] for variant, made in variants.items()]
-
-
-def _node(
-    stage: Stage,
-    options: Options,
-    inputs: tuple[str, ...],
-    tile: Tile,
-    sources: list[Any],
-    keep_mesh: bool,
-) -> Node:
-    module = stage_module(options)
-    made_of = [
-        stage.name,
-        module.__name__,
-        module.VERSION,
-        options.model_dump(mode="json"),
-        # The first stage takes the tile itself.
-        list(inputs) if stage.inputs else asdict(tile.grid),
-        [source for source in sources if source[0] in getattr(module, "READS", ())],
-        [_bytes(path) for path in model_files(options)],
-    ]
-    stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
-    return Node(digest(made_of), stage.name, options, inputs, stored)
+def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
+    """Return the graph of one tile; for many, `Pattern.graph` is quicker."""
+    return Pattern.of(config).graph(tile, checksum)
 
 
 def model_files(options: Options) -> tuple[Path, ...]:
@@ -180,40 +236,52 @@ def model_files(options: Options) -> tuple[Path, ...]:
     return files(options)
 
 
-def _bytes(path: Path) -> str | None:
-    try:
-        stat = path.stat()
-    except OSError:
-        # A missing file is its stage's to report; when it comes back the name changes.
-        return None
-    return _digest_of(path, stat.st_size, stat.st_mtime_ns)
+def files_read(graph: TileGraph, node: Node) -> list[Place]:
+    """Return the files that a stage reads: those of its source layers, and those its options name."""
+    reads = getattr(stage_module(node.options), "READS", ())
+    paths = [path for layer in graph.tile.layers if layer.name in reads for path in graph.tile.paths(layer)]
+    return [*paths, *model_files(node.options)]
 
 
-@lru_cache(maxsize=64)
-def _digest_of(path: Path, size: int, mtime_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def any_gone(graph: TileGraph) -> bool:
+    """Tell whether a file that the tile's stages might read is not there."""
+    return None in graph.seen.values()
 
 
-def _as_they_were(sources: list[Any], recorded: list[Any] | None) -> list[Any]:
+def _layer(tile: Tile, layer: Layer, seen: Mapping[str, Seen | None], checksum: bool) -> list[Any]:
+    """Return name, files, values and CRS of a layer; a file is told by name, size and time, or its bytes."""
+    files: list[list[str | int | None]] = []
+    for name, path in zip(layer.files, tile.paths(layer), strict=True):
+        now = seen[str(path)]
+        if checksum or now is None:
+            # A missing file is `load`'s to report; when it comes back the name changes.
+            files.append([name, _bytes(path, now)])
+        else:
+            files.append([name, now.size, now.version])
+    return [layer.name, files, list(layer.values), layer.crs]
+
+
+def _as_they_were(sources: list[Any], recorded: Recorded) -> list[Any]:
     """Return the sources with what is on record of files that are gone."""
-    known = {(name, file[0]): file for name, files, *_ in recorded or () for file in files}
+    known = {(name, file[0]): file for name, files, *_ in recorded for file in files}
     return [
         [name, [file if file[1] is not None else known.get((name, file[0]), file) for file in files], *rest]
         for name, files, *rest in sources
     ]
 
 
-def _layer(tile: Tile, layer: Layer, checksum: bool) -> list[Any]:
-    files: list[list[str | int | None]] = []
-    for name, path in zip(layer.files, tile.paths(layer), strict=True):
-        try:
-            stat = path.stat()
-            if checksum:
-                files.append([name, _digest_of(path, stat.st_size, stat.st_mtime_ns)])
-            else:
-                files.append([name, stat.st_size, stat.st_mtime_ns])
-        except OSError:
-            # A missing file is `load`'s to report; when it comes back the name changes.
-            files.append([name, None])
-    return [layer.name, files, list(layer.values), layer.crs]
+def _bytes(path: Place, seen: Seen | None) -> str | None:
+    if seen is None:
+        return None
+    try:
+        return _digest_of(path, seen.size, seen.version)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=65536)
+def _digest_of(path: Place, size: int, version: int | str) -> str:
+    if not isinstance(path, Path):
+        return hashlib.sha256(read(path)).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,7 +12,9 @@ the file for long, nor much of it in memory. ::
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import sqlite3
 import time
 from collections import Counter
@@ -21,7 +23,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
+from catalog.places import Place
 from pipeline.entry import Entry, Failure, Row
+from pipeline.mirror import Mirror
 
 NAME = "ledger.sqlite"
 VERSION = 1
@@ -42,22 +46,16 @@ PRAGMA user_version = {VERSION};
 
 
 class Ledger:
-    """Entries by tile; use it as a context, so that what waits is written at the end.
+    """Entries by tile; use it as a context, so that what waits is written at the end."""
 
-    Attributes
-    ----------
-    path : Path
-        The file.
-    """
-
-    def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
-        self.path = path
+    def __init__(self, connection: sqlite3.Connection, mirror: Mirror) -> None:
         self._connection = connection
+        self._mirror = mirror
         self._waiting: dict[str, Entry] = {}
         self._flushed = time.monotonic()
 
     @classmethod
-    def open(cls, path: Path) -> Ledger:
+    def open(cls, where: Place) -> Ledger:
         """Open a ledger to write, empty if there is no sound one.
 
         Raises
@@ -65,26 +63,30 @@ class Ledger:
         OSError
             If it cannot be written.
         """
+        mirror = Mirror(where)
+        mirror.fetch()
         try:
-            connection = _sound(path, "rwc")
+            connection = _sound(mirror.path, "rwc")
             if connection is None:
-                path.unlink(missing_ok=True)
-                connection = _connect(path, "rwc")
+                mirror.path.unlink(missing_ok=True)
+                connection = _connect(mirror.path, "rwc")
                 connection.executescript(SCHEMA)
         except sqlite3.Error as error:
-            raise OSError(f"cannot write {path}: {error}") from error
-        return cls(connection, path)
+            raise _os_error(error, where) from error
+        return cls(connection, mirror)
 
     @classmethod
-    def peek(cls, path: Path) -> Ledger:
+    def peek(cls, where: Place) -> Ledger:
         """Open a ledger to read only, also while a run writes it; an empty one if there is no sound one."""
+        mirror = Mirror(where, mine=False)
+        mirror.fetch()
         connection = None
         with contextlib.suppress(sqlite3.Error):
-            connection = _sound(path, "ro")
+            connection = _sound(mirror.path, "ro", thorough=False)
         if connection is None:
             connection = sqlite3.connect(":memory:")
             connection.executescript(SCHEMA)
-        return cls(connection, path)
+        return cls(connection, mirror)
 
     def __enter__(self) -> Ledger:
         return self
@@ -98,12 +100,15 @@ class Ledger:
         Raises
         ------
         OSError
-            If the disk is full.
+            If the disk is full, or the storage does not answer.
         """
         try:
             self.flush()
+            self._connection.close()
+            self._mirror.put()
         finally:
             self._connection.close()
+            self._mirror.close()
 
     def ask(self, tiles: Iterable[tuple[str, Standing]]) -> int:
         """Set which tiles there are, in the catalog's order, and how each stands.
@@ -134,6 +139,7 @@ class Ledger:
             # On a full disk the tiles go on; what waits is tried again.
             with contextlib.suppress(OSError):
                 self.flush()
+                self._mirror.tick()
 
     def flush(self) -> None:
         """Write what waits.
@@ -162,7 +168,7 @@ class Ledger:
         """Return what is known of a tile."""
         if tile_id in self._waiting:
             return self._waiting[tile_id]
-        line = self._connection.execute(f"SELECT {FIELDS} FROM entry WHERE tile = ?", (tile_id,)).fetchone()
+        line = self._line(f"SELECT {FIELDS} FROM entry WHERE tile = ?", tile_id)
         return _from_line(line) if line else None
 
     def counts(self) -> Counter[Standing]:
@@ -171,6 +177,11 @@ class Ledger:
         return Counter(
             dict(self._connection.execute("SELECT standing, count(*) FROM asked GROUP BY standing"))
         )
+
+    def standing(self, tile_id: str) -> Standing | None:
+        """Return how a tile stood when the last run looked at it, None if it was not asked for."""
+        line = self._line("SELECT standing FROM asked WHERE tile = ?", tile_id)
+        return line[0] if line else None
 
     def entries(self) -> Iterator[tuple[str, Standing, Entry | None]]:
         """Yield every tile of the catalog in its order: id, how it stands, and what is known of it."""
@@ -197,6 +208,13 @@ class Ledger:
         ):
             yield from (Failure(**failure) for failure in json.loads(failures))
 
+    def _line(self, query: str, tile_id: str) -> Sequence[Any] | None:
+        # What cannot be read is not known: the marker tells.
+        with contextlib.suppress(sqlite3.DatabaseError):
+            found: Sequence[Any] | None = self._connection.execute(query, (tile_id,)).fetchone()
+            return found
+        return None
+
     def _pages(self, query: str) -> Iterator[Sequence[Any]]:
         """Yield the lines of a query whose first column is a position and whose first parameter the last."""
         self.flush()
@@ -213,22 +231,21 @@ class Ledger:
             with self._connection:
                 yield
         except sqlite3.Error as error:
-            raise OSError(f"cannot write {self.path}: {error}") from error
+            raise _os_error(error, self._mirror.where) from error
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=WAIT_S)
 
 
-def _sound(path: Path, mode: str) -> sqlite3.Connection | None:
-    """Return a connection to a ledger that is there, whole and of this version."""
+def _sound(path: Path, mode: str, thorough: bool = True) -> sqlite3.Connection | None:
+    """Return a connection to a ledger that is there, of this version and, on a thorough look, whole."""
     if not path.exists():
         return None
     connection = _connect(path, mode)
     try:
         (version,) = connection.execute("PRAGMA user_version").fetchone()
-        (check,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-        if (version, check) == (VERSION, "ok"):
+        if version == VERSION and not (thorough and _damaged(connection)):
             return connection
     except sqlite3.OperationalError:
         # Locked or not to be written: no fault of the file.
@@ -238,6 +255,17 @@ def _sound(path: Path, mode: str) -> sqlite3.Connection | None:
         pass
     connection.close()
     return None
+
+
+def _damaged(connection: sqlite3.Connection) -> bool:
+    (check,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    return bool(check != "ok")
+
+
+def _os_error(error: sqlite3.Error, where: Place) -> OSError:
+    full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+    number, why = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
+    return OSError(number, why, str(where))
 
 
 def _to_line(entry: Entry) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
-    from pipeline.run import Summary
+    from pipeline.summary import Summary
     from pipeline.work import TileResult
 
 EVERY_S = 10.0

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -16,11 +17,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
+from catalog.places import Place, place
 from pipeline.errors import ConfigError
 from pipeline.graph import TileGraph
+from pipeline.look import look_at
+from pipeline.pull import Pull, StageError
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull, StageError
 from tasks.types import Floats, RoadMask, Surface
 
 
@@ -42,15 +45,15 @@ class Answer:
 class Ground:
     """The fitted surfaces of a run's finished tiles as one ground.
 
-    Surfaces come from the store; the sources are not needed for NURBS surfaces.
+    Surfaces come from the store; the sources are not needed for NURBS surfaces. Only the tiles under the
+    points asked for are looked at.
     """
 
     run: Run
     variant: str
-    graphs: tuple[TileGraph, ...]
 
     @classmethod
-    def open(cls, path: Path | str, variant: str | None = None) -> Ground:
+    def open(cls, path: Place | str, variant: str | None = None) -> Ground:
         """Open a run.
 
         Raises
@@ -58,19 +61,18 @@ class Ground:
         ConfigError
             If it is no run, has no such variant, or no tile is done.
         """
-        run = Run.open(Path(path))
+        run = Run.open(place(path))
         variant = variant or run.config.export.variants[0]
         if variant not in run.config.chains:
             raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-        graphs = tuple(graph for graph in run.graphs() if run.folder(graph.tile.id).done(graph))
-        if not graphs:
+        if not any(found.done for found in look_at(run, run.catalog.tiles)):
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
-        return cls(run, variant, graphs)
+        return cls(run, variant)
 
     def at(self, easting: Floats, northing: Floats) -> Answer:
         """Return height, normal, tile and class under n points (m, in the run's CRS).
 
-        A point on the edge of two tiles belongs to the one first in the catalog.
+        A point on the edge of two finished tiles belongs to the one first in the catalog.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -78,11 +80,8 @@ class Ground:
         normal = np.full((*easting.shape, 3), np.nan)
         tile = np.zeros(easting.shape, dtype=object)
         kind = np.full(easting.shape, "", dtype=object)
-        owner = self._owners(easting, northing)
         tile[:] = ""
-        for i in np.unique(owner[owner >= 0]):
-            here = np.flatnonzero(owner == i)
-            graph = self.graphs[i]
+        for graph, here in self._owners(easting, northing):
             surface, road = self._tile(graph)
             height[here] = surface.height(easting[here], northing[here])
             normal[here] = surface.normal(easting[here], northing[here])
@@ -92,13 +91,20 @@ class Ground:
             )
         return Answer(height, normal, tile.astype(str), kind.astype(str))
 
-    def _owners(self, easting: Floats, northing: Floats) -> NDArray[np.intp]:
-        tree = STRtree([box(*graph.tile.grid.bounds) for graph in self.graphs])
-        point, tile = tree.query(points(easting, northing), predicate="intersects")
-        owner = np.full(easting.shape, len(self.graphs), dtype=np.intp)
-        np.minimum.at(owner, point, tile)
-        owner[owner == len(self.graphs)] = -1
-        return owner
+    def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileGraph, NDArray[np.intp]]]:
+        """Yield each finished tile that has points, with their numbers."""
+        tiles = self.run.catalog.tiles
+        tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
+        point, number = tree.query(points(easting, northing), predicate="intersects")
+        order = np.argsort(number, kind="stable")
+        under, starts = np.unique(number[order], return_index=True)
+        free = np.ones(easting.shape, dtype=bool)
+        stands = look_at(self.run, [tiles[i] for i in under])
+        for found, here in zip(stands, np.split(point[order], starts[1:]), strict=True):
+            here = here[free[here]]
+            if found.done and here.size:
+                free[here] = False
+                yield found.graph, here
 
     def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
         pull = Pull(graph, Store(self.run.store))
@@ -109,7 +115,7 @@ class Ground:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
 
 
-def query_csv(run: Path, csv: Path, variant: str | None, out: TextIO) -> int:
+def query_csv(run: Place, csv: Path, variant: str | None, out: TextIO) -> int:
     """Answer a CSV of points with a CSV: its columns, then height_m, nx, ny, nz, tile, class.
 
     Returns

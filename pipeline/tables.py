@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Sequence
-from dataclasses import asdict, fields
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
+from itertools import islice
 
 import pandas as pd
 
+from catalog.places import Place, exists, read
+from pipeline.entry import Failure, Row
 from pipeline.errors import ConfigError
-from pipeline.store import write_atomic
-from pipeline.work import Failure
+from pipeline.mirror import whole
+
+PIECE = 10_000
+"""Rows held at a time; also the table's row groups."""
 
 COLUMNS: dict[str, str] = {
     "tile_id": "str",
@@ -54,23 +58,41 @@ COLUMNS: dict[str, str] = {
 """Columns of metrics.parquet and their types; the fixed ones first."""
 
 
-def metrics_frame(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
+def metrics_frame(rows: Sequence[Row]) -> pd.DataFrame:
     """Return the rows as a table with the fixed columns."""
     frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
     return frame.astype(COLUMNS)
 
 
-def write_tables(run: Path, rows: Sequence[dict[str, Any]], failures: Sequence[Failure]) -> None:
-    """Write metrics.parquet and failures.csv."""
-    buffer = io.BytesIO()
-    metrics_frame(rows).to_parquet(buffer, index=False)
-    write_atomic(run / "metrics.parquet", buffer.getvalue())
+def write_tables(run: Place, rows: Iterable[Row], failures: Iterable[Failure]) -> None:
+    """Write metrics.parquet and failures.csv, piece by piece.
+
+    Raises
+    ------
+    OSError
+        If they cannot be written, as on a full disk.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
+    with whole(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
+        for piece in _pieces(rows):
+            table.write_table(pa.Table.from_pandas(metrics_frame(piece), schema, preserve_index=False))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
-    table = pd.DataFrame([asdict(failure) for failure in failures], columns=names)
-    write_atomic(run / "failures.csv", table.to_csv(index=False).encode())
+    with whole(run / "failures.csv") as path, path.open("w", newline="") as file:
+        lines = csv.writer(file, lineterminator="\n")
+        lines.writerow(names)
+        lines.writerows([getattr(failure, name) for name in names] for failure in failures)
 
 
-def read_metrics(run: Path) -> pd.DataFrame:
+def _pieces(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    left = iter(rows)
+    while piece := list(islice(left, PIECE)):
+        yield piece
+
+
+def read_metrics(run: Place) -> pd.DataFrame:
     """Read the rows of a run.
 
     Raises
@@ -79,10 +101,10 @@ def read_metrics(run: Path) -> pd.DataFrame:
         If there are none yet, or the table is damaged.
     """
     path = run / "metrics.parquet"
-    if not path.exists():
+    if not exists(path):
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
         # Runs of earlier days lack the later columns.
-        return pd.read_parquet(path).reindex(columns=list(COLUMNS))
+        return pd.read_parquet(io.BytesIO(read(path))).reindex(columns=list(COLUMNS))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error

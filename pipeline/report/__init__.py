@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from catalog.places import Place
 from pipeline.report.content import gather
 from pipeline.report.pages import csv_page, html_page, markdown_page
 from pipeline.run import Run
@@ -12,7 +11,7 @@ from pipeline.store import write_atomic
 FORMATS = ("md", "csv", "html")
 
 
-def write_report(run: Run, form: str) -> Path:
+def write_report(run: Run, form: str) -> Place:
     """Write RUN/report.<form> and return its path.
 
     Parameters

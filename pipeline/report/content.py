@@ -9,7 +9,8 @@ import yaml
 
 from pipeline.report.steps import edge_steps
 from pipeline.report.trust import most_doubtful, over_tiles
-from pipeline.run import Run, summary
+from pipeline.run import Run
+from pipeline.summary import summary
 from pipeline.tables import read_metrics
 
 FIGURES = {

@@ -9,6 +9,7 @@ from typing import Final
 
 import pandas as pd
 
+from catalog.places import Place
 from pipeline.errors import ConfigError
 from pipeline.report.content import FIGURES
 from pipeline.run import Run
@@ -170,7 +171,7 @@ def _rows(run: Run) -> pd.DataFrame:
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
 
 
-def _sound(rows: pd.DataFrame, run: Path, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
+def _sound(rows: pd.DataFrame, run: Place, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
     evidence = Evidence(rows, dsc3d)
     if not evidence.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pipeline.graph import TileGraph
+from pipeline.look import look_at
+from pipeline.pull import Pull, StageError
 from pipeline.report.content import Content
 from pipeline.report.pages import TilePictures
 from pipeline.report.render import error_map, filter_picture, hillshade, render_meshes, support_picture
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull, StageError
 from tasks.drape import drape
 from tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
@@ -21,11 +22,11 @@ def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
     """Draw the exported variant of every tile, or of the worst where there are many."""
     variant = run.config.export.variants[0]
     shown = _shown(content)
-    graphs = [graph for graph in run.graphs() if graph.tile.id in shown]
-    graphs.sort(key=lambda graph: shown.index(graph.tile.id))
     maps: dict[str, TilePictures] = {}
     meshes: dict[str, Mesh] = {}
-    for graph in graphs:
+    known = {tile.id: tile for tile in run.catalog.tiles}
+    for found in look_at(run, [known[tile_id] for tile_id in shown]):
+        graph = found.graph
         pull = Pull(graph, Store(run.store))
         try:
             meshes[graph.tile.id] = pull(graph.variants[variant]["sample"])

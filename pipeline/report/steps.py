@@ -6,18 +6,24 @@ Tiles are fitted independently, so nothing makes their surfaces meet; this says 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
 
-from catalog import Grid
-from pipeline.graph import TileGraph
+from catalog import Grid, Tile
+from pipeline.graph import Node, TileGraph
+from pipeline.look import look_at
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull
 from tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
+KEPT = 1024
+"""Tiles whose surfaces are held until their other neighbours have come: more than a column of a state."""
+
+Nodes = tuple[Node, Node]
+"""Of the surface and of the road mask."""
 
 
 def edge_steps(run: Run) -> pd.DataFrame:
@@ -25,22 +31,40 @@ def edge_steps(run: Run) -> pd.DataFrame:
 
     Only pairs whose surfaces are in the store are told of.
     """
-    rows = [row for variant in run.config.export.variants for row in _rows(run, variant)]
+    done: list[tuple[Tile, dict[str, Nodes]]] = []
+    for found in look_at(run, run.catalog.tiles):
+        if found.done:
+            done.append((found.graph.tile, _nodes(found.graph)))
+    rows = [row for variant in run.config.export.variants for row in _rows(run, done, variant)]
     table = pd.DataFrame(rows, columns=COLUMNS)
     return table.sort_values("largest step (m)", ascending=False, ignore_index=True)
 
 
-def _rows(run: Run, variant: str) -> Iterator[tuple[str, str, str, float, float, float]]:
+def _nodes(graph: TileGraph) -> dict[str, Nodes]:
+    made = {variant: graph.variants[variant] for variant in graph.export.variants}
+    return {v: (graph.nodes[names["fit"]], graph.nodes[names["segment"]]) for v, names in made.items()}
+
+
+def _rows(
+    run: Run, done: list[tuple[Tile, dict[str, Nodes]]], variant: str
+) -> Iterator[tuple[str, str, str, float, float, float]]:
     store = Store(run.store)
-    graphs = {graph.tile.id: graph for graph in run.graphs() if run.folder(graph.tile.id).done(graph)}
-    corners = {_corner(g.tile.grid, g.tile.grid.west, g.tile.grid.south): g for g in graphs.values()}
-    for graph in graphs.values():
-        grid = graph.tile.grid
+    tiles = [tile for tile, _ in done]
+    nodes = {tile.id: nodes[variant] for tile, nodes in done}
+
+    @lru_cache(KEPT)
+    def results(tile_id: str) -> tuple[Surface, RoadMask] | None:
+        surface, road = (store.get(node) for node in nodes[tile_id])
+        return (surface[0], road[0]) if surface and road else None
+
+    corners = {_corner(tile.grid, tile.grid.west, tile.grid.south): tile for tile in tiles}
+    for tile in tiles:
+        grid = tile.grid
         for east, north in ((grid.east, grid.south), (grid.west, grid.north)):
             other = corners.get(_corner(grid, east, north))
-            if other is None or not (_kept(graph, variant, store) and _kept(other, variant, store)):
+            if other is None or (here := results(tile.id)) is None or (there := results(other.id)) is None:
                 continue
-            yield (variant, graph.tile.id, other.tile.id, *_step(graph, other, variant, store))
+            yield (variant, tile.id, other.id, *_step(grid, other.grid, *here, there[0]))
 
 
 def _corner(grid: Grid, east: float, north: float) -> tuple[str, float, float]:
@@ -48,14 +72,8 @@ def _corner(grid: Grid, east: float, north: float) -> tuple[str, float, float]:
     return grid.crs, round(east, 3), round(north, 3)
 
 
-def _kept(graph: TileGraph, variant: str, store: Store) -> bool:
-    return all(store.has(graph.nodes[graph.variants[variant][stage]]) for stage in ("fit", "segment"))
-
-
-def _step(graph: TileGraph, other: TileGraph, variant: str, store: Store) -> tuple[float, float, float]:
-    east, north = _shared_edge(graph.tile.grid, other.tile.grid)
-    a, road = _results(graph, variant, store)
-    b, _ = _results(other, variant, store)
+def _step(grid: Grid, other: Grid, a: Surface, road: RoadMask, b: Surface) -> tuple[float, float, float]:
+    east, north = _shared_edge(grid, other)
     inside = ~road.outside[road.grid.cells(east, north)]
     step = np.abs(a.height(east, north) - b.height(east, north))
     step = np.where(inside, step, np.nan)
@@ -73,9 +91,3 @@ def _shared_edge(grid: Grid, other: Grid) -> tuple[Floats, Floats]:
     if other.west > grid.west + grid.cell:
         return np.full(grid.height, grid.east), grid.northings
     return grid.eastings, np.full(grid.width, grid.north)
-
-
-def _results(graph: TileGraph, variant: str, store: Store) -> tuple[Surface, RoadMask]:
-    pull = Pull(graph, store)
-    made = graph.variants[variant]
-    return pull(made["fit"]), pull(made["segment"])

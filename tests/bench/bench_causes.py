@@ -17,9 +17,9 @@ import pandas as pd
 from catalog import Catalog
 from pipeline.config import load_config
 from pipeline.graph import tile_graph
+from pipeline.pull import Pull
 from pipeline.store import Store
 from pipeline.synthesis import write_scenes
-from pipeline.work import Pull
 from tasks import adam, ecsrc, evaluate, sample
 from tasks.fit import nurbs as fit
 from tasks.nurbs import NurbsSurface, basis_matrix

@@ -36,7 +36,7 @@ def table(config: Config, catalog: Catalog, folder: Path) -> None:
     warm(config)
     run = Run.create(folder, config, catalog)
     totals, stages = [], []
-    for graph in run.graphs():
+    for graph in map(run.graph, run.catalog.tiles):
         start = time.perf_counter()
         stages.append(do_tile(run.job(graph)).seconds)
         totals.append(time.perf_counter() - start)
@@ -54,7 +54,7 @@ def table(config: Config, catalog: Catalog, folder: Path) -> None:
 def growth(config: Config, catalog: Catalog, folder: Path, many: int) -> None:
     """Do the same tiles over and over, each time all anew, and watch this process grow."""
     run = Run.create(folder, config, catalog)
-    graphs = list(run.graphs())
+    graphs = [run.graph(tile) for tile in run.catalog.tiles]
     print(f"\nmemory of one process over {many} tiles (resident, MB)")
     every = max(1, many // 10)
     for done in range(many):

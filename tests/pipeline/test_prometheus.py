@@ -6,7 +6,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pipeline.entry import Entry
 from pipeline.meter import Span
 from pipeline.prometheus import Textfile
-from pipeline.run import Summary
+from pipeline.summary import Summary
 from pipeline.work import TileResult
 
 

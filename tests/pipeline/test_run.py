@@ -11,8 +11,9 @@ import rasterio
 from catalog import Catalog
 from pipeline.config import compose, load_config
 from pipeline.errors import ConfigError
-from pipeline.run import Run, execute, select, summary
+from pipeline.run import Run, execute, select
 from pipeline.store import Store
+from pipeline.summary import summary
 from pipeline.tables import read_metrics
 from pipeline.work import TileResult
 
@@ -215,7 +216,7 @@ def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
     def full(self, node, value, seconds):
         if node.stage == "fit" and len(list(self.root.rglob("*.npz"))) > 12:
             raise OSError(28, "No space left on device", str(self.root))
-        put(self, node, value, seconds)
+        return put(self, node, value, seconds)
 
     monkeypatch.setattr(Store, "put", full)
     results = results_of(run, SerialExecutor())
@@ -230,9 +231,15 @@ def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
 def test_log_has_one_event_per_tile(run, executor):
     execute(run, executor)
     events = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
-    assert [event["event"] for event in events] == ["run", "tile", "tile", "tile", "tile", "end"]
-    assert {event["tile"] for event in events[1:5]} == {tile.id for tile in run.catalog.tiles}
-    assert all(event["computed"] == EACH for event in events[1:5])
+    kinds = Counter(event["event"] for event in events)
+    assert kinds == {"run": 1, "stage": 4 * len(EACH), "tile": 4, "end": 1}
+    stages = [event for event in events if event["event"] == "stage"]
+    for tile in run.catalog.tiles:
+        here = {event["stage"]: event for event in stages if event["tile"] == tile.id}
+        assert {stage: event["computed"] for stage, event in here.items()} == EACH
+        assert here["fit"]["bytes"] > 1000
+        assert here["load"]["bytes"] == 0
+    assert all(event["peak_mb"] > 10 and event["pid"] and event["host"] for event in stages)
 
 
 def test_item_is_stac_with_checksums(run, executor):

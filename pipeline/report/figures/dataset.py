@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.errors import ConfigError
+from pipeline.look import look_at
+from pipeline.pull import Pull, StageError
 from pipeline.report.figures.plate import PATH, STRATA, Plate, new_figure
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull, StageError
 from tasks.types import TileData
 
 NAME = "dataset"
@@ -35,9 +36,8 @@ def statistics(run: Run, full: str, done: Table) -> Table:
     table = done.loc[done.variant == full, ["tile_id", "stratum", "road_fraction"]].copy()
     wanted = set(table.tile_id)
     ranges: dict[str, float] = {}
-    for graph in run.graphs():
-        if graph.tile.id not in wanted:
-            continue
+    for found in look_at(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
+        graph = found.graph
         try:
             data: TileData = Pull(graph, Store(run.store))(graph.variants[full]["load"])
         except StageError as error:

@@ -11,10 +11,11 @@ import pandas as pd
 from catalog import Grid
 from pipeline.errors import ConfigError
 from pipeline.graph import TileGraph
+from pipeline.look import look_at
+from pipeline.pull import Pull, StageError
 from pipeline.report.figures.cast import Cast
 from pipeline.run import Run
 from pipeline.store import Store
-from pipeline.work import Pull, StageError
 from tasks.drape import drape
 from tasks.mad import mean_angles
 from tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
@@ -79,7 +80,8 @@ def view_tile(run: Run, tile_id: str, cast: Cast) -> TileView:
         If a variant is, or a stage fails on the tile.
     """
     (tile,) = run.catalog.select([tile_id]).tiles
-    graph = next(graph for graph in run.graphs() if graph.tile.id == tile.id)
+    (found,) = look_at(run, [tile])
+    graph = found.graph
     for variant in cast.names:
         if variant not in graph.variants:
             raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
