@@ -108,6 +108,8 @@ def gdal_options() -> dict[str, str]:
         "CPL_VSIL_CURL_NON_CACHED": "/vsis3/",
         "GDAL_HTTP_MAX_RETRY": str(_tries() - 1),
         "GDAL_HTTP_RETRY_DELAY": "0.5",
+        # 0: no answer at all.
+        "GDAL_HTTP_RETRY_CODES": "0,429,500,502,503,504",
         "GDAL_HTTP_CONNECTTIMEOUT": "10",
         # Not a limit on large files: less than a byte a second, for a minute.
         "GDAL_HTTP_LOW_SPEED_LIMIT": "1",
@@ -189,6 +191,21 @@ class Sightings:
                 there = {}
             self._folders[str(folder)] = _files(folder, there)
         return self._folders[str(folder)]
+
+
+def namesakes(where: UPath) -> set[str]:
+    """Return the names of a file in a bucket and of those that differ in what follows its stem: one list.
+
+    Asked before GDAL opens a file, it saves a dozen requests for files beside it that are seldom there.
+
+    Raises
+    ------
+    OSError
+        If the storage does not answer.
+    """
+    folder = where.parent
+    with named(where):
+        return set(_files(folder, folder.fs.find(folder.path, prefix=f"{where.stem}.", detail=True)))
 
 
 def exists(where: Place) -> bool:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from rasterio.windows import Window
 
 from catalog.crs import same, short
 from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from catalog.places import Place, gdal_name, is_remote, stat
+from catalog.places import Place, gdal_name, is_remote, namesakes, stat
 from tasks.errors import TaskError
 from tasks.types import Floats
 
@@ -152,22 +153,29 @@ def opened(path: Place, name: str) -> Iterator[Any]:
     fail and be tried again than do without it.
     """
     try:
-        with rasterio.open(gdal_name(path)) as src:
+        with _surroundings(path, name), rasterio.open(gdal_name(path)) as src:
             yield src
     except (RasterioError, OSError) as error:
-        if not _there(path, name):
-            raise Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path)) from error
+        if not is_remote(path) and stat(path) is None:
+            raise _missing(path, name) from error
         reason = str(error.__cause__ or error).partition("\n")[0]
         if is_remote(path):
             raise TaskError(f"{name} cannot be read: {reason}; run again, or mend it", str(path)) from error
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
 
 
-def _there(path: Place, name: str) -> bool:
-    try:
-        return stat(path) is not None
-    except OSError as error:
-        raise TaskError(f"{name} cannot be read: {error.strerror}; run again", str(path)) from error
+def _surroundings(path: Place, name: str) -> AbstractContextManager[Any]:
+    """Let GDAL look for files beside one in a bucket only where there are some."""
+    if isinstance(path, Path):
+        return nullcontext()
+    there = namesakes(path)
+    if path.name not in there:
+        raise _missing(path, name)
+    return nullcontext() if there - {path.name} else rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
+
+
+def _missing(path: Place, name: str) -> Unreadable:
+    return Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path))
 
 
 def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:

@@ -6,6 +6,8 @@ GDAL may hold the interpreter's lock while it waits for an answer, so that a thr
 import json
 import random
 import re
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -30,7 +32,7 @@ class Fault:
     """What goes wrong with which requests."""
 
     answer: str
-    """One of `ANSWERS`, or "cut": the connection ends without one; "half": in the middle of it."""
+    """One of `ANSWERS`, or how the connection ends: "cut" (reset), "shut" (no answer), "half" (amid one)."""
     method: str = ""
     """A regular expression, like the next."""
     path: str = ""
@@ -86,14 +88,20 @@ class Faulty:
             return _answer(start_response, status, b"" if method == "HEAD" else text)
         if fault.answer == "half":
             return _half(self.app(environ, start_response), environ)
-        environ["werkzeug.socket"].shutdown(2)
+        connection = environ["werkzeug.socket"]
+        if fault.answer == "cut":
+            # Closing it will send a reset.
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            connection._real_close()
+        else:
+            connection.shutdown(socket.SHUT_RDWR)
         return []
 
 
 def _half(answer, environ):
     whole = b"".join(answer)
     yield whole[: len(whole) // 2]
-    environ["werkzeug.socket"].shutdown(2)
+    environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
 
 
 def _body(environ):
