@@ -29,6 +29,8 @@ MEMORY = {
 worker that paused would wait forever for its only tile to give memory back; so it is stopped at the limit."""
 ELSEWHERE_BYTES = 4 * 1024**3
 """Memory of a worker of a cluster that is asked for, where nothing is said."""
+GRACE_S = 10.0
+"""How long a running scheduler may be without workers: a nanny may be at replacing one."""
 ASKED_FOR = {
     "slurm": ("dask_jobqueue", "dask-jobqueue"),
     "kubernetes": ("dask_kubernetes.operator", "dask-kubernetes"),
@@ -58,7 +60,7 @@ def opened(cluster: Cluster, workers: int | None, scheduler: str | None, dashboa
         If something is not installed, or the cluster cannot be had.
     """
     if scheduler:
-        yield Place(scheduler, f"the Dask scheduler at {scheduler}")
+        yield Place(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})

@@ -147,7 +147,7 @@ def _guard(client: Client, place: Place, probe: Callable[[], None] | None) -> st
     name = uuid.uuid4().hex[:8]
     try:
         client.register_plugin(no_second_try(client.id, name), name=f"flexroad-{name}")
-        client.register_plugin(workers.Guard(here, probe, deaf=place.own), name=name)
+        _post(client, workers.Guard(here, probe, deaf=place.own), name)
     except Exception as error:
         # Of whatever kind unpickling gave; only a line of it helps.
         told = " ".join(str(error).split()) or repr(error)
@@ -155,10 +155,23 @@ def _guard(client: Client, place: Place, probe: Callable[[], None] | None) -> st
             f"{place.name} cannot load flexroad ({told}); install it for the workers, and let the scheduler "
             "take plugins (distributed.scheduler.pickle)"
         ) from error
-    for fault in client.run(workers.find_fault, name).values():
+    # A worker that dies meanwhile is no fault; the one after it is asked when its first tile comes.
+    for fault in client.run(workers.find_fault, name, on_error="ignore").values():
         if fault:
             raise ConfigError(fault)
     return name
+
+
+def _post(client: Client, guard: Any, name: str) -> None:
+    """Put a guard on all workers, again if one of them just died."""
+    for rest in range(4, -1, -1):
+        try:
+            client.register_plugin(guard, name=name)
+            return
+        except OSError:
+            if not rest:
+                raise
+            time.sleep(1)
 
 
 def _compare(client: Client, here: dict[str, str]) -> None:

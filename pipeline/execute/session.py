@@ -164,12 +164,13 @@ class Session(Generic[J, R]):
         """See, but not more often than every second, who is there."""
         if self.crew and time.monotonic() < self.looked + TICK_S:
             return
+        if self.client.status != "running":
+            # Asked now, it would not answer for long.
+            raise SchedulerGone
         try:
             self.crew = self.client.nthreads()
         except OSError as error:
-            raise SchedulerGone(str(error)) from error
-        if self.client.status != "running":
-            raise SchedulerGone
+            raise SchedulerGone from error
         self.looked = time.monotonic()
         self._wait_for_workers()
         for future, flight in list(self.flying.items()):

@@ -82,14 +82,19 @@ def processes(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def running(tmp_path_factory):
-    """A cluster of two workers that tests share; whoever kills a worker gets it back from its nanny."""
+def shared(tmp_path_factory):
     found = Processes(tmp_path_factory.mktemp("running"))
     found.scheduler()
     found.worker("--nworkers", "2")
-    wait_for(found.address, 2)
     yield found
     found.end()
+
+
+@pytest.fixture
+def running(shared):
+    """A cluster of two workers that tests share; whoever kills one gets it back from its nanny."""
+    wait_for(shared.address, 2)
+    return shared
 
 
 def wait_for(address: str, workers: int) -> None:
@@ -178,7 +183,8 @@ def refused(processes, jobs=(1, 2, 3), **options) -> str:
     return str(caught.value)
 
 
-def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy):
+def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy, monkeypatch):
+    monkeypatch.setattr("pipeline.execute.clusters.GRACE_S", 0)
     processes.scheduler()
     assert f"{processes.address} has no workers; start some" in refused(processes)
     unlike = processes.worker(**other_numpy)
@@ -234,22 +240,24 @@ def test_a_job_that_kills_its_worker_is_lost_and_no_other(running, poison):
 
 
 def greedy(job):
-    if job == "greedy":
-        hoard = []
-        while True:
-            hoard.append(b"x" * 20_000_000)
-            time.sleep(0.02)
-    return job
+    """Die, or take ever more memory, of the jobs that say so."""
+    hoard = []
+    while job == "greedy":
+        hoard.append(b"x" * 20_000_000)
+        time.sleep(0.02)
+    return deadly(job)
 
 
-def test_too_much_memory_on_a_single_worker_of_this_machine():
+def test_too_much_memory_on_the_only_worker_of_this_machine():
     small = Cluster(workers=1, memory="700 MiB")
-    results = list(DaskExecutor(cluster=small).map(greedy, [1, "greedy", 2, 3], lost))
-    ((job, why),) = [result for result in results if isinstance(result, tuple)]
-    assert job == "greedy"
-    assert "at last for memory: it used" in why
-    assert "may use 700.00 MiB" in why
-    assert sorted(result for result in results if isinstance(result, int)) == [1, 2, 3]
+    jobs = [1, 2, "greedy", 3, "exit 1", 4]
+    results = list(DaskExecutor(cluster=small).map(greedy, jobs, lost))
+    told = dict(result for result in results if isinstance(result, tuple))
+    assert sorted(told) == ["exit 1", "greedy"]
+    assert "at last for memory: it used" in told["greedy"]
+    assert "may use 700.00 MiB" in told["greedy"]
+    assert "at last for memory" not in told["exit 1"]
+    assert sorted(result for result in results if isinstance(result, int)) == [1, 2, 3, 4]
 
 
 def slow(job):

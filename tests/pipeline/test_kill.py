@@ -80,11 +80,13 @@ def test_the_whole_run_is_killed(place, undisturbed, tmp_path):
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
 
 
-def test_a_worker_is_killed(place, undisturbed, tmp_path):
+@pytest.mark.parametrize("which", [slice(1), slice(None)], ids=["one", "all"])
+def test_workers_are_killed(place, undisturbed, tmp_path, which):
     out = tmp_path / "run"
     process = subprocess.Popen(command(place, out), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     until(lambda: len(markers(out)) >= 1)
-    workers(process.pid)[0].kill()
+    for worker in workers(process.pid)[which]:
+        worker.kill()
     assert process.wait(timeout=120) == 0
     table = read_metrics(out).drop(columns="seconds")
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
