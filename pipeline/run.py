@@ -60,10 +60,20 @@ class Run:
     """Whole-metre (easting, northing) all meshes are placed against; fixed when the run is made."""
     checksum: bool
     versions: dict[str, str]
+    allowed: tuple[str, ...] = ()
+    """Folders and addresses outside the catalog's own that sources may lie in."""
+    exported: tuple[str, ...] = ()
+    """Variants whose products the run has, or had when its configuration was another."""
 
     @classmethod
     def create(
-        cls, path: Place, config: Config, catalog: Catalog, store: Place | None = None, checksum: bool = False
+        cls,
+        path: Place,
+        config: Config,
+        catalog: Catalog,
+        store: Place | None = None,
+        checksum: bool = False,
+        allowed: Sequence[str] = (),
     ) -> Run:
         """Make a run folder, or bring an old one up to date with a new configuration or catalog.
 
@@ -76,7 +86,9 @@ class Run:
         old = _record(path)
         origin = old["origin"] if old else _origin(catalog)
         store = store or (place(old["store"]) if old and old["shared_store"] else path / "store")
-        run = cls(path, config, catalog, store, (origin[0], origin[1]), checksum, versions())
+        exported = _exported(old, config)
+        place_of = (origin[0], origin[1])
+        run = cls(path, config, catalog, store, place_of, checksum, versions(), tuple(allowed), exported)
         try:
             for folder in (path, store):
                 check_writable(folder)
@@ -107,7 +119,17 @@ class Run:
         config = _config(path / "config.yaml").model_copy(update={"name": found["config"]})
         catalog = Catalog.read(path / "catalog.parquet")
         origin = (found["origin"][0], found["origin"][1])
-        return cls(path, config, catalog, store, origin, found["checksum"], found["versions"])
+        return cls(
+            path,
+            config,
+            catalog,
+            store,
+            origin,
+            found["checksum"],
+            found["versions"],
+            tuple(found.get("allowed", ())),
+            _exported(found, config),
+        )
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -142,6 +164,8 @@ class Run:
             "origin": list(self.origin),
             "checksum": self.checksum,
             "versions": self.versions,
+            "allowed": list(self.allowed),
+            "exported": list(self.exported),
         }
         write(self.path / "run.json", json.dumps(found, indent=1).encode())
 
@@ -163,6 +187,7 @@ def execute(
     only: Callable[[Tile], bool] = lambda tile: True,
     anew: frozenset[str] = frozenset(),
     watch: Callable[[TileResult], None] = lambda result: None,
+    verify: bool = False,
 ) -> Summary:
     """Bring the run's tiles up to date, write the tables, then summary.json.
 
@@ -174,6 +199,8 @@ def execute(
         Stages to compute even if the store has them.
     watch : callable
         Told of every result as it comes, those found done included.
+    verify : bool
+        Read all products, and do again the tiles whose are not what was written.
 
     Raises
     ------
@@ -188,8 +215,9 @@ def execute(
         close = partial(_close, run, ledger, journal, now(), time.perf_counter())
         stock = None
         try:
-            stock = take_stock(run, ledger, only, anew, watch)
-            for result in executor.map(do_tile, _jobs(run, stock, anew), _lost):
+            stock = take_stock(run, ledger, only, anew, watch, verify)
+            probe = partial(check_writable, run.store)
+            for result in executor.map(do_tile, _jobs(run, stock, anew), _lost, probe):
                 ledger.record(result.entry)
                 journal.tile(result)
                 watch(result)
@@ -206,11 +234,14 @@ def take_stock(
     only: Callable[[Tile], bool],
     anew: frozenset[str],
     watch: Callable[[TileResult], None],
+    verify: bool,
 ) -> Stock:
     """Look at every tile once, bring the ledger up to date, and tell what there is to do."""
     todo, standings, new, changed = array("L"), list[Standing](), 0, 0
     for position, found in enumerate(stands(run, ledger)):
         wanted = only(found.graph.tile)
+        if wanted and verify and found.done and not run.folder(found.graph.tile.id).verified():
+            found = replace(found, current=False)
         new += found.known is None
         changed += found.known is not None and not found.current
         standing: Standing = "done" if found.done else "failed" if found.failed else "pending"
@@ -331,6 +362,11 @@ def _lost(job: Job, why: str) -> TileResult:
 def _origin(catalog: Catalog) -> tuple[float, float]:
     corners = [tile.grid.origin for tile in catalog.tiles]
     return min(east for east, _ in corners), min(north for _, north in corners)
+
+
+def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
+    before = (record or {}).get("exported", ())
+    return tuple(dict.fromkeys([*before, *config.export.variants]))
 
 
 def _config(where: Place) -> Config:

@@ -93,8 +93,9 @@ class TileFolder:
             return None
         return item if whole else None
 
-    def verified(self, item: dict[str, Any]) -> bool:
-        """Tell whether the products that an item names are as they were written, byte for byte."""
+    def verified(self) -> bool:
+        """Tell whether the products that the item names are as they were written, byte for byte."""
+        item = self._read("item.json") or {}
         try:
             return all(
                 _checksum(places.read(self.path / asset["href"])) == asset["file:checksum"]

@@ -90,12 +90,12 @@ def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
     folder = TileFolder(tmp_path / "tile")
     item = {"assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
     folder.finish(item, {"mesh.glb": b"abc"})
-    assert folder.verified(item)
+    assert folder.verified()
     for damaged in (b"abd", b"ab", b""):
         (folder.path / "mesh.glb").write_bytes(damaged)
-        assert not folder.verified(item)
+        assert not folder.verified()
     (folder.path / "mesh.glb").unlink()
-    assert not folder.verified(item)
+    assert not folder.verified()
 
 
 def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeypatch):
