@@ -1,25 +1,45 @@
-"""``flexroad run``, ``rerun``, ``status``: bring the tiles of a run up to date and tell how they stand."""
+"""``flexroad run``, ``rerun``, ``status``, ``clean``: bring a run up to date, tell how it stands, tidy up."""
 
 from __future__ import annotations
 
 import contextlib
 import shlex
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.errors import ConfigError
+from pipeline.ending import ON_FAILURE, Ending, line, overseen
+from pipeline.errors import ClusterLost, ConfigError
 
 if TYPE_CHECKING:
-    from catalog import Tile
+    from catalog import Catalog, Tile
+    from catalog.places import Place
+    from pipeline.cluster import Cluster
     from pipeline.execute import Executor
     from pipeline.run import Run
+    from pipeline.work import TileResult
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")]
 ExecutorName = Annotated[str, typer.Option("--executor", help="dask, or serial: one process, to debug with.")]
+Dashboard = Annotated[bool, typer.Option("--dashboard", help="Serve Dask's dashboard, and say where.")]
+Verify = Annotated[
+    bool, typer.Option("--verify", help="Compare the checksums of all products, not only their sizes.")
+]
+OnFailure = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CMD|URL",
+        envvar=ON_FAILURE,
+        help="Command, or address to POST to, that gets the summary if the exit code is not 0.",
+    ),
+]
+Prometheus = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Text file for Prometheus (.prom), kept up to date.")
+]
 
 
 def run(
@@ -33,34 +53,53 @@ def run(
     workers: Workers = None,
     scheduler: Scheduler = None,
     executor: ExecutorName = "dask",
+    dashboard: Dashboard = False,
     store: Annotated[Path | None, typer.Option(help="Folder of artefacts shared by runs.")] = None,
     checksum: Annotated[
         bool, typer.Option(help="Notice changed sources by bytes, not size and time.")
     ] = False,
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DIR|URL", help="Where files outside the catalog's folder may lie; repeatable."),
+    ] = None,
+    verify: Verify = False,
+    on_failure: OnFailure = None,
+    prometheus: Prometheus = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the graph, do nothing.")] = False,
 ) -> None:
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
     from catalog import Catalog
+    from catalog.places import place
     from pipeline.config import load_config
     from pipeline.run import Run, asked, select
 
-    chosen, whole = load_config(config), Catalog.read(catalog)
-    tiles = whole.select(tile or (), bbox)
-    if not tiles.tiles:
-        raise ConfigError(f"catalog {catalog} has no tiles")
+    path, root = place(out), place(store) if store else None
+
+    def wanted() -> tuple[Catalog, Catalog]:
+        whole = Catalog.read(place(catalog))
+        found = whole.select(tile or (), bbox)
+        if not found.tiles:
+            raise ConfigError(f"catalog {catalog} has no tiles")
+        return whole, found
+
     if dry_run:
         from pipeline.graph import tile_graphs
         from pipeline.plan import plan
 
-        root = store or out / "store"
-        for line in plan(tile_graphs(tiles, chosen, checksum), root, out):
+        for line in plan(
+            tile_graphs(wanted()[1], load_config(config), checksum), root or path / "store", path
+        ):
             typer.echo(line)
         return
-    some = bool(tile) or bbox is not None
-    with _alone(out, make=True):
-        opened = Run.create(out, chosen, asked(out, whole, tiles) if some else whole, store, checksum)
-        only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
-        _carry_out(opened, _executor(executor, workers, scheduler), only)
+    with overseen(path, on_failure, prometheus, _warn) as ending:
+        chosen, (whole, tiles) = load_config(config), wanted()
+        some = bool(tile) or bbox is not None
+        with _alone(path, make=True):
+            opened = Run.create(path, chosen, asked(path, whole, tiles) if some else whole, root, checksum)
+            only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
+            with_whom = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
+            _carry_out(opened, with_whom, only, frozenset(), ending)
+    _leave(ending)
 
 
 def rerun(
@@ -73,101 +112,176 @@ def rerun(
     workers: Workers = None,
     scheduler: Scheduler = None,
     executor: ExecutorName = "dask",
+    dashboard: Dashboard = False,
+    verify: Verify = False,
+    on_failure: OnFailure = None,
+    prometheus: Prometheus = None,
 ) -> None:
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
+    from catalog.places import place
     from pipeline.graph import STAGE_NAMES
     from pipeline.run import Run, select
 
-    if from_stage is not None and from_stage not in STAGE_NAMES:
-        raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
-    anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
-    with _alone(path):
-        opened = Run.open(path)
-        only = select(opened, tile or (), failed)
-        _carry_out(opened, _executor(executor, workers, scheduler), only, anew)
+    where = place(path)
+    with overseen(where, on_failure, prometheus, _warn) as ending:
+        if from_stage is not None and from_stage not in STAGE_NAMES:
+            raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
+        anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
+        with _alone(where):
+            opened = Run.open(where)
+            only = select(opened, tile or (), failed)
+            with_whom = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
+            _carry_out(opened, with_whom, only, anew, ending)
+    _leave(ending)
 
 
 @contextlib.contextmanager
-def _alone(path: Path, make: bool = False) -> Iterator[None]:
+def _alone(path: Place, make: bool = False) -> Iterator[None]:
     """Keep other runs out of the folder; ``make`` it if it is not there."""
     from pipeline.lock import held
 
     try:
-        if make:
+        if make and isinstance(path, Path):
             path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
-    with held(path, lambda line: typer.echo(f"note: {line}", err=True)):
+    with held(path, lambda line: _warn(line, "note")):
         yield
 
 
-def _executor(name: str, workers: int | None, scheduler: str | None) -> Executor:
+def _executor(
+    name: str,
+    workers: int | None,
+    scheduler: str | None,
+    cluster: Cluster,
+    dashboard: bool,
+    say: Callable[[str], None],
+) -> Executor:
     from pipeline.execute import DaskExecutor, SerialExecutor
 
     if name == "serial":
         return SerialExecutor()
     if name == "dask":
-        return DaskExecutor(workers, scheduler)
+        return DaskExecutor(workers, scheduler, cluster, dashboard, say)
     raise ConfigError(f"--executor {name}: there are dask and serial")
 
 
 def _carry_out(
     run: Run,
-    executor: Executor,
+    with_whom: Callable[[Callable[[str], None]], Executor],
     only: Callable[[Tile], bool],
-    anew: frozenset[str] = frozenset(),
+    anew: frozenset[str],
+    ending: Ending,
 ) -> None:
-    import signal
-
+    """Do the tiles, and fill in how that ended."""
     from rich.console import Console
 
     from pipeline.progress import Watch
     from pipeline.run import execute
 
-    # An operator's `kill` ends the run as Ctrl-C does: workers gone, tables written.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    total = sum(map(only, run.catalog.tiles))
     folder = shlex.quote(str(run.path))
+    console = Console(stderr=True)
+    executor = with_whom(partial(console.print, markup=False, highlight=False, soft_wrap=True))
+    watch = Watch(sum(map(only, run.catalog.tiles)), console)
+    if ending.textfile is not None:
+        ending.textfile.total = len(run.catalog.tiles)
+
+    def told(result: TileResult) -> None:
+        watch(result)
+        if ending.textfile is not None:
+            ending.textfile(result)
+
     try:
-        with Watch(total, Console(stderr=True)) as watch:
-            how = execute(run, executor, only, anew, watch)
-    except KeyboardInterrupt:
-        typer.echo("interrupted; the same command goes on from here", err=True)
-        raise typer.Exit(130) from None
+        with watch:
+            how = ending.how = execute(run, executor, only, anew, told)
+    except ClusterLost as error:
+        ending.exit_code, ending.text = 1, f"{error}; the same command goes on from here"
+        return
     except OSError as error:
-        typer.echo(f"error: {error}; make room, then `flexroad rerun {folder}` goes on from here", err=True)
-        raise typer.Exit(1) from None
-    typer.echo(
-        f"{how.tiles} tiles: {how.done} done ({how.cached} cached), {how.failed} failed, "
-        f"{how.pending} pending; results in {run.path}"
-    )
+        ending.exit_code = 1
+        ending.text = f"{error}; make room, then `flexroad rerun {folder}` goes on from here"
+        return
+    finally:
+        _draw(run)
+    ending.exit_code, ending.text = how.exit_code, line(how)
+    typer.echo(f"{ending.text}; results in {run.path}")
     if set(watch.status) == {"cached"}:
         typer.echo("nothing had changed; `flexroad rerun RUN --from load` computes all anew")
     if how.failed:
         typer.echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
-        raise typer.Exit(1)
-    typer.echo(f"next: flexroad report {folder} --format html")
+    elif not how.exit_code:
+        typer.echo(f"next: flexroad report {folder} --format html")
+
+
+def _draw(run: Run) -> None:
+    """Write the map of the tiles' states; a run without one is a run all the same."""
+    from pipeline.states import NAME, write_states
+
+    try:
+        write_states(run, run.path / NAME)
+    except OSError as error:
+        _warn(f"no map of the tiles: {error}")
+
+
+def _leave(ending: Ending) -> None:
+    """End the command with its exit code; what went wrong as a whole is said in one line."""
+    if ending.exit_code and ending.how is None:
+        typer.echo(ending.text if ending.exit_code == 130 else f"error: {ending.text}", err=True)
+    raise typer.Exit(ending.exit_code)
+
+
+def _warn(line: str, kind: str = "warning") -> None:
+    typer.echo(f"{kind}: {line}", err=True)
 
 
 def status(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    geojson: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a map of the tiles' states, for QGIS.")
+    ] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until Ctrl-C.")] = False,
+    every: Annotated[float, typer.Option(min=0.1, help="With --watch: how often to look (s).")] = 2,
 ) -> None:
     """Tell how a run stands, and what failed why."""
+    from catalog.places import place
+    from pipeline.run import Run
+
+    where = place(path)
+    opened = Run.open(where)
+    if watch:
+        from rich.console import Console
+
+        from pipeline.follow import follow
+
+        with contextlib.suppress(KeyboardInterrupt):
+            follow(where, Console(), every)
+        return
+    if geojson is not None:
+        from pipeline.states import write_states
+
+        write_states(opened, place(geojson))
+        typer.echo(str(geojson))
+        return
+    _tell(opened, as_json)
+
+
+def _tell(run: Run, as_json: bool) -> None:
     import json
     from dataclasses import asdict
 
-    from pipeline.run import Run, summary
+    from pipeline.lock import holder
+    from pipeline.summary import summary
 
-    how = summary(Run.open(path))
+    how, who = summary(run), holder(run.path)
     if as_json:
-        failures = [
-            {key: value for key, value in asdict(failure).items() if key != "trace"}
-            for failure in how.failures
-        ]
-        typer.echo(json.dumps(asdict(how) | {"failures": failures}, indent=1))
+        found = asdict(how)
+        found["failures"] = [{k: v for k, v in one.items() if k != "trace"} for one in found["failures"]]
+        found["at_work"] = {"host": who.host, "pid": who.pid, "since": who.since} if who else None
+        typer.echo(json.dumps(found, indent=1))
         return
-    counts = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
-    typer.echo(f"{how.tiles} tiles: {counts}")
+    typer.echo(line(how))
+    if who:
+        typer.echo(f"pid {who.pid} on {who.host} is at work since {who.since}")
     for failure in how.failures:
         typer.echo(f"  {failure.notice}")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
+from catalog.places import Place
 from pipeline.graph import STAGE_NAMES, TileGraph
 from pipeline.store import Store, TileFolder
 
 
-def plan(graphs: Iterable[TileGraph], store: Path, run: Path) -> Iterator[str]:
+def plan(graphs: Iterable[TileGraph], store: Place, run: Place) -> Iterator[str]:
     """Yield one line per tile and stage node, then the totals.
 
     A node is ``stored`` if the store has it, ``to do`` if not; nodes that are never stored (what `load`

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,17 +12,19 @@ from numpy.typing import NDArray
 
 from catalog import Tile
 from catalog.crs import transformer
+from catalog.places import Place
 from pipeline.entry import Entry
+from pipeline.ledger import NAME as LEDGER
 from pipeline.ledger import Ledger, Standing
+from pipeline.mirror import whole
 from pipeline.run import Run
-from pipeline.store import write_atomic
 
 NAME = "tiles.geojson"
 AT_ONCE = 10_000
 Known = tuple[Tile, Standing, Entry | None]
 
 
-def write_states(run: Run, ledger: Ledger, path: Path) -> None:
+def write_states(run: Run, where: Place) -> None:
     """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
 
     Each has its id, its ``state`` (done: by the last run; cached: found done by it; failed; pending), why it
@@ -34,8 +35,12 @@ def write_states(run: Run, ledger: Ledger, path: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    features = ",\n".join(_features(_known(run.catalog.tiles, ledger), run.config.export.variants[0]))
-    write_atomic(path, f'{{"type": "FeatureCollection", "features": [\n{features}\n]}}\n'.encode())
+    with Ledger.peek(run.path / LEDGER) as ledger, whole(where) as path, path.open("w") as file:
+        features = _features(_known(run.catalog.tiles, ledger), run.config.export.variants[0])
+        file.write('{"type": "FeatureCollection", "features": [\n')
+        file.write(next(features, ""))
+        file.writelines(f",\n{feature}" for feature in features)
+        file.write("\n]}\n")
 
 
 def corners(tiles: Sequence[Tile]) -> NDArray[np.float64]:
@@ -44,10 +49,10 @@ def corners(tiles: Sequence[Tile]) -> NDArray[np.float64]:
     Anticlockwise, and to 1 cm; one transformation for all tiles of a CRS.
     """
     rings = np.empty((len(tiles), 5, 2))
-    systems = np.array([tile.grid.crs for tile in tiles])
+    systems = [tile.grid.crs for tile in tiles]
     west, south, east, north = np.array([tile.grid.bounds for tile in tiles]).T
-    for crs in np.unique(systems):
-        here = systems == crs
+    for crs in set(systems):
+        here = np.array([system == crs for system in systems])
         eastings = np.stack([west, east, east, west, west], axis=1)[here]
         northings = np.stack([south, south, north, north, south], axis=1)[here]
         rings[here] = np.stack(transformer(crs, "EPSG:4326").transform(eastings, northings), axis=2)

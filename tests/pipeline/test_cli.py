@@ -221,7 +221,7 @@ def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
         ),
         (
             [*"run --config paper --catalog CAT --out OUT --scheduler tcp://127.0.0.1:9".split()],
-            "no Dask scheduler answers",
+            "does not answer",
         ),
         (["run", "--config", "paper"], "Missing option"),
         (["status", "FILE"], "is no run"),

@@ -1,0 +1,148 @@
+"""How a command about a run ends, and who is told: exit code, operator's alarm, file for Prometheus."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from catalog.errors import CatalogError
+from catalog.places import Place
+from pipeline.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pipeline.prometheus import Textfile
+    from pipeline.summary import Summary
+
+CANNOT_START = 2
+INTERRUPTED = 130
+ON_FAILURE = "FLEXROAD_ON_FAILURE"
+"""Says the same as `--on-failure`: an address may be a secret, which the list of processes shows to all."""
+
+
+@dataclass
+class Ending:
+    """How it ends; whoever does the work fills it in."""
+
+    exit_code: int = 0
+    text: str = ""
+    """In one line, for people."""
+    how: Summary | None = None
+    textfile: Textfile | None = None
+    """Told of every tile, if it is wanted."""
+
+
+def line(how: Summary) -> str:
+    """Return how a run stands in one line."""
+    now = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
+    since = f"{how.new} new, {how.changed} changed, {how.vanished} vanished"
+    return f"{how.tiles} tiles: {now}; {since}; {how.seconds:.0f} s"
+
+
+@contextlib.contextmanager
+def overseen(
+    run: Place, on_failure: str | None, prometheus: Path | None, warn: Callable[[str], None]
+) -> Iterator[Ending]:
+    """See to it that whatever ends the work inside is told to those who asked to be.
+
+    An interruption ends here; everything else goes on.
+
+    Raises
+    ------
+    ConfigError
+        If the file for Prometheus cannot be written.
+    """
+    from pipeline.summary import read_summary
+
+    before = read_summary(run)
+    ending = Ending()
+    with contextlib.ExitStack() as stack:
+        # Leaves in the opposite order: the alarm rings when the file is written.
+        stack.callback(_alarm, ending, run, before, on_failure, warn)
+        try:
+            _end_as_ctrl_c()
+            ending.textfile = _textfile(stack, run, prometheus)
+            yield ending
+        except KeyboardInterrupt:
+            ending.exit_code = INTERRUPTED
+            ending.text = "interrupted; the same command goes on from here"
+        except BaseException as error:
+            ending.exit_code, ending.text = _told_by(error)
+            raise
+        finally:
+            if ending.textfile is not None:
+                ending.textfile.ended(ending.exit_code, ending.how)
+
+
+def unread(words: Sequence[str], warn: Callable[[str], None]) -> None:
+    """Tell the alarm, if it can be made out, that a command line could not be read."""
+    if not words or words[0] not in ("run", "rerun"):
+        return
+    target = _after(words, "--on-failure") or os.environ.get(ON_FAILURE)
+    text = "the command line could not be read; `flexroad run --help` shows it"
+    run = Path(_after(words, "--out") or (words[1] if words[0] == "rerun" and words[1:] else ""))
+    _alarm(Ending(CANNOT_START, text), run, {}, target, warn)
+
+
+def _end_as_ctrl_c() -> None:
+    """Let an operator's `kill`, or a terminal that goes away, end it as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Who started it with nohup wants it to go on.
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
+
+
+def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Textfile | None:
+    if path is None:
+        return None
+    from pipeline.prometheus import Textfile
+
+    name = str(run.resolve()) if isinstance(run, Path) else str(run)
+    try:
+        return stack.enter_context(Textfile(path, name))
+    except OSError as error:
+        raise ConfigError(f"cannot write --prometheus {path}: {error.strerror or error}") from error
+
+
+def _told_by(error: BaseException) -> tuple[int, str]:
+    if isinstance(error, CatalogError | ConfigError | OSError):
+        return CANNOT_START, f"could not start: {error}"
+    return 1, f"{type(error).__name__}: {error}"
+
+
+def _alarm(
+    ending: Ending, run: Place, before: dict[str, Any], target: str | None, warn: Callable[[str], None]
+) -> None:
+    if not target or not ending.exit_code:
+        return
+    from pipeline.notify import notify
+    from pipeline.summary import read_summary
+
+    now = read_summary(run)
+    told = {
+        # What web addresses of chats show.
+        "text": f"flexroad {run} on {socket.gethostname()}: {ending.text}",
+        # Of an earlier run it would mislead.
+        **(now if now != before else {}),
+        "run": str(run),
+        "host": socket.gethostname(),
+        "flexroad": importlib.metadata.version("flexroad"),
+        "exit_code": ending.exit_code,
+    }
+    if why := notify(target, told):
+        warn(f"--on-failure: {why}")
+
+
+def _after(words: Sequence[str], option: str) -> str | None:
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == option:
+            return following or None
+        if word.startswith(option + "="):
+            return word.removeprefix(option + "=")
+    return None

@@ -1,0 +1,67 @@
+"""The map of the tiles' states: where the tiles are, as other programs read it, and how they stand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyogrio
+import pytest
+from pyproj import Transformer
+
+from catalog import Catalog
+from pipeline.config import load_config
+from pipeline.entry import Entry, Failure
+from pipeline.ledger import NAME, Ledger
+from pipeline.run import Run
+from pipeline.states import corners, write_states
+
+
+@pytest.fixture
+def run(made_survey, quick_config, tmp_path) -> Run:
+    """Four tiles: one done, one found done, one failed, one that the ledger does not know."""
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    run = Run.create(tmp_path / "run", load_config(quick_config), catalog)
+    one, two, three, _ = (tile.id for tile in catalog.tiles)
+    rows = tuple({"variant": name, "doubt_m": doubt} for name, doubt in (("rgt", 9.0), ("flexroad", 0.25)))
+    with Ledger.open(run.path / NAME) as ledger:
+        ledger.ask([(one, "done"), (two, "cached"), (three, "failed")])
+        ledger.record(Entry(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
+        ledger.record(Entry(three, "failed", "f", (), (Failure(three, "load", "TaskError", "no, file"),)))
+        ledger.ask([(one, "done"), (two, "cached"), (three, "failed")])
+    return run
+
+
+def test_other_programs_read_it(run, tmp_path):
+    write_states(run, tmp_path / "tiles.geojson")
+    table = pyogrio.read_dataframe(tmp_path / "tiles.geojson")
+    assert table.crs.to_epsg() == 4326
+    assert table["id"].tolist() == [tile.id for tile in run.catalog.tiles]
+    assert table.state.tolist() == ["done", "cached", "failed", "pending"]
+    done, _, failed, pending = table.itertuples()
+    # Of the surface that is exported, not of the baselines.
+    assert (done.doubt_m, done.seconds) == (0.25, 1.5)
+    assert done.finished.isoformat() == "2026-11-21T02:00:00+00:00"
+    assert failed.error == "load: TaskError: no, file"
+    assert table.loc[pending.Index, ["error", "seconds", "doubt_m", "finished"]].isna().all()
+    crs = run.catalog.tiles[0].grid.crs
+    for tile, there in zip(run.catalog.tiles, table.to_crs(crs).geometry, strict=True):
+        assert there.bounds == pytest.approx(tile.grid.bounds, abs=0.02)
+        assert there.exterior.is_ccw
+
+
+def test_tiles_of_several_systems_lie_where_they_are(made_survey):
+    one, two, *_ = Catalog.read(made_survey / "catalog.parquet").tiles
+    other = replace(two, grid=replace(two.grid, crs="EPSG:32633"))
+    rings = corners([one, other, one])
+    assert rings.shape == (3, 5, 2)
+    assert np.array_equal(rings[0], rings[2])
+    to_wgs84 = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
+    west, south, east, north = other.grid.bounds
+    expected = [
+        to_wgs84.transform(*at) for at in ((west, south), (east, south), (east, north), (west, north))
+    ]
+    assert rings[1, :4] == pytest.approx(np.array(expected), abs=1e-7)
+
+
+def test_a_catalog_without_tiles_left_is_an_empty_map(run, tmp_path):
+    write_states(replace(run, catalog=Catalog(())), tmp_path / "tiles.geojson")
+    assert pyogrio.read_info(tmp_path / "tiles.geojson")["features"] == 0
