@@ -153,15 +153,20 @@ def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
             "cluster.kind kubernetes: which image? set cluster.image to one with flexroad in it"
         )
     spec = operator.make_cluster_spec(**kubernetes_options(cluster))
+    # Whatever the client libraries raise: no credentials, nobody there, no operator, no rights.
+    try:
+        importlib.import_module("kr8s").api(namespace=cluster.namespace).version()
+    except Exception as error:
+        raise ConfigError(
+            f"cluster.kind kubernetes: {_line(error)}; does `kubectl get pods` work?"
+        ) from error
     try:
         return operator.KubeCluster(
             custom_cluster_spec=spec, namespace=cluster.namespace, quiet=True, resource_timeout=60
         )
     except Exception as error:
-        # Whatever its client library raises: no kubeconfig, no rights, no operator.
-        told = " ".join(str(error).split()) or repr(error)
         raise ConfigError(
-            f"cluster.kind kubernetes: {told}; is the Dask operator installed, and may this account "
+            f"cluster.kind kubernetes: {_line(error)}; is the Dask operator installed, and may this account "
             "make DaskCluster resources?"
         ) from error
 
@@ -179,6 +184,10 @@ def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
         # Whoever is killed leaves no cluster behind.
         "idle_timeout": 900,
     }
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or repr(error)
 
 
 def _environment() -> dict[str, str]:

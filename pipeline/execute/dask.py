@@ -205,12 +205,8 @@ def _dashboard(client: Client) -> str:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask's own words about what is told in one's own: lost workers, schedulers, versions."""
-    logger = logging.getLogger("distributed")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module="distributed")
-            yield
-    finally:
-        logger.setLevel(before)
+    from distributed.utils import silence_logging_cmgr
+
+    with silence_logging_cmgr(logging.CRITICAL), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="distributed")
+        yield
