@@ -40,6 +40,11 @@ class Job:
     """Stages to compute even if the store has them."""
 
     @property
+    def key(self) -> str:
+        """What the job is called on Dask's dashboard."""
+        return f"tile-{self.graph.tile.id}"
+
+    @property
     def folder(self) -> TileFolder:
         """Where the tile's products go."""
         return TileFolder.of(place(self.run), self.graph.tile.id)
