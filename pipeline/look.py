@@ -101,7 +101,7 @@ def _last_result(folder: Place, entry: Entry | None, files: dict[str, Seen]) -> 
     name = DONE if DONE in files else FAILED if FAILED in files else None
     if name is None:
         # A full disk leaves no marker, but what failed is known.
-        return entry if entry and entry.marker is None else None
+        return entry if entry and entry.state == "failed" and entry.marker is None else None
     marker = (name, files[name].size, files[name].version)
     return entry if entry and entry.marker == marker else _from_marker(folder, marker)
 
