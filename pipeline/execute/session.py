@@ -17,7 +17,7 @@ from typing import Generic
 
 from dask.utils import format_bytes
 from distributed import Client, Future
-from distributed.scheduler import KilledWorker, NoWorkerError
+from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
 from pipeline.errors import ClusterLost, ConfigError
 from pipeline.execute.executor import J, R
@@ -192,12 +192,14 @@ class Session(Generic[J, R]):
         error = future.exception() if future.status == "error" else None
         if isinstance(error, KilledWorker):
             yield from self._died(flight, error)
-        elif isinstance(error, NoWorkerError):
+        elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be set to give up what waits for workers; patience is this side's.
             self._put_back(flight)
         elif isinstance(error, Unfit):
             raise ConfigError(str(error))
-        elif future.status in ("finished", "error"):
+        elif future.status == "error":
+            future.result()
+        elif future.status == "finished":
             yield from self._fetched(future, flight)
         else:
             self._put_back(flight)
@@ -209,7 +211,7 @@ class Session(Generic[J, R]):
         except KilledWorker as error:
             # The worker died between doing the job and handing over the result.
             yield from self._died(flight, error)
-        except CancelledError as error:
+        except (CancelledError, OSError) as error:
             self._put_back(flight)
             raise SchedulerGone from error
         else:
@@ -226,7 +228,7 @@ class Session(Generic[J, R]):
 
     def _why(self, error: KilledWorker) -> str:
         worker = error.last_worker
-        for _, event in self.client.get_events("worker-restart-memory"):
+        for _, event in self.client.get_events("worker-restart-memory") or ():
             if event["worker"] == worker.address:
                 used, limit = format_bytes(event["rss"]), format_bytes(worker.memory_limit)
                 return (

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import cloudpickle
+import psutil
 import pytest
 
 from pipeline.cluster import Cluster
@@ -342,6 +343,25 @@ def test_the_section_reaches_slurm():
     } <= set(lines)  # fmt: skip
     assert "--nthreads 1 --memory-limit 2.00GiB --nworkers 3 --nanny" in lines[-1]
     assert "--lifetime 8700s" in lines[-1]
+
+
+def test_slurm_is_asked_for_workers_and_released(tmp_path, monkeypatch):
+    """With commands that start and end jobs here, as SLURM would elsewhere."""
+    pytest.importorskip("dask_jobqueue")
+    jobs = tmp_path / "jobs"
+    commands = {
+        "sbatch": f'setsid bash "$1" >{tmp_path}/said 2>&1 &\necho $! >>{jobs}\necho Submitted batch job $!',
+        "scancel": 'kill -- -"$1"',
+    }
+    for name, text in commands.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    night = Cluster(kind="slurm", interface="lo", memory="2 GiB", start_s=60)
+    assert sorted(DaskExecutor(cluster=night).map(double, range(5), lost)) == [0, 2, 4, 6, 8]
+    started = [int(line) for line in jobs.read_text().split()]
+    assert len(started) == 1
+    until(lambda: not any(psutil.pid_exists(pid) for pid in started))
 
 
 def test_the_section_reaches_kubernetes():
