@@ -1,14 +1,16 @@
 """Fingerprints change with what makes a result, and with nothing else."""
 
+import hashlib
+import json
 import os
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from catalog import Catalog, Layer
-from pipeline.config import compose
-from pipeline.graph import STAGE_NAMES, tile_graph
+from pipeline.config import compose, load_config
+from pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, tile_graph
 from tasks import ecsrc
 from tasks.segment import mask
 
@@ -47,6 +49,37 @@ def test_the_same_again_is_the_same(survey):
 )
 def test_an_option_changes_its_stage_and_what_follows(survey, override, stages):
     assert changed(names(survey), names(survey, {**PAPER, **override})) == stages
+
+
+def literally(graph, config) -> dict[str, dict[str, str]]:
+    """Name every node as the page says, one by one."""
+    tile, names = graph.tile, {}
+    for variant, chain in config.chains.items():
+        made = names[variant] = {}
+        for stage in STAGES:
+            options = chain[stage.name]
+            module = stage_module(options)
+            made_of = [
+                stage.name,
+                module.__name__,
+                module.VERSION,
+                options.model_dump(mode="json"),
+                [made[name] for name in stage.inputs] or asdict(tile.grid),
+                [source for source in graph.sources if source[0] in getattr(module, "READS", ())],
+                [],
+            ]
+            text = json.dumps(made_of, sort_keys=True, separators=(",", ":"))
+            made[stage.name] = hashlib.sha256(text.encode()).hexdigest()[:32]
+    return names
+
+
+@pytest.mark.parametrize("name", ["paper", "ablation"])
+def test_names_are_the_hash_of_what_makes_a_node(name, survey):
+    config = load_config(name)
+    pattern = Pattern.of(config)
+    for tile in Catalog.read(survey).tiles:
+        graph = pattern.graph(tile)
+        assert graph.variants == literally(graph, config)
 
 
 def test_an_option_at_its_default_changes_nothing(survey):

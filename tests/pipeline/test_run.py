@@ -1,6 +1,7 @@
 """Runs on both executors: what is computed, what is not, and what becomes of failures."""
 
 import json
+import os
 from collections import Counter
 
 import numpy as np
@@ -11,9 +12,11 @@ import rasterio
 from catalog import Catalog
 from pipeline.config import compose, load_config
 from pipeline.errors import ConfigError
+from pipeline.execute import DaskExecutor, SerialExecutor
+from pipeline.graph import Pattern
 from pipeline.run import Run, execute, select
 from pipeline.store import Store
-from pipeline.summary import summary
+from pipeline.summary import Summary, summary
 from pipeline.tables import read_metrics
 from pipeline.work import TileResult
 
@@ -78,8 +81,6 @@ def test_rows_are_complete_and_what_is_shared_is_computed_once(run, executor):
 
 
 def test_executors_agree(survey, quick_config, tmp_path, cluster):
-    from pipeline.execute import DaskExecutor, SerialExecutor
-
     tables = []
     for name, which in (("a", SerialExecutor()), ("b", DaskExecutor(scheduler=cluster.scheduler_address))):
         run = Run.create(tmp_path / name, load_config(quick_config), Catalog.read(survey))
@@ -209,8 +210,6 @@ def test_a_lost_product_is_written_again(run, executor):
 
 
 def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
-    from pipeline.execute import SerialExecutor
-
     put = Store.put
 
     def full(self, node, value, seconds):
@@ -226,6 +225,165 @@ def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
     monkeypatch.undo()
     assert {r.status for r in results_of(run, SerialExecutor())} == {"done", "cached"}
     assert not list(run.path.rglob("*.tmp"))
+
+
+class Meddling(SerialExecutor):
+    """Does something before the n-th tile, when its graph is made already."""
+
+    def __init__(self, n, meddle):
+        self.n, self.meddle = n, meddle
+
+    def map(self, function, jobs, lost, probe=None):
+        for i, job in enumerate(jobs):
+            if i == self.n:
+                self.meddle()
+            yield function(job)
+
+
+@pytest.mark.parametrize("how", ["replaced", "truncated"])
+def test_a_source_replaced_while_its_tile_is_done(how, run, survey, quick_config, tmp_path):
+    tile = run.catalog.tiles[2]
+    path = tile.paths(tile.layer("dsm"))[0]
+
+    def replace_it():
+        if how == "truncated":
+            path.write_bytes(path.read_bytes()[:700])
+            return
+        with rasterio.open(path, "r+") as raster:
+            raster.write(raster.read(1) + 0.5, 1)
+
+    whole = path.read_bytes()
+    results = results_of(run, Meddling(2, replace_it))
+    assert [result.status for result in results] == ["done", "done", "failed", "done"]
+    (failure,) = results[2].failures
+    assert (failure.stage, failure.kind, failure.file) == ("load", "SourceChanged", str(path))
+    assert "the same command takes the tile up again" in failure.message
+    assert not failure.trace
+    stored = {path.stem for path in (run.path / "store").rglob("*.npz")}
+    assert not stored & set(run.graph(tile).nodes)
+    if how == "truncated":
+        path.write_bytes(whole)
+    how = execute(run, SerialExecutor())
+    assert (how.done, how.cached, how.changed) == (4, 3, 1)
+    undisturbed = Run.create(tmp_path / "undisturbed", run.config, run.catalog)
+    execute(undisturbed, SerialExecutor())
+    left, right = (read_metrics(r.path).drop(columns="seconds") for r in (run, undisturbed))
+    pd.testing.assert_frame_equal(left, right, check_exact=True)
+
+
+def nothing_to_do(run) -> Summary:
+    """Execute a run that is done, and see that it knows."""
+    before = read_metrics(run.path)
+    how = execute(run, Meddling(0, lambda: pytest.fail("there was something to do")))
+    assert (how.done, how.cached) == (4, 4)
+    pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
+    return how
+
+
+def test_a_resume_makes_each_graph_once_and_reads_no_marker(run, monkeypatch):
+    execute(run, SerialExecutor())
+    made = Counter()
+    graph = Pattern.graph
+
+    def counted(self, tile, *how):
+        made[tile.id] += 1
+        return graph(self, tile, *how)
+
+    monkeypatch.setattr(Pattern, "graph", counted)
+    monkeypatch.setattr("pipeline.look._from_marker", lambda *_: pytest.fail("a marker was read"))
+    nothing_to_do(Run.open(run.path))
+    assert made == {tile.id: 1 for tile in run.catalog.tiles}
+
+
+@pytest.mark.parametrize("how", ["lost", "damaged", "of before"])
+def test_the_markers_are_the_truth(how, run):
+    execute(run, SerialExecutor())
+    ledger = run.path / "ledger.sqlite"
+    before = ledger.read_bytes()
+    run = changed(run, evaluate={"nearest": True})
+    execute(run, SerialExecutor())
+    if how == "lost":
+        ledger.unlink()
+    else:
+        # As if the client had been killed before it wrote down anything.
+        ledger.write_bytes(before if how == "of before" else before[:5000])
+    assert summary(run).done == 4
+    nothing_to_do(run)
+    assert read_metrics(run.path).nearest_road_m.notna().all()
+
+
+def test_a_summary_counts_what_is_new_changed_and_vanished(run):
+    first = Run.create(run.path, run.config, Catalog(run.catalog.tiles[:3]))
+    how = execute(first, SerialExecutor())
+    assert (how.new, how.changed, how.vanished, how.exit_code) == (3, 0, 0, 0)
+    tile = run.catalog.tiles[1]
+    os.utime(tile.paths(tile.layer("dtm"))[0], (1, 1))
+    second = Run.create(run.path, run.config, Catalog(run.catalog.tiles[1:]))
+    assert [summary(second).pending, summary(second).done] == [2, 1]
+    how = execute(second, SerialExecutor())
+    assert (how.new, how.changed, how.vanished) == (1, 1, 1)
+    assert (how.tiles, how.done, how.cached) == (3, 3, 1)
+    told = json.loads((run.path / "summary.json").read_text())
+    assert {name: told[name] for name in ("new", "changed", "vanished", "done", "exit_code")} == {
+        "new": 1, "changed": 1, "vanished": 1, "done": 3, "exit_code": 0,
+    }  # fmt: skip
+    assert told["start"] < told["end"]
+    assert list(read_metrics(run.path).tile_id.unique()) == [tile.id for tile in second.catalog.tiles]
+    assert execute(second, SerialExecutor()).vanished == 0
+
+
+def test_an_interruption_leaves_tables_and_a_summary(run):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        execute(run, Meddling(2, interrupt))
+    told = json.loads((run.path / "summary.json").read_text())
+    assert {name: told[name] for name in ("interrupted", "exit_code", "done", "pending")} == {
+        "interrupted": True, "exit_code": 130, "done": 2, "pending": 2,
+    }  # fmt: skip
+    assert read_metrics(run.path).tile_id.nunique() == 2
+    how = execute(run, SerialExecutor())
+    assert (how.done, how.cached, how.interrupted, how.exit_code) == (4, 2, False, 0)
+
+
+def test_an_interrupted_run_keeps_no_rows_of_another_configuration(run):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    execute(run, SerialExecutor())
+    other = changed(run, evaluate={"nearest": True})
+    with pytest.raises(KeyboardInterrupt):
+        execute(other, Meddling(1, interrupt))
+    rows = read_metrics(run.path)
+    assert list(rows.tile_id.unique()) == [run.catalog.tiles[0].id]
+    assert rows.nearest_road_m.notna().all()
+
+
+def test_products_are_compared_byte_for_byte_on_demand(run):
+    execute(run, SerialExecutor())
+    folder = run.folder(run.catalog.tiles[0].id).path
+    (mesh,) = folder.glob("*.glb")
+    whole = mesh.read_bytes()
+    mesh.write_bytes(bytes(len(whole)))
+    nothing_to_do(run)
+    results = []
+    execute(run, SerialExecutor(), watch=results.append, verify=True)
+    assert computed(results) == times(1, {"export": 1})
+    assert mesh.read_bytes() == whole
+
+
+def test_gone_sources_count_as_they_were_until_the_tile_is_asked_for(run):
+    execute(run, SerialExecutor())
+    tile = run.catalog.tiles[1]
+    tile.paths(tile.layer("dsm"))[0].unlink()
+    assert (summary(run).done, summary(run).pending) == (4, 0)
+    other = run.catalog.tiles[0].id
+    how = execute(run, SerialExecutor(), select(run, (other,), failed=False))
+    assert (how.done, how.cached, how.failed) == (4, 1, 0)
+    how = execute(run, SerialExecutor())
+    assert (how.done, how.cached, how.failed) == (3, 3, 1)
+    assert how.failures[0].tile_id == tile.id
 
 
 def test_log_has_one_event_per_tile(run, executor):
