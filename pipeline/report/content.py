@@ -56,6 +56,8 @@ class Content:
     """Tiles of the exported variant to look at first; needs no ground truth."""
     steps: pd.DataFrame
     """Height steps between neighbouring tiles."""
+    steps_of: str
+    """Which tiles that is about, if not all."""
     failures: pd.DataFrame
     versions: dict[str, str]
     config: str
@@ -74,6 +76,7 @@ def gather(run: Run) -> Content:
     rows = read_metrics(run.path)
     done = rows[rows.status == "done"]
     how = summary(run)
+    steps, steps_of = edge_steps(run)
     variants = [name for name in run.config.chains if name in set(done.variant)]
     shown = run.config.export.variants[0]
     failures = pd.DataFrame(
@@ -91,7 +94,8 @@ def gather(run: Run) -> Content:
         worst=_worst(done, shown),
         trust=over_tiles(done, variants),
         doubtful=most_doubtful(done, shown, WORST),
-        steps=edge_steps(run),
+        steps=steps,
+        steps_of=steps_of,
         failures=failures,
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),

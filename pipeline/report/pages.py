@@ -72,7 +72,7 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Worst tiles by road L2", content.worst, ""),
         ("Worst tiles by doubt, without ground truth", content.doubtful, trust.MEANING),
         ("What the surfaces tell of themselves, mean over tiles", content.trust, ""),
-        ("Height steps between neighbouring tiles", content.steps.head(10), ""),
+        ("Height steps between neighbouring tiles", content.steps.head(10), content.steps_of),
         ("Failures", content.failures, ""),
     )
     return (section for section in named if len(section[1]))

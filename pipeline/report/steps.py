@@ -5,7 +5,8 @@ Tiles are fitted independently, so nothing makes their surfaces meet; this says 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,25 +20,38 @@ from pipeline.store import Store
 from tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
+MOST = 2000
+"""Tiles compared with their neighbours; of larger runs a part, evenly over the catalog."""
 KEPT = 1024
-"""Tiles whose surfaces are held until their other neighbours have come: more than a column of a state."""
+"""Tiles whose surfaces are held until their other neighbours have come."""
 
 Nodes = tuple[Node, Node]
 """Of the surface and of the road mask."""
 
 
-def edge_steps(run: Run) -> pd.DataFrame:
-    """Return one row per exported variant and pair of neighbours, the largest steps first.
+def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
+    """Return one row per exported variant and pair of neighbours, largest steps first, and of which tiles.
 
     Only pairs whose surfaces are in the store are told of.
     """
-    done: list[tuple[Tile, dict[str, Nodes]]] = []
-    for found in look_at(run, run.catalog.tiles):
-        if found.done:
-            done.append((found.graph.tile, _nodes(found.graph)))
-    rows = [row for variant in run.config.export.variants for row in _rows(run, done, variant)]
+    tiles = run.catalog.tiles
+    every = math.ceil(len(tiles) / most)
+    pairs = list(_pairs(tiles, every))
+    wanted = {tile.id: tile for pair in pairs for tile in pair}
+    done = {found.graph.tile.id: _nodes(found.graph) for found in look_at(run, wanted.values()) if found.done}
+    rows = [row for variant in run.config.export.variants for row in _rows(run, pairs, done, variant)]
     table = pd.DataFrame(rows, columns=COLUMNS)
-    return table.sort_values("largest step (m)", ascending=False, ignore_index=True)
+    note = f"Of one tile in {every}, against its neighbours in the east and north." if every > 1 else ""
+    return table.sort_values("largest step (m)", ascending=False, ignore_index=True), note
+
+
+def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
+    corners = {_corner(tile.grid, tile.grid.west, tile.grid.south): tile for tile in tiles}
+    for tile in tiles[::every]:
+        grid = tile.grid
+        for east, north in ((grid.east, grid.south), (grid.west, grid.north)):
+            if other := corners.get(_corner(grid, east, north)):
+                yield tile, other
 
 
 def _nodes(graph: TileGraph) -> dict[str, Nodes]:
@@ -46,25 +60,21 @@ def _nodes(graph: TileGraph) -> dict[str, Nodes]:
 
 
 def _rows(
-    run: Run, done: list[tuple[Tile, dict[str, Nodes]]], variant: str
+    run: Run, pairs: Sequence[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float]]:
     store = Store(run.store)
-    tiles = [tile for tile, _ in done]
-    nodes = {tile.id: nodes[variant] for tile, nodes in done}
 
     @lru_cache(KEPT)
     def results(tile_id: str) -> tuple[Surface, RoadMask] | None:
-        surface, road = (store.get(node) for node in nodes[tile_id])
+        surface, road = (store.get(node) for node in done[tile_id][variant])
         return (surface[0], road[0]) if surface and road else None
 
-    corners = {_corner(tile.grid, tile.grid.west, tile.grid.south): tile for tile in tiles}
-    for tile in tiles:
-        grid = tile.grid
-        for east, north in ((grid.east, grid.south), (grid.west, grid.north)):
-            other = corners.get(_corner(grid, east, north))
-            if other is None or (here := results(tile.id)) is None or (there := results(other.id)) is None:
-                continue
-            yield (variant, tile.id, other.id, *_step(grid, other.grid, *here, there[0]))
+    for tile, other in pairs:
+        if tile.id not in done or other.id not in done:
+            continue
+        here, there = results(tile.id), results(other.id)
+        if here and there:
+            yield (variant, tile.id, other.id, *_step(tile.grid, other.grid, *here, there[0]))
 
 
 def _corner(grid: Grid, east: float, north: float) -> tuple[str, float, float]:

@@ -14,6 +14,7 @@ from pipeline.config import compose, load_config
 from pipeline.errors import ConfigError
 from pipeline.execute import DaskExecutor, SerialExecutor
 from pipeline.graph import Pattern
+from pipeline.report.steps import edge_steps
 from pipeline.run import Run, execute, select
 from pipeline.store import Store
 from pipeline.summary import Summary, summary
@@ -430,6 +431,17 @@ def test_products_open_as_they_are(run, executor):
     with rasterio.open(folder / f"{tile.id}_flexroad_height.tif") as raster:
         assert tuple(raster.bounds) == tile.grid.bounds
         assert raster.crs.to_epsg() == 25832
+
+
+def test_a_large_run_is_judged_by_a_part_of_its_steps(run):
+    execute(run, SerialExecutor())
+    whole, note = edge_steps(run)
+    part, told = edge_steps(run, most=2)
+    pairs = ["tile", "neighbour"]
+    assert (len(whole), note) == (4, "")
+    assert 0 < len(part) < len(whole)
+    assert part.set_index(pairs).equals(whole.set_index(pairs).loc[pd.MultiIndex.from_frame(part[pairs])])
+    assert told == "Of one tile in 2, against its neighbours in the east and north."
 
 
 def test_what_is_no_run_is_said(tmp_path):
