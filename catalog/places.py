@@ -338,7 +338,8 @@ def _tries() -> int:
 def _s3_options() -> dict[str, Any]:
     """Return what s3fs is told; credentials and region it finds as every program of AWS does."""
     config: dict[str, Any] = {
-        "retries": {"total_max_attempts": _tries(), "mode": os.environ.get("AWS_RETRY_MODE") or "standard"},
+        # The other modes give a process an allowance of second tries, which a night of stumbles uses up.
+        "retries": {"total_max_attempts": _tries(), "mode": os.environ.get("AWS_RETRY_MODE") or "legacy"},
         "connect_timeout": 10,
         "read_timeout": 60,
     }

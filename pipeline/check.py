@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 
 from catalog import LAYERS, Catalog, Tile
 from catalog.crs import short
+from catalog.places import Place, Sightings
 from tasks import load, registration
 from tasks.errors import TaskError
 from tasks.photo import read_photo
@@ -45,10 +45,11 @@ def check(catalog: Catalog) -> Iterator[Remark]:
 
 
 def _missing(tiles: Sequence[Tile]) -> Iterator[Remark]:
-    wanted: Counter[Path] = Counter(
+    wanted: Counter[Place] = Counter(
         path for tile in tiles for layer in tile.layers for path in tile.paths(layer)
     )
-    gone = [(path, count) for path, count in wanted.items() if not path.exists()]
+    look = Sightings()
+    gone = [(path, count) for path, count in wanted.items() if look(path) is None]
     for path, count in gone[:SHOWN]:
         yield Remark(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
     if len(gone) > SHOWN:

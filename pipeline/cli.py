@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from datetime import datetime
@@ -14,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from catalog.errors import CatalogError
+from pipeline.cli_clean import clean
 from pipeline.cli_prepare import prepare
-from pipeline.cli_run import rerun, run, status
+from pipeline.cli_run import next_run, rerun, run, status
 from pipeline.cli_train import train
+from pipeline.ending import unread
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -36,12 +37,12 @@ app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
 app.command("train")(train)
-for command in (run, rerun, status):
+for command in (run, rerun, status, clean):
     app.command()(command)
 
 SEVERAL = ("--tile", "--road-value", "--ground-class", "--bridge-class")
 """Options that take several values in a row."""
-FOLDER_FIRST = ("rerun", "figures", "rasters", "nrw")
+FOLDER_FIRST = ("rerun", "clean", "figures", "rasters", "nrw")
 """Commands with a folder of their own, which must come first for that."""
 
 
@@ -53,6 +54,11 @@ def main() -> None:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)  # noqa: T201
         sys.exit(2)
+    except SystemExit as ended:
+        if ended.code == 2:
+            # Everything else that ends with 2 has told the alarm itself.
+            unread(sys.argv[1:], lambda line: print(f"warning: {line}", file=sys.stderr))  # noqa: T201
+        raise
     except BrokenPipeError:
         # `flexroad ... | head` closed the pipe: no fault of the run.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -216,7 +222,7 @@ def _write_catalog(found: Indexed, output: Path) -> None:
     catalog = Catalog(found.tiles)
     catalog.write(output)
     _say(f"{len(catalog.tiles)} tiles in {output}")
-    _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(output))} --out RUN")
+    _say(f"next: {next_run(output)}")
 
 
 @catalogs.command("synthetic")
@@ -241,7 +247,7 @@ def catalog_synthetic(
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     _say(f"{len(Catalog.read(path).tiles)} tiles in {path}")
-    _say(f"next: flexroad run --config paper --catalog {shlex.quote(str(path))} --out RUN")
+    _say(f"next: {next_run(path)}")
 
 
 @catalogs.command("show")
@@ -282,6 +288,7 @@ def report(
     form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
 ) -> None:
     """Write RUN/report.<format>: the paper's main table over the run, worst tiles, steps, failures."""
+    from catalog.places import read
     from pipeline.report import FORMATS, write_report
     from pipeline.run import Run
 
@@ -289,7 +296,7 @@ def report(
         raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
     written = write_report(Run.open(path), form)
     if form != "html":
-        _say(written.read_text())
+        _say(read(written).decode())
     typer.echo(f"written to {written}", err=True)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import shlex
 from collections.abc import Callable
 from dataclasses import fields
 from datetime import datetime
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from pipeline.cli_run import next_run
 from pipeline.prepare.asked import Asked
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def _carry_out(make: Callable[[], Published]) -> None:
     for note in made.notes:
         typer.echo(f"note: {note}", err=True)
     typer.echo(f"{made.tiles} tile{'s' * (made.tiles != 1)} in {made.catalog}")
-    typer.echo(f"next: flexroad run --config paper --catalog {shlex.quote(str(made.catalog))} --out RUN")
+    typer.echo(f"next: {next_run(made.catalog)}")
 
 
 @prepare.command("points")

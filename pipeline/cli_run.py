@@ -69,14 +69,18 @@ def run(
 ) -> None:
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
     from catalog import Catalog
-    from catalog.places import place
+    from catalog.places import absolute, normal, place
+    from catalog.trust import refuse_outside
     from pipeline.config import load_config
     from pipeline.run import Run, asked, select
 
-    path, root = place(out), place(store) if store else None
+    path, listed, root = place(out), place(catalog), place(store) if store else None
+    # What its own folder holds is a catalog's to name.
+    allowed = [str(absolute(listed).parent), *(normal(text) for text in allow or ())]
 
     def wanted() -> tuple[Catalog, Catalog]:
-        whole = Catalog.read(place(catalog))
+        whole = Catalog.read(listed)
+        refuse_outside(whole, listed.parent, allowed)
         found = whole.select(tile or (), bbox)
         if not found.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
@@ -95,10 +99,11 @@ def run(
         chosen, (whole, tiles) = load_config(config), wanted()
         some = bool(tile) or bbox is not None
         with _alone(path, make=True):
-            opened = Run.create(path, chosen, asked(path, whole, tiles) if some else whole, root, checksum)
+            about = asked(path, whole, tiles) if some else whole
+            opened = Run.create(path, chosen, about, root, checksum, allowed)
             only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
             with_whom = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
-            _carry_out(opened, with_whom, only, frozenset(), ending)
+            _carry_out(opened, with_whom, only, frozenset(), verify, ending)
     _leave(ending)
 
 
@@ -119,6 +124,7 @@ def rerun(
 ) -> None:
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
     from catalog.places import place
+    from catalog.trust import refuse_outside
     from pipeline.graph import STAGE_NAMES
     from pipeline.run import Run, select
 
@@ -129,9 +135,12 @@ def rerun(
         anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
         with _alone(where):
             opened = Run.open(where)
+            if opened.allowed:
+                # A run of old does not know.
+                refuse_outside(opened.catalog, where, opened.allowed)
             only = select(opened, tile or (), failed)
             with_whom = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
-            _carry_out(opened, with_whom, only, anew, ending)
+            _carry_out(opened, with_whom, only, anew, verify, ending)
     _leave(ending)
 
 
@@ -171,6 +180,7 @@ def _carry_out(
     with_whom: Callable[[Callable[[str], None]], Executor],
     only: Callable[[Tile], bool],
     anew: frozenset[str],
+    verify: bool,
     ending: Ending,
 ) -> None:
     """Do the tiles, and fill in how that ended."""
@@ -193,7 +203,7 @@ def _carry_out(
 
     try:
         with watch:
-            how = ending.how = execute(run, executor, only, anew, told)
+            how = ending.how = execute(run, executor, only, anew, told, verify)
     except ClusterLost as error:
         ending.exit_code, ending.text = 1, f"{error}; the same command goes on from here"
         return
@@ -232,6 +242,17 @@ def _leave(ending: Ending) -> None:
 
 def _warn(line: str, kind: str = "warning") -> None:
     typer.echo(f"{kind}: {line}", err=True)
+
+
+def next_run(catalog: Path) -> str:
+    """Return the command that runs a catalog, with leave for all that it names."""
+    from catalog import Catalog
+    from catalog.trust import needed
+
+    allowed = "".join(
+        f" --allow {shlex.quote(where)}" for where in needed(Catalog.read(catalog), catalog.parent)
+    )
+    return f"flexroad run --config paper --catalog {shlex.quote(str(catalog))} --out RUN{allowed}"
 
 
 def status(

@@ -106,8 +106,7 @@ def stage_function(stage: str, options: Options) -> Callable[..., Any]:
     return function
 
 
-def _json(value: Any) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 
 
 def _hash(text: str) -> str:

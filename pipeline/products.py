@@ -13,6 +13,13 @@ from tasks.support import of_faces
 
 Product = tuple[bytes, str]
 """Bytes and media type."""
+SUFFIXES = {
+    "glb": (glb.NAME,),
+    "ply": (ply.NAME,),
+    "cog": (cog.NAME_HEIGHT, cog.NAME_ROAD, cog.NAME_SUPPORT),
+    "npz": (npz.NAME,),
+}
+"""What the files of each format are called, after tile and variant."""
 
 
 def products(graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, float]) -> dict[str, Product]:

@@ -39,6 +39,7 @@ from pipeline.ledger import NAME as LEDGER
 from pipeline.ledger import Ledger, Standing
 from pipeline.look import Folders, stands
 from pipeline.meter import now
+from pipeline.registry import register
 from pipeline.store import TileFolder, check_writable
 from pipeline.summary import Summary, summarise, write_summary
 from pipeline.tables import write_tables
@@ -93,6 +94,7 @@ class Run:
             for folder in (path, store):
                 check_writable(folder)
             run._write()
+            register(run)
         except OSError as error:
             raise ConfigError(
                 f"cannot write the run to {path}: {error}; choose another --out or --store"
@@ -100,7 +102,7 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, path: Place) -> Run:
+    def open(cls, path: Place | str) -> Run:
         """Open a run made before, with its configuration and catalog as they are now.
 
         Raises
@@ -110,6 +112,7 @@ class Run:
         CatalogError
             If its catalog is damaged.
         """
+        path = place(path)
         found = _record(path)
         if found is None:
             raise ConfigError(

@@ -104,21 +104,6 @@ class TileFolder:
         except (OSError, KeyError, TypeError, AttributeError):
             return False
 
-    def sources(self) -> list[Any] | None:
-        """Return the sources of the tile when it was last done, as `TileGraph.sources` names them."""
-        properties = (self._read("item.json") or {}).get("properties", {})
-        found: list[Any] | None = properties.get("flexroad:sources")
-        return found
-
-    def gave_up(self) -> bool:
-        """Tell whether the tile failed when it was last tried, with whatever files and options."""
-        return places.exists(self.path / "failed.json")
-
-    def failed(self, graph: TileGraph) -> dict[str, Any] | None:
-        """Return what is known of the tile's last failure, if it was of this graph."""
-        failure = self._read("failed.json")
-        return failure if failure and failure.get("fingerprint") == graph.fingerprint else None
-
     def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
         """Write the products, then the item that says so.
 

@@ -80,8 +80,6 @@ def storage_server():
 @pytest.fixture
 def storage(storage_server, monkeypatch):
     """Object storage on loopback that can be told to fail; what speaks S3 in this process finds it."""
-    from botocore.retries.standard import ExponentialBackoff
-
     storage_server.fail()
     settings = {
         "AWS_ENDPOINT_URL": storage_server.url,
@@ -92,7 +90,7 @@ def storage(storage_server, monkeypatch):
     }
     for name, value in settings.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(ExponentialBackoff, "delay_amount", lambda self, context: 0.01)
+    monkeypatch.setattr("botocore.retryhandler.delay_exponential", lambda **_: 0.01)
     yield storage_server
     storage_server.fail()
 

@@ -42,7 +42,9 @@ PATCH_M = 400
 """Size of the one made scene that is laid out over and over."""
 SLEEP_S = 0.3
 """What a tile of configs/nightly.yaml takes."""
-SLEEPERS = 8
+SLEEPERS = 4
+ASLEEP = 2000
+"""Tiles slept through: enough for a mean."""
 WORKERS = 2
 STATE = 550_000
 """Tiles of 250 m of one German state (34,100 km2)."""
@@ -61,8 +63,11 @@ def main(tiles: int = TILES, plot: Path | None = None) -> None:
         found, took = timed(lambda: rasters.index(folder, LAYERS, tile_size_m=TILE_M))
         Catalog(found.tiles).write(folder / "catalog.parquet")
         say("cut the catalog", took, side**2)
+        before = resident_mb(psutil.Process())
         catalog, took = timed(lambda: Catalog.read(folder / "catalog.parquet"))
         say("read the catalog", took, side**2)
+        held = (resident_mb(psutil.Process()) - before) / side**2
+        print(f"  in memory {1024 * held:.1f} KB a tile, {held * STATE / 1024:.1f} GB for {STATE:,}")
         config = compose(CONFIG, "scale")
         run, took = timed(lambda: Run.create(folder / "RUN", config, catalog))
         say("make the run", took, side**2)
@@ -123,8 +128,10 @@ class Asleep:
 
     workers: int
     times: list[float] = field(default_factory=list)
-    busy: list[float] = field(default_factory=list)
+    here: list[float] = field(default_factory=list)
     """CPU time of client and scheduler (s) at the same moments."""
+    there: dict[int, float] = field(default_factory=dict)
+    """And of all workers, by number of results."""
 
     def map(
         self,
@@ -135,21 +142,32 @@ class Asleep:
     ) -> Iterator[Any]:
         for result in DaskExecutor(self.workers).map(sleep_tile, jobs, lost, probe):
             self.times.append(time.perf_counter())
-            self.busy.append(time.process_time())
+            self.here.append(time.process_time())
+            if len(self.times) % 50 == self.workers:
+                # Now and then: asking costs time, too.
+                self.there[len(self.times)] = busy(psutil.Process().children(recursive=True))
             yield result
+
+
+def busy(processes: list[psutil.Process]) -> float:
+    times = [process.cpu_times() for process in processes]
+    return float(sum(time.user + time.system for time in times))
 
 
 def overhead(run: Run) -> None:
     asleep = Asleep(SLEEPERS)
-    execute(run, asleep)
+    some = {tile.id for tile in run.catalog.tiles[:ASLEEP]}
+    execute(run, asleep, only=lambda tile: tile.id in some)
     # Of each worker's first tile one sees the end only.
     first, tiles = SLEEPERS - 1, len(asleep.times) - SLEEPERS
     wall, slept = asleep.times[-1] - asleep.times[first], SLEEP_S * tiles
-    each = (asleep.busy[-1] - asleep.busy[first]) / tiles
+    here = (asleep.here[-1] - asleep.here[first]) / tiles
+    there = (max(asleep.there.values()) - asleep.there[SLEEPERS]) / (max(asleep.there) - SLEEPERS)
     print(
         f"asleep: {tiles} tiles of {SLEEP_S} s on {SLEEPERS} workers: {wall:.1f} s x {SLEEPERS} against "
-        f"{slept:.1f} s: overhead {wall * SLEEPERS / slept - 1:.1%}\n  client and scheduler: "
-        f"{1000 * each:.1f} ms of CPU a tile, enough for {SLEEP_S / each:.0f} workers",
+        f"{slept:.1f} s: overhead {wall * SLEEPERS / slept - 1:.1%}\n"
+        f"  CPU: a worker {1000 * there:.1f} ms a tile, {there / SLEEP_S:.1%}; client and scheduler "
+        f"{1000 * here:.1f} ms a tile, enough for {SLEEP_S / here:.0f} workers",
         flush=True,
     )
 

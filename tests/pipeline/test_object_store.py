@@ -1,0 +1,258 @@
+"""Catalog, sources, store and run in a bucket: as on disk, also when the storage stumbles."""
+
+import io
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from catalog import Catalog, places
+from catalog.places import place
+from pipeline import codec
+from pipeline.cli import main
+from pipeline.config import compose
+from pipeline.dataset import open_tile
+from pipeline.execute import SerialExecutor
+from pipeline.query import Ground
+from pipeline.report import write_report
+from pipeline.run import Run, execute
+from pipeline.summary import read_summary, summary
+from pipeline.tables import read_metrics
+from tests.conftest import QUICK
+from tests.s3_server import Fault
+
+LIGHT = {"variants": {"plane": {"fit": "plane", "sample": "corners"}}}
+CONFIG = compose(LIGHT, "light")
+
+
+@pytest.fixture(scope="module")
+def local(made_survey, tmp_path_factory):
+    """The same run on disk, where nothing happens to it."""
+    return on_disk(made_survey, tmp_path_factory.mktemp("local"), CONFIG)
+
+
+def on_disk(survey, folder, config):
+    run = Run.create(folder, config, Catalog.read(survey / "catalog.parquet"))
+    execute(run, SerialExecutor())
+    return run
+
+
+@pytest.fixture
+def survey(made_survey, bucket):
+    """The survey, put into a bucket."""
+    home = bucket / "survey"
+    for file in made_survey.rglob("*"):
+        if file.is_file():
+            places.write(home / file.relative_to(made_survey).as_posix(), file.read_bytes())
+    return home / "catalog.parquet"
+
+
+@pytest.fixture
+def run(survey, bucket):
+    return Run.create(bucket / "run", CONFIG, Catalog.read(survey))
+
+
+@pytest.fixture
+def flexroad(monkeypatch, capsys):
+    def call(*words) -> str:
+        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert not end.value.code
+        return capsys.readouterr().out
+
+    return call
+
+
+def bring_up_to_date(run):
+    results = []
+    how = execute(run, SerialExecutor(), watch=results.append)
+    return how, {result.tile_id: result for result in results}
+
+
+def assert_same(run, local):
+    """Rows and products alike, to the byte."""
+    ours, theirs = (read_metrics(each.path).drop(columns="seconds") for each in (run, local))
+    pd.testing.assert_frame_equal(ours, theirs)
+    for tile in run.catalog.tiles:
+        one, other = (each.folder(tile.id).path for each in (run, local))
+        names = places.listing(one).keys()
+        assert names == places.listing(other).keys()
+        for name in names - {"item.json"}:
+            assert places.read(one / name) == places.read(other / name), name
+
+
+def assert_nothing_half(run):
+    """Every artefact is whole, and so are the products of every tile that counts as done."""
+    for name in places.listing(run.store):
+        if name.endswith(".npz"):
+            assert codec.decode(places.read(run.store / name))
+    for tile in run.catalog.tiles:
+        folder = run.folder(tile.id)
+        assert folder.verified() == places.exists(folder.path / "item.json")
+
+
+def test_a_run_in_a_bucket_is_the_one_on_disk(survey, made_survey, bucket, tmp_path):
+    config = compose(QUICK, "quick")
+    local = on_disk(made_survey, tmp_path, config)
+    run = Run.create(bucket / "run", config, Catalog.read(survey))
+    how, results = bring_up_to_date(run)
+    assert (how.exit_code, {result.status for result in results.values()}) == (0, {"done"})
+    assert_same(run, local)
+    how, results = bring_up_to_date(Run.open(place(str(run.path))))
+    assert (how.exit_code, {result.status for result in results.values()}) == (0, {"cached"})
+    assert (how.done, how.cached, how.failed) == (4, 4, 0)
+
+
+def test_what_was_made_can_be_asked_for(run, local):
+    execute(run, SerialExecutor())
+    opened = Run.open(run.path)
+    assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
+    for form in ("md", "csv", "html"):
+        assert places.read(write_report(opened, form))
+    tile = opened.catalog.tiles[0]
+    assert open_tile(str(run.path), tile.id).identical(open_tile(local.path, tile.id))
+    east, north = tile.grid.west + 10.3, tile.grid.north - 20.7
+    ours, theirs = (Ground.open(each.path).at(east, north) for each in (run, local))
+    assert ours.height == theirs.height
+    assert list(ours.tile) == [tile.id]
+
+
+def test_a_source_with_other_bytes_is_noticed(run):
+    execute(run, SerialExecutor())
+    tile = run.catalog.tiles[1]
+    file = tile.paths(tile.layer("dsm"))[0]
+    before = places.stat(file)
+    places.write(file, places.read(file) + b"\0")
+    places.write(file, places.read(file)[:-1] + b"\1")
+    assert places.stat(file).size == before.size + 1
+    how, results = bring_up_to_date(Run.open(run.path))
+    assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
+    assert how.exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        pytest.param([Fault("slow", first=2)], id="every request is throttled twice"),
+        pytest.param([Fault("half", "GET", r"json|npz|parquet", first=1)], id="every answer breaks off once"),
+        pytest.param(
+            [
+                Fault(answer, share=0.1, seed=seed)
+                for seed, answer in enumerate(("slow", "error", "cut", "shut"))
+            ],
+            id="a third of all requests fail somehow",
+        ),
+    ],
+)
+def test_storage_that_stumbles_changes_nothing(survey, bucket, storage, local, faults):
+    storage.fail(*faults)
+    run = Run.create(bucket / "run", CONFIG, Catalog.read(survey))
+    how, _ = bring_up_to_date(run)
+    storage.fail()
+    assert (how.exit_code, how.done) == (0, 4)
+    assert_same(run, local)
+
+
+@pytest.mark.parametrize(("answer", "skip"), [("denied", 0), ("error", 7), ("slow", 20)])
+def test_writes_that_fail_from_some_moment_on(run, storage, local, answer, skip):
+    storage.fail(Fault(answer, "PUT", "/run/(tiles|store)", skip=skip))
+    how, results = bring_up_to_date(run)
+    storage.fail()
+    failed = {name for name, result in results.items() if result.status == "failed"}
+    assert (how.exit_code, how.failed) == (1, len(failed))
+    assert failed
+    rows = read_metrics(run.path)
+    assert set(rows[rows.status == "failed"].tile_id) == failed
+    assert rows[rows.status == "failed"].error.str.contains(f"{run.path}/").all()
+    assert read_summary(run.path)["exit_code"] == 1
+    assert_nothing_half(run)
+
+    how, results = bring_up_to_date(Run.open(run.path))
+    assert how.exit_code == 0
+    assert {name for name, result in results.items() if result.status == "done"} == failed
+    assert_same(run, local)
+
+
+def test_storage_that_goes_away_altogether_leaves_what_is_done(run, storage, local):
+    storage.fail(Fault("cut", path="/run/", skip=40))
+    with pytest.raises(OSError, match=str(run.path)):
+        execute(run, SerialExecutor())
+    storage.fail()
+    assert_nothing_half(run)
+    how, _ = bring_up_to_date(Run.open(run.path))
+    assert how.exit_code == 0
+    assert_same(run, local)
+
+
+@pytest.mark.parametrize("answer", ["slow", "denied", "half"])
+def test_a_source_that_cannot_be_read_is_one_failed_tile(run, storage, local, answer):
+    tile = run.catalog.tiles[2]
+    file = tile.paths(tile.layer("dsm"))[0]
+    storage.fail(Fault(answer, "GET", f"/{file.path}"))
+    how, results = bring_up_to_date(run)
+    storage.fail()
+    assert (how.exit_code, how.done, how.failed) == (1, 3, 1)
+    (failure,) = results[tile.id].failures
+    assert (failure.stage, failure.file) == ("load", str(file))
+
+    how, results = bring_up_to_date(Run.open(run.path))
+    assert how.exit_code == 0
+    assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
+    assert_same(run, local)
+
+
+def test_a_missing_source_is_named_by_its_address(run):
+    tile = run.catalog.tiles[0]
+    file = tile.paths(tile.layer("dtm"))[0]
+    places.remove(file)
+    how, results = bring_up_to_date(run)
+    (failure,) = results[tile.id].failures
+    assert failure.file == str(file)
+    assert "is missing" in failure.message
+    assert (how.done, how.failed) == (3, 1)
+
+
+def test_a_damaged_artefact_is_made_anew(run, local):
+    execute(run, SerialExecutor())
+    name = next(name for name in places.listing(run.store) if name.startswith("evaluate/"))
+    whole = places.read(run.store / name)
+    places.write(run.store / name, whole[:-1])
+    for tile in run.catalog.tiles:
+        places.remove(run.folder(tile.id).path / "item.json")
+    _, results = bring_up_to_date(Run.open(run.path))
+    assert sum(result.computed.get("evaluate", 0) for result in results.values()) == 1
+    assert_same(run, local)
+
+
+def test_requests_grow_with_the_tiles_only_where_tiles_are_done(run, storage):
+    storage.requests()
+    execute(run, SerialExecutor())
+    first = storage.requests()
+    # Of each file and artefact: looked for, written or read, looked at again.
+    assert len(first) / 4 < 45
+    execute(Run.open(run.path), SerialExecutor())
+    again = [path for _, path in storage.requests()]
+    # A list of the products, one of each folder of sources, and the run's own files.
+    assert len(again) <= 20
+    assert not [path for path in again if "/tiles/" in path or "/store/" in path or "/survey/" in path]
+
+
+def test_commands_take_addresses(survey, bucket, tmp_path, local, flexroad):
+    config = tmp_path / "light.yaml"
+    config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
+    home = str(bucket / "run")
+    asked = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--workers", "1"]
+    flexroad(*asked)
+    assert_same(Run.open(bucket / "run"), local)
+    assert "4 done" in flexroad("status", home)
+    flexroad("report", home)
+    assert places.read(bucket / "run" / "report.md")
+    tile = local.catalog.tiles[0]
+    points = tmp_path / "points.csv"
+    points.write_text(f"easting,northing\n{tile.grid.west + 10},{tile.grid.north - 10}\n")
+    answer = pd.read_csv(io.StringIO(flexroad("query", home, "--points", points)))
+    assert list(answer.tile) == [tile.id]
+    assert np.isfinite(answer.height_m).all()
