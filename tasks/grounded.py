@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, distance_transform_edt, label
 
 from tasks import options as base
 from tasks.flat_patches import Patches, flat_patches
@@ -25,7 +25,7 @@ from tasks.local_plane import ALONE, ON, against_known
 from tasks.support import unsound
 from tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
-VERSION = 1
+VERSION = 2
 
 REACH_M = 4.0
 """How far a cell looks for the ground it is held against (m)."""
@@ -69,6 +69,13 @@ class Options(base.Options):
     keep_largest: int | None = Field(
         None, ge=1, description="of the rest, keep so many of the largest; null keeps all"
     )
+    verge_m: float = Field(
+        0.0,
+        ge=0,
+        le=50,
+        description="beside the mask the DTM does not count up to this distance (m): a terrain model rounds "
+        "kerbs and banks off, and a surface drawn to it lifts the road's edge",
+    )
 
 
 def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
@@ -87,8 +94,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     -------
     RoadClusters
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
-        no cluster is large enough. With them, the dropped cells where the DTM is not the road's either:
-        under a car on a bridge it is the valley's.
+        no cluster is large enough. With them, the cells whose DTM does not count: dropped ones where it is
+        not the road's either (under a car on a bridge it is the valley's), and the verge.
     """
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
@@ -100,7 +107,22 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     level = np.abs(data.dsm - data.dtm) <= theta
     kept = ground | (near == ON) | (points & ~ground & (near == ALONE) & level)
     labels = _labels(kept, cell, options)
-    return RoadClusters(data.grid, labels, unsound(data, road, labels > 0))
+    astray = unsound(data, road, labels > 0) | _verge(road.mask, labels > 0, options.verge_m / cell)
+    return RoadClusters(data.grid, labels, astray)
+
+
+def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
+    """Return the cells beside the streets at most ``width`` cells away, ``(H, W)``.
+
+    A street is a part of the mask of which something was kept, what hangs over its edge with it.
+    """
+    if not kept.any() or width <= 0:
+        return np.zeros_like(mask)
+    parts, count = label(mask, np.ones((3, 3)))
+    street = np.zeros(count + 1, np.bool_)
+    street[parts[kept]] = True
+    verge: Bools = ~mask & (distance_transform_edt(~street[parts]) <= width)
+    return verge
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

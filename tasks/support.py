@@ -38,8 +38,8 @@ REACH_M = 3 * NEAR_M
 """Farther than this from any kept cell nothing can gainsay the DTM (m)."""
 CREST_M = 100.0
 """Radius of the sharpest crest or sag to be expected where a road is not seen (m)."""
-LEVEL_M2 = 0.01
-"""Keeps a plane's slopes finite where all that is seen lies on a line."""
+THIN_M2 = 0.2
+"""What scatters less in some direction (m2) lies on a line, and no plane goes on from it."""
 
 
 def support(
@@ -113,7 +113,8 @@ def without_unsound(data: TileData, clusters: RoadClusters) -> TileData:
 def continuation(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Floats]:
     """Return height and scatter (m) of the plane through the known cells around each cell, ``(H, W)`` each.
 
-    Moving least squares with Gaussian weights; NaN where no known cell lies within `REACH_M`.
+    Moving least squares with Gaussian weights; NaN where within `REACH_M` there is no known cell, or all of
+    them lie on a line.
 
     Parameters
     ----------
@@ -132,12 +133,17 @@ def continuation(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Fl
         r, c, rr, rc, cc = (_moment(known.astype(np.float64), cell, *order) / total for order in orders)
         m, mr, mc = (_moment(z, cell, *order) / total for order in ((0, 0), (1, 0), (0, 1)))
         # Central moments: two equations for the slopes, then the level where the offsets are 0.
-        rr, rc, cc = rr - r * r + LEVEL_M2, rc - r * c, cc - c * c + LEVEL_M2
+        rr, rc, cc = rr - r * r, rc - r * c, cc - c * c
         mr, mc = mr - m * r, mc - m * c
-        determinant = rr * cc - rc * rc
+        determinant = np.where(_least_spread(rr, rc, cc) >= THIN_M2, rr * cc - rc * rc, np.nan)
         by_row, by_col = (mr * cc - mc * rc) / determinant, (mc * rr - mr * rc) / determinant
         left = _moment(z**2, cell, 0, 0) / total - m * m - by_row * mr - by_col * mc
         return datum + m - by_row * r - by_col * c, np.sqrt(np.maximum(left, 0.0))
+
+
+def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
+    """Return the smaller eigenvalue of symmetric matrices of two rows."""
+    return np.asarray((rr + cc) / 2 - np.hypot((rr - cc) / 2, rc))
 
 
 def _moment(values: Floats, cell: float, row_power: int, col_power: int) -> Floats:

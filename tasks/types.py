@@ -81,7 +81,8 @@ class RoadClusters:
     labels: NDArray[np.int32]
     """``(H, W)``; 0 is no road, clusters count from 1 in the order of their first cell."""
     unsound: Bools | None = None
-    """Road cells, none of them kept, where the DTM is not sound either, ``(H, W)``; None: nobody asked."""
+    """Cells, none of them kept, whose DTM does not count: under what hides a road it may be another ground's,
+    and beside a road it is rounded off, ``(H, W)``; None: nobody asked."""
 
     @property
     def mask(self) -> Bools:
