@@ -231,6 +231,21 @@ def read(where: Place) -> bytes:
         return data
 
 
+def fetch(where: UPath, folder: Path) -> Path:
+    """Copy a file of a bucket, and those beside it that belong to it, into a folder; return the copy.
+
+    Raises
+    ------
+    OSError
+        If it is not there, or the storage does not answer.
+    """
+    for name in {where.name, *namesakes(where)}:
+        source = where.parent / name
+        with named(source):
+            source.fs.get_file(source.path, str(folder / name))
+    return folder / where.name
+
+
 def write(where: Place, data: bytes) -> None:
     """Write a file whole or not at all: renamed when it is whole, or by one request.
 
@@ -359,6 +374,7 @@ def _s3_options() -> dict[str, Any]:
 @contextlib.contextmanager
 def named(where: UPath) -> Iterator[None]:
     """Turn what goes wrong with object storage into an OSError that names the file."""
+    from aiohttp import ClientError
     from botocore.exceptions import BotoCoreError
 
     try:
@@ -366,5 +382,5 @@ def named(where: UPath) -> Iterator[None]:
     except OSError as error:
         number = error.errno or next((n for kind, n in _NUMBERS if isinstance(error, kind)), errno.EIO)
         raise OSError(number, error.strerror or str(error), str(where)) from error
-    except BotoCoreError as error:
+    except (BotoCoreError, ClientError) as error:
         raise OSError(errno.EIO, str(error), str(where)) from error

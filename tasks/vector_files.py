@@ -1,7 +1,8 @@
 """Features of a vector file near a tile: one spatial index per file and process, not one reading per tile.
 
 Files with an index of their own (GeoPackage, FlatGeobuf) are read by large squares, of which a process keeps
-a few: memory does not grow with the file. Others (GeoJSON, OSM) are read once, as a whole.
+a few: memory does not grow with the file. Others (GeoJSON, OSM) are read once, as a whole. A file in a
+bucket is copied once per process: read where it is, a GeoPackage asks hundreds of times.
 """
 
 from __future__ import annotations
@@ -11,16 +12,21 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 import shapely
 from pyproj.exceptions import ProjError
+from upath import UPath
 
 from catalog.crs import short, transformer
 from catalog.errors import CatalogError
 from catalog.grid import Bounds
-from catalog.places import Place, Seen, gdal_name, gdal_options, stat
+from catalog.places import Place, Seen, fetch, stat
 from tasks.errors import TaskError
 
 SQUARE_M = 4000.0
@@ -112,8 +118,8 @@ def _layers(asked: Asked, version: Seen) -> tuple[_Layer, ...]:
     import pyogrio
 
     try:
-        pyogrio.set_gdal_config_options(gdal_options())
-        kinds = dict(pyogrio.list_layers(gdal_name(asked.path)))
+        file = _file(asked, version)
+        kinds = dict(pyogrio.list_layers(file))
         # Styles and other tables may lie beside the features.
         spatial = [name for name, kind in kinds.items() if kind is not None]
         names = [asked.layer] if asked.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
@@ -121,10 +127,34 @@ def _layers(asked: Asked, version: Seen) -> tuple[_Layer, ...]:
             raise _fault(asked, f"has no layer {asked.layer!r}; there are {', '.join(kinds)}")
         if not names or (len(names) > 1 and names != list(OSM)):
             raise _fault(asked, f"has the layers {', '.join(kinds)}; name one with segment.layer")
-        file = gdal_name(asked.path)
         return tuple(_described(asked, name, pyogrio.read_info(file, layer=name)) for name in names)
     except (RuntimeError, ValueError) as error:
         raise _fault(asked, f"cannot be read as vectors: {error}") from error
+
+
+def _file(asked: Asked, version: Seen) -> Path:
+    """Return the file, or a copy of one in a bucket."""
+    if isinstance(asked.path, Path):
+        return asked.path
+    try:
+        return _copied(asked.path, version).path
+    except OSError as error:
+        raise _fault(asked, f"cannot be read: {error.strerror}; run again") from error
+
+
+class _Copy:
+    """A copy of a file in a bucket, which goes when it is forgotten."""
+
+    def __init__(self, path: UPath) -> None:
+        folder = Path(mkdtemp(prefix="flexroad-"))
+        finalize(self, rmtree, folder, ignore_errors=True)
+        self.path = fetch(path, folder)
+
+
+@lru_cache(maxsize=KEPT)
+def _copied(path: UPath, version: Seen) -> _Copy:
+    """Return a copy of that version."""
+    return _Copy(path)
 
 
 def _described(asked: Asked, name: str, info: Any) -> _Layer:
@@ -150,7 +180,7 @@ def _part(asked: Asked, version: Seen, layer: _Layer, square: Bounds | None) -> 
     """Return a layer's features, or those that touch a square of the tiles' plane, with their index."""
     try:
         bbox = square and transformer(asked.crs, layer.crs).transform_bounds(*square, densify_pts=21)
-        found = _read(asked, layer, bbox)
+        found = _read(asked, _file(asked, version), layer, bbox)
         if found.crs is None:
             found = found.set_crs(layer.crs)
         found = found.to_crs(asked.crs)
@@ -164,12 +194,12 @@ def _part(asked: Asked, version: Seen, layer: _Layer, square: Bounds | None) -> 
     return _unpacked(found[there], asked.columns)
 
 
-def _read(asked: Asked, layer: _Layer, bbox: Bounds | None) -> Any:
+def _read(asked: Asked, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
     import pyogrio
 
     def read(**more: str) -> Any:
         return pyogrio.read_dataframe(
-            gdal_name(asked.path),
+            file,
             layer=layer.name,
             columns=list(layer.columns),
             where=layer.where,

@@ -7,8 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from PIL import Image
+from shapely import LineString
 
-from catalog import Catalog, places
+from catalog import Catalog, Grid, places
 from catalog.places import place
 from pipeline import codec
 from pipeline.cli import main
@@ -20,7 +22,12 @@ from pipeline.report import write_report
 from pipeline.run import Run, execute
 from pipeline.summary import read_summary, summary
 from pipeline.tables import read_metrics
+from tasks import TaskError
+from tasks.photo import read_photo
+from tasks.types import Source
+from tasks.vector_files import Asked, near
 from tests.conftest import QUICK
+from tests.make_roads import write as write_roads
 from tests.s3_server import Fault
 
 LIGHT = {"variants": {"plane": {"fit": "plane", "sample": "corners"}}}
@@ -213,6 +220,44 @@ def test_a_missing_source_is_named_by_its_address(run):
     assert failure.file == str(file)
     assert "is missing" in failure.message
     assert (how.done, how.failed) == (3, 1)
+
+
+def test_a_photo_with_a_world_file_is_placed_as_on_disk(bucket, tmp_path):
+    grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 40, 40)
+    grey = np.random.default_rng(0).integers(0, 255, (80, 80), np.uint8)
+    photo = tmp_path / "dop.tif"
+    Image.fromarray(grey).save(photo)
+    photo.with_suffix(".tfw").write_text("0.5\n0\n0\n-0.5\n295500.25\n5629499.75\n")
+    for file in (photo, photo.with_suffix(".tfw")):
+        places.write(bucket / file.name, file.read_bytes())
+    theirs, ours = (
+        read_photo(Source("dop", (home / "dop.tif",), grid.crs), grid) for home in (tmp_path, bucket)
+    )
+    assert ours.known.all()
+    assert np.array_equal(ours.colour, theirs.colour)
+
+
+def test_roads_in_a_bucket_are_those_on_disk(made_survey, survey, storage, tmp_path):
+    crs, bounds = "EPSG:25832", (499900.0, 5599900.0, 500200.0, 5600200.0)
+    homes = (made_survey, survey.parent)
+    asked = [Asked(home / "roads.gpkg", None, None, ("highway", "width"), None, crs) for home in homes]
+    storage.fail(Fault("half", "GET", "gpkg", first=1))
+    theirs, ours = (near(each, bounds) for each in asked)
+    assert len(ours) > 3
+    assert ours.equals(theirs)
+    # Another version is another file; one that cannot be had is a fault of one line.
+    write_roads(tmp_path / "one.gpkg", [LineString([(500000, 5600000), (500050, 5600000)])], width=[6])
+    places.write(asked[1].path, (tmp_path / "one.gpkg").read_bytes())
+    assert len(near(asked[1], bounds)) == 1
+    for answer in ("error", "half"):
+        places.write(asked[1].path, answer.encode())
+        storage.fail(Fault(answer, "GET", "gpkg"))
+        with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be read: .*; run again"):
+            near(asked[1], bounds)
+    storage.fail()
+    places.remove(asked[1].path)
+    with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be opened .no such file.; put it back"):
+        near(asked[1], bounds)
 
 
 def test_a_damaged_artefact_is_made_anew(run, local):
