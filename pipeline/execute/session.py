@@ -17,11 +17,13 @@ from typing import Generic
 
 from dask.utils import format_bytes
 from distributed import Client, Future
+from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
 from pipeline.errors import ClusterLost, ConfigError
 from pipeline.execute.executor import J, R
-from pipeline.execute.workers import Unfit, work
+from pipeline.execute.scheduler import carrier
+from pipeline.execute.workers import work
 
 TICK_S = 1.0
 """How long nothing must happen before one looks whether scheduler and workers are there."""
@@ -90,6 +92,7 @@ class Session(Generic[J, R]):
         self.flying: dict[Future, Flight[J]] = {}
         self.landed: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self.numbers = count(1)
+        self.carry = carrier()
         self.crew: dict[str, int] = {}
         """Threads by worker, as they were at ``looked``."""
         self.looked = 0.0
@@ -140,9 +143,8 @@ class Session(Generic[J, R]):
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
         # Numbered: a key that failed must not come back. Not pure: the store knows what is done already.
         future = self.client.submit(
-            work,
-            self.function,
-            flight.job,
+            self.carry,
+            dumps((work, self.function, flight.job)),
             self.guard,
             key=f"{name}-{self.guard}-{next(self.numbers)}",
             pure=False,
@@ -195,8 +197,6 @@ class Session(Generic[J, R]):
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be set to give up what waits for workers; patience is this side's.
             self._put_back(flight)
-        elif isinstance(error, Unfit):
-            raise ConfigError(str(error))
         elif future.status == "error":
             future.result()
         elif future.status == "finished":
@@ -207,7 +207,7 @@ class Session(Generic[J, R]):
 
     def _fetched(self, future: Future, flight: Flight[J]) -> Iterator[R]:
         try:
-            result = future.result()
+            fault, result = future.result()
         except KilledWorker as error:
             # The worker died between doing the job and handing over the result.
             yield from self._died(flight, error)
@@ -215,6 +215,8 @@ class Session(Generic[J, R]):
             self._put_back(flight)
             raise SchedulerGone from error
         else:
+            if fault:
+                raise ConfigError(fault)
             yield result
 
     def _died(self, flight: Flight[J], error: KilledWorker) -> Iterator[R]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from threading import Lock
 from typing import Any
 
-from distributed import WorkerPlugin, get_worker
+from distributed import WorkerPlugin
 
 from pipeline import ONE_THREAD
 from pipeline.execute.executor import J, R
@@ -21,10 +21,6 @@ PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """What must be alike for messages to be understood; also on the scheduler."""
 RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torch")
 """What must be alike for tiles to come out alike."""
-
-
-class Unfit(Exception):
-    """A worker must not do tiles; one line says which worker, what is wrong and the remedy."""
 
 
 class Guard(WorkerPlugin):  # type: ignore[misc]
@@ -50,12 +46,12 @@ class Guard(WorkerPlugin):  # type: ignore[misc]
 
     def setup(self, worker: Any) -> None:
         """Prepare a worker of now, or one that joins later."""
-        if self.deaf:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-        pin_threads()
         self.address: str = worker.address
         self._lock = Lock()
         self._fault: str | None = None
+        if self.deaf:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        pin_threads()
 
     @property
     def fault(self) -> str:
@@ -81,17 +77,8 @@ class Guard(WorkerPlugin):  # type: ignore[misc]
         return ""
 
 
-def work(function: Callable[[J], R], job: J, guard: str) -> R:
-    """Do one job on a worker, if it is fit to.
-
-    Raises
-    ------
-    Unfit
-        If versions or store are not what they must be.
-    """
-    watch: Guard = get_worker().plugins[guard]
-    if watch.fault:
-        raise Unfit(watch.fault)
+def work(function: Callable[[J], R], job: J) -> R:
+    """Do one job on a worker that is fit to."""
     # Some libraries count threads by thread, and this may be another than the last time.
     pin_threads()
     return function(job)

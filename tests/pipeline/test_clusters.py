@@ -350,7 +350,9 @@ def test_slurm_is_asked_for_workers_and_released(tmp_path, monkeypatch):
     pytest.importorskip("dask_jobqueue")
     jobs = tmp_path / "jobs"
     commands = {
-        "sbatch": f'setsid bash "$1" >{tmp_path}/said 2>&1 &\necho $! >>{jobs}\necho Submitted batch job $!',
+        # Copied first, as SLURM does: who hands it in removes it at once.
+        "sbatch": f'cp "$1" {jobs}.sh; setsid bash {jobs}.sh >/dev/null 2>&1 &\n'
+        f"echo $! >>{jobs}; echo Submitted batch job $!",
         "scancel": 'kill -- -"$1"',
     }
     for name, text in commands.items():
