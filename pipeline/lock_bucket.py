@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -11,8 +12,8 @@ from upath import UPath
 from catalog.places import named, read, remove
 from pipeline.lock_file import Sight
 
-REFUSED = (404, 409, 412)
-"""Answers to a conditional request: nothing there, another came in between, a condition not met."""
+REFUSED = (409, 412)
+"""Answers to a conditional request: another came in between, a condition not met."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,10 @@ class InBucket:
 
     def create(self, data: bytes) -> bool:
         """Make it; False if there is one."""
-        return self._put(data, IfNoneMatch="*")
+        try:
+            return self._put(data, REFUSED, IfNoneMatch="*")
+        except FileNotFoundError as error:
+            raise OSError(errno.EIO, "there is no such bucket", str(self.path)) from error
 
     def look(self) -> Sight | None:
         """Return it, or None if there is none."""
@@ -41,7 +45,7 @@ class InBucket:
 
     def replace(self, seen: Sight, data: bytes) -> bool:
         """Put another in its place; False if it is no longer the one seen."""
-        return self._put(data, IfMatch=seen.version)
+        return self._put(data, (404, *REFUSED), IfMatch=seen.version)
 
     def beat(self, seen: Sight) -> None:
         """Renew its time."""
@@ -52,12 +56,12 @@ class InBucket:
         # Not every storage knows conditions on that; only who was silent for minutes can have lost it since.
         remove(self.path)
 
-    def _put(self, data: bytes, **condition: str) -> bool:
+    def _put(self, data: bytes, refusals: tuple[int, ...], **condition: str) -> bool:
         try:
             with named(self.path):
                 self.path.fs.pipe_file(self.path.path, data, **condition)
         except OSError as error:
-            if _status(error) in REFUSED:
+            if _status(error) in refusals:
                 return False
             raise
         return True

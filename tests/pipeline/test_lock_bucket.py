@@ -118,3 +118,12 @@ def test_a_bucket_that_is_not_there_is_said(run):
 def _time(run):
     assert Holder.of(read(run / "lock.json"))
     return run.fs.info((run / "lock.json").path)["LastModified"]
+
+
+def test_a_bucket_that_is_not_there_is_named(run):
+    nowhere = place("s3://nowhere/run")
+    with (
+        pytest.raises(ConfigError, match=r"cannot write the run to s3://nowhere/run: .*no such bucket"),
+        held(nowhere),
+    ):
+        pass
