@@ -33,3 +33,15 @@ def test_the_command_lines_of_the_docs_run(tmp_path):
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_every_fault_has_the_test_that_the_table_names():
+    table = (ROOT / "docs" / "operations.md").read_text().split("## Faults")[1].split("\n## ")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) > 15
+    for row in rows:
+        named = re.findall(r"`(test_\w+\.py)::(test_\w+)`", row)
+        assert named, row
+        for file, test in named:
+            there = any(f"def {test}(" in path.read_text() for path in (ROOT / "tests").rglob(file))
+            assert there, f"no {file} has {test}"

@@ -1,0 +1,189 @@
+"""Runs as an operator has them: the same command every night, who hears of what went wrong, tidying up."""
+
+import json
+import os
+import shutil
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from catalog import Catalog
+from pipeline.cli import main
+from pipeline.lock import held
+
+QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
+
+
+@pytest.fixture(autouse=True)
+def same_signals():
+    """A command takes some signals over; here it is no process of its own."""
+    before = {which: signal.getsignal(which) for which in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for which, handler in before.items():
+        signal.signal(which, handler)
+
+
+@pytest.fixture
+def flexroad(monkeypatch, capfd):
+    """Run a command line; return what it wrote to both outputs, its exit code checked."""
+
+    def call(*words, expect: int = 0) -> str:
+        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
+        code = 0
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code or 0
+        out, err = capfd.readouterr()
+        assert code == expect, out + err
+        return out + err
+
+    return call
+
+
+@pytest.fixture
+def nightly(survey, tmp_path) -> list:
+    """The words of a run of four tiles of one's own, in RUN = tmp_path / "run"."""
+    config = tmp_path / "quick.yaml"
+    config.write_text(QUICK)
+    return ["run", "--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
+
+
+@pytest.fixture
+def alarm(tmp_path):
+    """An alarm that writes down what it is told, and what that was."""
+
+    class Alarm:
+        words = ("--on-failure", f"cat > {tmp_path}/told.json")
+
+        @property
+        def told(self):
+            path = tmp_path / "told.json"
+            found = json.loads(path.read_text()) if path.exists() else None
+            path.unlink(missing_ok=True)
+            return found
+
+    return Alarm()
+
+
+def test_every_night_tells_what_is_new_changed_and_vanished(flexroad, nightly, survey, alarm, tmp_path):
+    whole = Catalog.read(survey)
+    Catalog(whole.tiles[:3]).write(survey)
+    said = flexroad(*nightly, *alarm.words)
+    assert "3 tiles: 3 done (0 cached), 0 failed, 0 pending; 3 new, 0 changed, 0 vanished; " in said
+    Catalog(whole.tiles[1:]).write(survey)
+    os.utime(whole.tiles[1].paths(whole.tiles[1].layer("dsm"))[0], (1, 1))
+    said = flexroad(*nightly, *alarm.words)
+    assert "3 tiles: 3 done (1 cached), 0 failed, 0 pending; 1 new, 1 changed, 1 vanished; " in said
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["exit_code"], summary["new"], summary["cached"]) == (0, 1, 1)
+    # Of the same size, but not the bytes that its marker vouches for.
+    product = next((tmp_path / "run" / "tiles" / whole.tiles[2].id).glob("*.glb"))
+    data = bytearray(product.read_bytes())
+    data[-1] ^= 1
+    product.write_bytes(data)
+    assert "3 done (3 cached)" in flexroad(*nightly)
+    assert "3 done (2 cached)" in flexroad(*nightly, "--verify")
+    assert alarm.told is None
+    states = json.loads((tmp_path / "run" / "tiles.geojson").read_text())["features"]
+    assert [state["properties"]["state"] for state in states] == ["cached", "done", "cached"]
+
+
+def test_a_failed_tile_rings_the_alarm_and_is_on_the_map(flexroad, nightly, survey, alarm, tmp_path):
+    tiles = Catalog.read(survey).tiles[:2]
+    Catalog(tiles).write(survey)
+    tiles[1].paths(tiles[1].layer("dtm"))[0].unlink()
+    flexroad(*nightly, *alarm.words, "--prometheus", tmp_path / "run.prom", expect=1)
+    told = alarm.told
+    assert (told["exit_code"], told["failed"], told["interrupted"]) == (1, 1, False)
+    assert told["failures"][0]["tile_id"] == tiles[1].id
+    assert "2 tiles: 1 done (0 cached), 1 failed" in told["text"]
+    flexroad("status", tmp_path / "run", "--geojson", tmp_path / "map.geojson")
+    states = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    assert [state["properties"]["state"] for state in states] == ["done", "failed"]
+    families = text_string_to_metric_families((tmp_path / "run.prom").read_text())
+    values = {sample.name: sample.value for family in families for sample in family.samples}
+    assert (values["flexroad_run_exit_code"], values["flexroad_run_running"]) == (1, 0)
+
+
+def test_the_alarm_rings_when_nothing_could_start(flexroad, nightly, alarm, tmp_path, monkeypatch):
+    said = flexroad(*nightly, *alarm.words, "--executor", "x", expect=2)
+    told = alarm.told
+    assert told["exit_code"] == 2
+    assert "could not start: --executor x: there are dask and serial" in told["text"]
+    assert "dask and serial" in said
+    # A run before this one tells nothing of it.
+    assert "tiles" not in told
+    with held(tmp_path / "run"):
+        flexroad(*nightly, *alarm.words, expect=2)
+    assert f"is in use by pid {os.getpid()}" in alarm.told["text"]
+    flexroad(*nightly, "--wrokers", 2, *alarm.words, expect=2)
+    assert "the command line could not be read" in alarm.told["text"]
+    monkeypatch.setenv("FLEXROAD_ON_FAILURE", alarm.words[1])
+    flexroad("rerun", tmp_path / "nowhere", expect=2)
+    assert "is no run" in alarm.told["text"]
+    flexroad("status", tmp_path / "nowhere", "--wach", expect=2)
+    assert alarm.told is None
+
+
+def test_an_interruption_rings_the_alarm_and_a_broken_alarm_changes_nothing(
+    flexroad, nightly, alarm, monkeypatch
+):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.run.execute", interrupted)
+    said = flexroad(*nightly, *alarm.words, expect=130)
+    assert "interrupted; the same command goes on from here" in said
+    assert alarm.told["exit_code"] == 130
+    said = flexroad(*nightly, "--on-failure", "exit 9", expect=130)
+    assert "warning: --on-failure: `exit 9` ended with exit code 9" in said
+
+
+def test_a_catalog_names_only_what_is_allowed_and_rerun_remembers(flexroad, nightly, survey, tmp_path):
+    tile = Catalog.read(survey).tiles[0]
+    (tmp_path / "dtm").mkdir()
+    shutil.move(tile.paths(tile.layer("dtm"))[0], tmp_path / "dtm" / "a.tif")
+    files = {"dtm": (str(tmp_path / "dtm" / "a.tif"),)}
+    layers = tuple(replace(layer, files=files.get(layer.name, layer.files)) for layer in tile.layers)
+    Catalog((replace(tile, layers=layers),)).write(survey)
+    said = flexroad(*nightly, expect=2)
+    option = f"--allow {tmp_path / 'dtm'}"
+    assert option in said
+    flexroad(*nightly, *option.split())
+    flexroad("rerun", tmp_path / "run", "--executor", "serial")
+    record = tmp_path / "run" / "run.json"
+    record.write_text(record.read_text().replace(str(tmp_path / "dtm"), str(tmp_path / "other")))
+    assert option in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
+
+
+def test_clean_names_what_it_would_drop_then_drops_it(flexroad, nightly, survey, tmp_path):
+    tiles = Catalog.read(survey).tiles
+    Catalog(tiles[:2]).write(survey)
+    flexroad(*nightly)
+    Catalog(tiles[:1]).write(survey)
+    flexroad(*nightly)
+    said = flexroad("clean", tmp_path / "run", "--dry-run")
+    *named, artefacts, files, total = said.splitlines()
+    assert artefacts.startswith("artefacts that no run needs: ")
+    assert files.startswith("files of tiles that the catalog no longer has: ")
+    assert total.startswith(f"would free {len(named)} files, ")
+    assert all(Path(name).exists() for name in named)
+    assert f"freed {len(named)} files, " in flexroad("clean", tmp_path / "run")
+    assert not any(Path(name).exists() for name in named)
+    assert flexroad("clean", tmp_path / "run") == "freed 0 files, 0.0 MB\n"
+    assert "no run of the store" in flexroad("clean", tmp_path / "run", "--forget", "x", expect=2)
+    assert "1 done (1 cached)" in flexroad(*nightly)
+
+
+def test_status_tells_who_is_at_work(flexroad, nightly, survey, tmp_path):
+    Catalog(Catalog.read(survey).tiles[:1]).write(survey)
+    flexroad(*nightly)
+    assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"] is None
+    with held(tmp_path / "run"):
+        assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"]["pid"] == os.getpid()
+        assert f"pid {os.getpid()} on" in flexroad("status", tmp_path / "run")
