@@ -176,21 +176,24 @@ class Sightings:
             If the storage does not answer.
         """
         if not isinstance(where, Path):
-            return self._folder(where).get(where.name)
+            # Its own ways to parent and name take as long as all the rest.
+            folder, _, name = where.path.rpartition("/")
+            if folder not in self._folders:
+                self._folders[folder] = _listed(where.parent)
+            return self._folders[folder].get(name)
         if where not in self._files:
             self._files[where] = stat(where)
         return self._files[where]
 
-    def _folder(self, where: UPath) -> dict[str, Seen]:
-        folder = where.parent
-        if str(folder) not in self._folders:
-            try:
-                with named(folder):
-                    there = {found["name"]: found for found in folder.fs.ls(folder.path, detail=True)}
-            except FileNotFoundError:
-                there = {}
-            self._folders[str(folder)] = _files(folder, there)
-        return self._folders[str(folder)]
+
+def _listed(folder: UPath) -> dict[str, Seen]:
+    """Return the files in a folder of a bucket, but not those in folders within."""
+    try:
+        with named(folder):
+            there = {found["name"]: found for found in folder.fs.ls(folder.path, detail=True)}
+    except FileNotFoundError:
+        return {}
+    return _files(folder, there)
 
 
 def namesakes(where: UPath) -> set[str]:
@@ -270,42 +273,6 @@ def write(where: Place, data: bytes) -> None:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def create(where: Place, data: bytes) -> None:
-    """Write a file that is not there yet; of several who try at once, one does.
-
-    Raises
-    ------
-    FileExistsError
-        If it is there.
-    OSError
-        If it cannot be written.
-    """
-    if isinstance(where, Path):
-        where.parent.mkdir(parents=True, exist_ok=True)
-        with where.open("xb") as file:
-            file.write(data)
-        return
-    with named(where):
-        where.fs.pipe_file(where.path, data, mode="create")
-
-
-def modified(where: Place) -> float | None:
-    """Return when a file was last written (s since 1970) by the storage's own clock, or None without one.
-
-    Raises
-    ------
-    OSError
-        If the storage does not answer.
-    """
-    try:
-        if isinstance(where, Path):
-            return where.stat().st_mtime
-        with named(where):
-            return float(where.fs.modified(where.path).timestamp())
-    except FileNotFoundError:
-        return None
 
 
 def remove(where: Place) -> None:

@@ -50,13 +50,6 @@ def test_what_is_missing_is_named(folder):
     assert places.listing(folder) == {}
 
 
-def test_of_those_who_create_a_file_one_does(folder):
-    places.create(folder / "lock", b"mine")
-    with pytest.raises(FileExistsError):
-        places.create(folder / "lock", b"theirs")
-    assert places.read(folder / "lock") == b"mine"
-
-
 def test_a_place_says_what_it_was_called(tmp_path, bucket):
     assert place(str(tmp_path)) == tmp_path
     assert type(place(str(tmp_path))) is type(tmp_path)
