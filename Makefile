@@ -36,7 +36,8 @@ TRUE := $(REPRODUCED)/true
 endif
 SURVEY := $(REPRODUCED)/survey/catalog.parquet
 RESULTS ?= $(REPRODUCED)/results
-ABLATE = $(BIN)/flexroad run --catalog $(SURVEY) --store $(REPRODUCED)/store
+# The published dataset lies elsewhere than its catalog.
+ABLATE = $(BIN)/flexroad run --catalog $(SURVEY) $(if $(GEROD_ROOT),--allow $(GEROD_ROOT)) --store $(REPRODUCED)/store
 # DSC3D cannot be had as rasters: five made scenes stand in for it, by the paper's reference and by the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet

@@ -43,6 +43,7 @@ def test_real_tiles_take_the_place_of_made_ones(tmp_path):
     catalog, _, run, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
     assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
     assert "ablation" in run
+    assert run[run.index("--allow") + 1] == "/data/gerod"
     assert "--true" not in tables
 
 
