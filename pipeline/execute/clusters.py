@@ -193,8 +193,8 @@ def _line(error: Exception) -> str:
 
 
 def _environment() -> dict[str, str]:
-    memory = {f"DASK_{key.replace('.', '__').upper()}": str(value) for key, value in MEMORY.items()}
-    return ONE_THREAD | memory
+    settings = {f"DASK_{key.replace('.', '__').upper()}": str(value) for key, value in SETTINGS.items()}
+    return ONE_THREAD | settings
 
 
 def _extra(kind: str) -> Any:
