@@ -17,6 +17,7 @@ import sys
 import tempfile
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,11 +64,10 @@ def main(tiles: int = TILES, plot: Path | None = None) -> None:
         found, took = timed(lambda: rasters.index(folder, LAYERS, tile_size_m=TILE_M))
         Catalog(found.tiles).write(folder / "catalog.parquet")
         say("cut the catalog", took, side**2)
-        before = resident_mb(psutil.Process())
         catalog, took = timed(lambda: Catalog.read(folder / "catalog.parquet"))
         say("read the catalog", took, side**2)
-        held = (resident_mb(psutil.Process()) - before) / side**2
-        print(f"  in memory {1024 * held:.1f} KB a tile, {held * STATE / 1024:.1f} GB for {STATE:,}")
+        held = kept(lambda: Catalog.read(folder / "catalog.parquet")) / side**2
+        print(f"  in memory {held / 2**10:.1f} KB a tile, {held * STATE / 2**30:.1f} GB for {STATE:,}")
         config = compose(CONFIG, "scale")
         run, took = timed(lambda: Run.create(folder / "RUN", config, catalog))
         say("make the run", took, side**2)
@@ -264,6 +264,16 @@ def flexroad(folder: Path, words: list[str]) -> None:
         check=True,
         capture_output=True,
     )
+
+
+def kept(act: Callable[[], Any]) -> int:
+    """Return how many bytes a result holds."""
+    tracemalloc.start()
+    found = act()
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    del found
+    return size
 
 
 def timed(act: Callable[[], Any]) -> tuple[Any, float]:
