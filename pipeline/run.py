@@ -14,12 +14,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import platform
 import time
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -219,11 +220,11 @@ def execute(
         stock = None
         try:
             stock = take_stock(run, ledger, only, anew, watch, verify)
-            probe = partial(check_writable, run.store)
-            for result in executor.map(do_tile, _jobs(run, stock, anew), _lost, probe):
-                ledger.record(result.entry)
-                journal.tile(result)
-                watch(result)
+            with contextlib.closing(_results(run, executor, ledger, _jobs(run, stock, anew))) as results:
+                for result in results:
+                    ledger.record(result.entry)
+                    journal.tile(result)
+                    watch(result)
         except BaseException as error:
             # What is done is in the tables.
             close(stock, interrupted=isinstance(error, KeyboardInterrupt))
@@ -269,6 +270,30 @@ def _jobs(run: Run, stock: Stock, anew: frozenset[str]) -> Iterator[Job]:
     for position in stock.todo:
         # Made a second time: thousands kept since the stocktaking would fill the memory, and be old by now.
         yield run.job(run.graph(run.catalog.tiles[position], look), anew)
+
+
+def _results(
+    run: Run, executor: Executor, ledger: Ledger, jobs: Iterator[Job]
+) -> Generator[TileResult, None, None]:
+    """Yield what tiles come to; at the end record those that got done although nobody heard of it."""
+    flying: dict[str, Tile] = {}
+
+    def noted() -> Iterator[Job]:
+        for job in jobs:
+            flying[job.graph.tile.id] = job.graph.tile
+            yield job
+
+    found = executor.map(do_tile, noted(), _lost, partial(check_writable, run.store))
+    try:
+        for result in found:
+            flying.pop(result.tile_id)
+            yield result
+    finally:
+        # Interrupted: first nobody works any more, then what lies there counts.
+        found.close()
+        for stand in stands(run, ledger, flying.values()):
+            if stand.known and stand.unknown:
+                ledger.record(stand.known)
 
 
 def _close(

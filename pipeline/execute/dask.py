@@ -7,7 +7,7 @@ import logging
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +61,7 @@ class DaskExecutor:
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
-    ) -> Iterator[R]:
+    ) -> Generator[R, None, None]:
         """Yield results as tiles finish."""
         queue = iter(jobs)
         first = list(islice(queue, 1))

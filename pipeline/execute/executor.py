@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import Protocol, TypeVar
 
 J = TypeVar("J")
@@ -18,7 +18,7 @@ class Executor(Protocol):
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
-    ) -> Iterator[R]:
+    ) -> Generator[R, None, None]:
         """Yield results as they come, in any order, with a bounded number of jobs in flight.
 
         Parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 
 from pipeline.execute.executor import J, R
 
@@ -16,7 +16,7 @@ class SerialExecutor:
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
-    ) -> Iterator[R]:
+    ) -> Generator[R, None, None]:
         """Yield results in the jobs' order; whoever calls has probed this process already."""
         for job in jobs:
             yield function(job)
