@@ -35,7 +35,7 @@ MEANING: dict[Kind, str] = {
     "tiles": "files of tiles that the catalog no longer has",
     "temporary files": "temporary files of writers that were killed",
 }
-TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp|\.probe-\d+")
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp|\.probe-[0-9a-f]{32}")
 ARTEFACT = re.compile(r"([0-9a-f]{32})\.npz")
 
 

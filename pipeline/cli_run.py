@@ -265,12 +265,12 @@ def status(
     every: Annotated[float, typer.Option(min=0.1, help="With --watch: how often to look (s).")] = 2,
 ) -> None:
     """Tell how a run stands, and what failed why."""
-    from catalog.places import place
+    from catalog.places import exists, place
     from pipeline.run import Run
 
     where = place(path)
-    opened = Run.open(where)
-    if watch:
+    # Not opened for a look at its ledger: that reads the catalog.
+    if watch and exists(where / "run.json"):
         from rich.console import Console
 
         from pipeline.follow import follow
@@ -278,6 +278,7 @@ def status(
         with contextlib.suppress(KeyboardInterrupt):
             follow(where, Console(), every)
         return
+    opened = Run.open(where)
     if geojson is not None:
         from pipeline.states import write_states
 
