@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import logging
-import os
 import shutil
 import sys
 import tempfile
@@ -80,10 +79,12 @@ def opened(cluster: Cluster, workers: int | None, scheduler: str | None, dashboa
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
     """Return processes of one thread on this machine."""
+    from dask.system import CPU_COUNT
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
-    workers = cluster.workers or os.cpu_count() or 1
+    # As far as a container may use them.
+    workers = cluster.workers or CPU_COUNT
     return LocalCluster(
         n_workers=workers,
         threads_per_worker=1,

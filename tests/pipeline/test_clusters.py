@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import islice
 from pathlib import Path
 
 import cloudpickle
@@ -315,16 +316,18 @@ def kept(dask_scheduler) -> list[str]:
     return [*dask_scheduler.tasks, *dask_scheduler.worker_plugins, *dask_scheduler.plugins]
 
 
-def test_nothing_of_a_run_stays_on_a_cluster(running):
+@pytest.mark.parametrize("wanted", [20, 1], ids=["whole", "interrupted"])
+def test_nothing_of_a_run_stays_on_a_cluster(running, wanted):
     from distributed import Client
 
     with Client(running.address, set_as_default=False) as client:
         before = client.run_on_scheduler(kept)
-        during = []
-        for _ in DaskExecutor(scheduler=running.address).map(double, range(3), lost):
-            during.append(client.run_on_scheduler(kept))
-        assert len(during[0]) > len(before)
-        assert client.run_on_scheduler(kept) == before
+        results = DaskExecutor(scheduler=running.address).map(slow, range(20), lost)
+        next(results)
+        assert len(client.run_on_scheduler(kept)) > len(before)
+        assert len(list(islice(results, wanted - 1))) == wanted - 1
+        results.close()
+        until(lambda: client.run_on_scheduler(kept) == before)
 
 
 def test_the_section_reaches_slurm():
