@@ -97,9 +97,11 @@ def waste(runs: Sequence[Run]) -> Iterator[Waste]:
     needed = _needed(runs)
     yield from _in_store(first.store, needed)
     yield from _in_tiles(first)
-    if isinstance(first.path, Path):
-        files = [path for path in first.path.glob(".*") if path.is_file()]
-        yield from _temporary(first.path, {path.name: path.stat().st_size for path in files})
+    for folder in (first.path, first.store):
+        # A bucket knows no temporary names.
+        if isinstance(folder, Path):
+            files = [path for path in folder.glob(".*") if path.is_file()]
+            yield from _temporary(folder, {path.name: path.stat().st_size for path in files})
 
 
 def drop(found: Iterable[Waste]) -> Iterator[Waste]:

@@ -136,7 +136,7 @@ def test_foreign_files_stay_and_those_of_killed_writers_go(made, tmp_path):
         folder / f".{name}.{'0a' * 16}.tmp"
         for folder, name in ((run.path, "metrics.parquet"), (stage, old), (gone, "item.json"))
     ]
-    killed.append(run.path / f".probe-{'0a' * 16}")
+    killed += [folder / f".probe-{'0a' * 16}" for folder in (run.path, run.store)]
     for path in (*foreign, *killed):
         path.parent.mkdir(exist_ok=True, parents=True)
         path.write_text("x")
