@@ -14,25 +14,9 @@ ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+0
 QUICK = Pace(beat_s=0.05, stale_s=0.5)
 
 
-@pytest.fixture(scope="module")
-def server():
-    from moto.server import ThreadedMotoServer
-
-    made = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    made.start()
-    yield made
-    made.stop()
-
-
 @pytest.fixture
-def run(server, monkeypatch, request):
-    host, port = server.get_host_and_port()
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "test")
-    made = place("s3://runs/" + request.node.name.replace("[", "/").strip("]"))
-    made.fs.mkdirs("runs", exist_ok=True)
-    return made
+def run(bucket):
+    return bucket / "run"
 
 
 def test_one_holds_it_and_gives_it_back(run):
