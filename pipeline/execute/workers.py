@@ -9,7 +9,7 @@ import platform
 import signal
 import sys
 from collections.abc import Callable, Mapping
-from threading import Lock
+from threading import Lock, local
 from typing import Any
 
 from distributed import WorkerPlugin
@@ -21,6 +21,9 @@ PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """What must be alike for messages to be understood; also on the scheduler."""
 RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torch")
 """What must be alike for tiles to come out alike."""
+
+_here = local()
+"""What is known of the thread that does a job."""
 
 
 class Guard(WorkerPlugin):  # type: ignore[misc]
@@ -79,8 +82,10 @@ class Guard(WorkerPlugin):  # type: ignore[misc]
 
 def work(function: Callable[[J], R], job: J) -> R:
     """Do one job on a worker that is fit to."""
-    # Some libraries count threads by thread, and this may be another than the last time.
-    pin_threads()
+    if not hasattr(_here, "pinned"):
+        # Some libraries count by calling thread. Once is enough: what is loaded later reads the environment.
+        pin_threads()
+        _here.pinned = True
     return function(job)
 
 
