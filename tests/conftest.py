@@ -2,12 +2,15 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import yaml
 
 from pipeline import ONE_THREAD
+from pipeline.cli import main
 from pipeline.execute import DaskExecutor, SerialExecutor
 
 QUICK = {
@@ -19,6 +22,33 @@ QUICK = {
     },
 }
 """The paper's three variants with a light fit: tests of the machinery want no accuracy."""
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    @property
+    def errors(self) -> list[str]:
+        """The lines that tell of faults."""
+        return [line for line in self.err.splitlines() if line.startswith(("error: ", "failed "))]
+
+
+@pytest.fixture
+def flexroad(monkeypatch, capsys):
+    """The command line, in this process; no traceback ever."""
+
+    def call(*words) -> Said:
+        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = Said(int(end.value.code or 0), *capsys.readouterr())
+        assert "Traceback" not in said.err
+        return said
+
+    return call
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,40 +18,12 @@ from rasterio.warp import transform_bounds
 
 from catalog import Catalog, Grid, Tile
 from catalog.sources import prepared
-from pipeline.cli import main
 from pipeline.config import compose
 from pipeline.execute import SerialExecutor
 from pipeline.run import Run, execute
 from pipeline.tables import read_metrics
-from tests.conftest import QUICK
+from tests.conftest import QUICK, Said
 from tests.make_rasters import write
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def errors(self) -> list[str]:
-        """The lines that tell of faults."""
-        return [line for line in self.err.splitlines() if line.startswith(("error: ", "failed "))]
-
-
-@pytest.fixture
-def flexroad(monkeypatch, capsys):
-    """The command line, in this process; no traceback ever."""
-
-    def call(*words) -> Said:
-        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = Said(int(end.value.code or 0), *capsys.readouterr())
-        assert "Traceback" not in said.err
-        return said
-
-    return call
 
 
 @pytest.fixture

@@ -1,0 +1,419 @@
+"""Faults of a night: afterwards the same command gives what a run gives that nothing happens to.
+
+The faults that belong to one part are tested beside that part; `docs/operations.md` lists them all.
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import random
+import resource
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+import yaml
+
+from catalog import Catalog, places
+from pipeline.config import load_config
+from pipeline.execute import SerialExecutor
+from pipeline.lock import Holder, held
+from pipeline.run import Run, execute
+from pipeline.tables import read_metrics
+
+LIGHT = {
+    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
+    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
+}
+DAY_S = 86400
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("config") / "light.yaml"
+    path.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="module")
+def undisturbed(made_survey, config, tmp_path_factory) -> Path:
+    """A run that nothing happened to; not to be touched."""
+    catalog = Catalog.read(made_survey / "catalog.parquet")
+    run = Run.create(tmp_path_factory.mktemp("undisturbed") / "run", load_config(config), catalog)
+    execute(run, SerialExecutor())
+    return run.path
+
+
+@pytest.fixture
+def out(tmp_path) -> Path:
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def finished(undisturbed, out) -> Path:
+    """A finished run of one's own, to spoil."""
+    return shutil.copytree(undisturbed, out)
+
+
+@pytest.fixture
+def night(flexroad, config, made_survey, out):
+    """The command of every night."""
+
+    def call(*more, catalog=made_survey / "catalog.parquet"):
+        words = ["--config", config, "--catalog", catalog, "--out", out, "--executor", "serial"]
+        return flexroad("run", *words, *more)
+
+    return call
+
+
+def rows(out: Path) -> pd.DataFrame:
+    return read_metrics(out).drop(columns="seconds")
+
+
+def products(out: Path) -> dict[str, bytes]:
+    """The files of all tiles but their markers, which tell the time."""
+    return {
+        path.relative_to(out).as_posix(): path.read_bytes()
+        for path in out.glob("tiles/*/*")
+        if path.suffix != ".json"
+    }
+
+
+def times(out: Path) -> dict[str, int]:
+    """When each product, marker and artefact was written."""
+    paths = (path for part in ("tiles", "store") for path in (out / part).rglob("*") if path.is_file())
+    return {path.relative_to(out).as_posix(): path.stat().st_mtime_ns for path in paths}
+
+
+def assert_whole(out: Path, undisturbed: Path) -> None:
+    """The run is as if nothing had happened, and tidy."""
+    pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
+    assert products(out) == products(undisturbed)
+    assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
+    assert not [path for path in out.rglob("*") if path.suffix == ".tmp" or "probe" in path.name]
+    assert not (out / "lock.json").exists()
+
+
+def computed(out: Path, since: int = 0) -> Counter[str]:
+    """How many nodes of each stage the log says were computed, from some event on."""
+    events = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()][since:]
+    found = Counter[str]()
+    for event in events:
+        if event["event"] == "stage":
+            found[event["stage"]] += event["computed"]
+    return +found
+
+
+def events(out: Path) -> int:
+    return len((out / "log.jsonl").read_text().splitlines())
+
+
+@pytest.fixture
+def before_tile(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
+    """Make something happen in mid-run, before the n-th tile that is done."""
+
+    def arrange(n: int, happen: Callable[[], object]) -> None:
+        def map_(self, function, jobs, lost, probe=None):
+            for i, job in enumerate(jobs):
+                if i == n:
+                    happen()
+                yield function(job)
+
+        monkeypatch.setattr(SerialExecutor, "map", map_)
+
+    return arrange
+
+
+# --- files of a run -----------------------------------------------------------------------------------
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGES = {
+    "gone": Path.unlink,
+    # A power failure leaves names without bytes.
+    "empty": lambda path: path.write_bytes(b""),
+    "cut off": _cut,
+    "flipped": _flip,
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_files_of_a_run_are_damaged(seed, finished, undisturbed, night):
+    """A third of all files, each in some way; what is sound stays as it is."""
+    random_ = random.Random(seed)
+    damaged = set()
+    for path in sorted(path for path in finished.rglob("*") if path.is_file()):
+        name = path.relative_to(finished).as_posix()
+        # A flipped bit is told by a checksum; markers and the run's own small files have none.
+        summed = name.startswith(("store/", "tiles/")) and path.suffix != ".json"
+        how = random_.choice([how for how in DAMAGES if summed or how != "flipped"])
+        if random_.random() < 1 / 3:
+            DAMAGES[how](path)
+            damaged.add(name)
+    before = times(finished)
+    said = night("--verify")
+    assert said.code == 0, said
+    assert_whole(finished, undisturbed)
+    spoilt = {name.split("/")[1] for name in damaged if name.startswith("tiles/")}
+    after = times(finished)
+    for name, written in before.items():
+        kept = name.split("/")[1] not in spoilt if name.startswith("tiles/") else name not in damaged
+        assert not kept or after[name] == written, f"{name} was made again"
+
+
+def test_a_tile_folder_deleted_by_hand_costs_its_export(finished, undisturbed, night):
+    shutil.rmtree(min((finished / "tiles").iterdir()))
+    since = events(finished)
+    assert "4 done (3 cached)" in night().out
+    assert computed(finished, since) == {"export": 1}
+    assert_whole(finished, undisturbed)
+
+
+def test_a_run_that_was_moved_goes_on_where_it_is(finished, undisturbed, night, flexroad, tmp_path):
+    elsewhere = finished.rename(tmp_path / "elsewhere")
+    assert "nothing had changed" in flexroad("rerun", elsewhere, "--executor", "serial").out
+    assert_whole(elsewhere, undisturbed)
+    assert Run.open(elsewhere).store == elsewhere / "store"
+
+
+# --- disks --------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def no_file_above(size: int) -> Iterator[None]:
+    """Let every write fail in its middle that would make a file larger, as if the disk were full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextlib.contextmanager
+def obeying() -> Iterator[None]:
+    """Let permissions count in this thread, also for root, by giving up what lets root ignore them."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header, had = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, had) == 0
+    fewer = (ctypes.c_uint32 * 6)(*had)
+    # The effective ones of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
+    fewer[0] &= ~0b110
+    assert libc.capset(header, fewer) == 0
+    try:
+        yield
+    finally:
+        assert libc.capset(header, had) == 0
+
+
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        pytest.param(30_000, "ledger.sqlite", id="products and the ledger"),
+        pytest.param(40_000, "3 failed", id="products"),
+    ],
+)
+def test_a_disk_that_is_full_in_the_middle_of_a_write(
+    size, told, flexroad, night, undisturbed, config, made_survey, out
+):
+    Run.create(out, load_config(config), Catalog.read(made_survey / "catalog.parquet"))
+    with no_file_above(size):
+        said = flexroad("rerun", out, "--executor", "serial")
+    assert said.code == 1
+    assert told in said.out + said.err
+    failed = [line for line in said.errors if "File too large" in line]
+    assert failed
+    assert all(str(out) in line for line in failed)
+    assert not list(out.rglob("*.tmp"))
+    before = times(out)
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+    done = {name.split("/")[1] for name in before if name.endswith("item.json")}
+    after = times(out)
+    kept = [name for name in before if name.startswith("store/") or name.split("/")[1] in done]
+    assert kept
+    assert all(after[name] == before[name] for name in kept)
+
+
+def test_a_store_that_may_not_be_written_is_refused_before_anything(night, out, undisturbed, tmp_path):
+    store = tmp_path / "store"
+    store.mkdir(mode=0o555)
+    with obeying():
+        said = night("--store", store)
+    assert said.code == 2
+    (line,) = said.errors
+    assert f"cannot write the run to {out}" in line
+    assert f"Permission denied: '{store}" in line
+    assert "choose another --out or --store" in line
+    assert not list(out.iterdir())
+    store.chmod(0o755)
+    assert night("--store", store).code == 0
+    assert_whole(out, undisturbed)
+
+
+@pytest.mark.parametrize("part", ["store", ".", "tiles"])
+def test_what_becomes_unwritable_in_the_middle(part, night, before_tile, undisturbed, out):
+    folders: list[Path] = []
+
+    def shut() -> None:
+        folders.extend([out / part, *(path for path in (out / part).rglob("*") if path.is_dir())])
+        for folder in folders:
+            folder.chmod(0o555)
+
+    before_tile(2, shut)
+    with obeying():
+        said = night()
+    for folder in folders:
+        folder.chmod(0o755)
+    assert said.code == 1
+    assert said.errors
+    assert all(str(out) in line for line in said.errors)
+    if (out / "lock.json").exists():
+        # It could not be removed; by the next night this process would be gone.
+        gone = replace(Holder.me(), pid=2**22 + 1)
+        (out / "lock.json").write_bytes(gone.data)
+    before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
+    assert len(before) == 2
+    before_tile(9, folders.clear)
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+    assert all(path.stat().st_mtime_ns == written for path, written in before.items())
+
+
+def test_a_log_that_cannot_be_written_stops_nothing(night, undisturbed, out):
+    out.mkdir()
+    # Takes nothing, as a full disk does.
+    (out / "log.jsonl").symlink_to("/dev/full")
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+
+
+# --- clocks -------------------------------------------------------------------------------------------
+
+
+def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbed, out):
+    """What is written later has earlier times; the next night finds nothing to do all the same."""
+    write, now = places.write, time.time
+
+    def set_back() -> None:
+        monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
+        monkeypatch.setattr("pipeline.meter.now", lambda: "2001-01-01T00:00:00.000+00:00")
+        monkeypatch.setattr(places, "write", write_then)
+
+    def write_then(where, data) -> None:
+        write(where, data)
+        os.utime(where, (now() - 5 * DAY_S,) * 2)
+
+    before_tile(2, set_back)
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+    assert "4 done (4 cached)" in night().out
+
+
+def test_a_clock_set_back_between_nights(survey, night, undisturbed, out):
+    """Sources and results are of the future; a source that changes now is older than both."""
+    for path in survey.parent.rglob("*"):
+        os.utime(path, (time.time() + 10 * DAY_S,) * 2)
+    assert night(catalog=survey).code == 0
+    for path in out.rglob("*"):
+        os.utime(path, (time.time() + 10 * DAY_S,) * 2)
+    assert "4 done (4 cached)" in night(catalog=survey).out
+    tile = Catalog.read(survey).tiles[1]
+    (file,) = tile.paths(tile.layer("dsm"))
+    whole = file.read_bytes()
+    with rasterio.open(file, "r+") as raster:
+        raster.write(raster.read(1) + np.float32(0.5), 1)
+    said = night(catalog=survey)
+    assert "4 done (3 cached), 0 failed, 0 pending; 0 new, 1 changed" in said.out
+    assert not rows(out).equals(rows(undisturbed))
+    file.write_bytes(whole)
+    assert "4 done (3 cached)" in night(catalog=survey).out
+    assert_whole(out, undisturbed)
+
+
+# --- others -------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, undisturbed):
+    me = Holder.me()
+    with held(finished):
+        before = places.listing(finished)
+        for said in (
+            night("--verify"),
+            flexroad("rerun", finished, "--from", "load"),
+            flexroad("clean", finished),
+        ):
+            assert said.code == 2
+            (line,) = said.errors
+            assert f"{finished} is in use by pid {me.pid} on {me.host} since" in line
+        assert places.listing(finished) == before
+    assert "4 cached" in night().out
+    assert_whole(finished, undisturbed)
+
+
+def test_a_catalog_that_points_elsewhere(night, flexroad, made_survey, undisturbed, out, tmp_path):
+    there = Catalog.read(made_survey / "catalog.parquet")
+    listed = tmp_path / "elsewhere" / "catalog.json"
+    listed.parent.mkdir()
+    there.write(listed, movable=False)
+    said = night(catalog=listed)
+    assert said.code == 2
+    (line,) = said.errors
+    assert f"tile {there.tiles[0].id}: dsm names {made_survey}/dsm/" in line
+    assert not out.exists()
+    option = line.partition("add ")[2].split()
+    assert option == ["--allow", f"{made_survey}/dsm"]
+    assert night("--allow", made_survey, catalog=listed).code == 0
+    pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
+    assert "4 cached" in flexroad("rerun", out, "--executor", "serial").out
+    # Somebody else's hand in the run's own catalog.
+    tile = there.tiles[0]
+    wicked = tuple(replace(one, files=("/etc/passwd",)) if one.name == "dsm" else one for one in tile.layers)
+    Catalog((replace(tile, layers=wicked), *there.tiles[1:])).write(out / "catalog.parquet", movable=False)
+    said = flexroad("rerun", out, "--executor", "serial")
+    assert said.code == 2
+    assert "dsm names /etc/passwd" in said.errors[0]
+
+
+def test_a_catalog_that_points_to_a_url(night, made_survey, out, tmp_path):
+    there = Catalog.read(made_survey / "catalog.parquet")
+    tile, url = there.tiles[0], "https://example.org/dsm.tif"
+    layers = tuple(replace(one, files=(url,)) if one.name == "dsm" else one for one in tile.layers)
+    Catalog((replace(tile, layers=layers),)).write(tmp_path / "catalog.json", movable=False)
+    said = night("--allow", made_survey, "--allow", "https://example.org", catalog=tmp_path / "catalog.json")
+    assert said.code == 2
+    assert f"dsm names {url}; only files on disk and in s3:// are read: fetch it first" in said.errors[0]
+    assert not out.exists()
+
+
+def test_a_survey_that_is_not_mounted_for_one_night(survey, night, undisturbed, out):
+    """All tiles fail; the night after, nothing is computed that the store has."""
+    assert night(catalog=survey).code == 0
+    for name in ("dsm", "dtm"):
+        (survey.parent / name).rename(survey.parent / f"{name} elsewhere")
+    said = night(catalog=survey)
+    assert (said.code, len(said.errors)) == (1, 4)
+    assert all("is missing" in line for line in said.errors)
+    for name in ("dsm", "dtm"):
+        (survey.parent / f"{name} elsewhere").rename(survey.parent / name)
+    since = events(out)
+    assert night(catalog=survey).code == 0
+    assert computed(out, since) == {"export": 4}
+    assert_whole(out, undisturbed)
