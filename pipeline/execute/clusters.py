@@ -39,7 +39,7 @@ ASKED_FOR = {
 
 
 @dataclass(frozen=True)
-class Place:
+class Workplace:
     """Where a client connects to."""
 
     target: Any
@@ -52,7 +52,9 @@ class Place:
 
 
 @contextlib.contextmanager
-def opened(cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool) -> Iterator[Place]:
+def opened(
+    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
+) -> Iterator[Workplace]:
     """Start, ask for or find a cluster, and end what was started.
 
     Raises
@@ -61,7 +63,7 @@ def opened(cluster: Cluster, workers: int | None, scheduler: str | None, dashboa
         If something is not installed, or the cluster cannot be had.
     """
     if scheduler:
-        yield Place(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
+        yield Workplace(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
@@ -74,7 +76,7 @@ def opened(cluster: Cluster, workers: int | None, scheduler: str | None, dashboa
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
         made = stack.enter_context(make(cluster, scratch, dashboard))
         start_s = 0 if cluster.kind == "local" else cluster.start_s
-        yield Place(made, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
+        yield Workplace(made, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
 
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.cluster import Cluster
 from pipeline.errors import ClusterLost, ConfigError
-from pipeline.execute.clusters import Place, opened
+from pipeline.execute.clusters import Workplace, opened
 from pipeline.execute.executor import J, R
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class DaskExecutor:
                 connect = self._again
 
     @contextlib.contextmanager
-    def _first(self, place: Place) -> Iterator[Client]:
+    def _first(self, place: Workplace) -> Iterator[Client]:
         from distributed import Client
 
         try:
@@ -102,7 +102,7 @@ class DaskExecutor:
             yield client
 
     @contextlib.contextmanager
-    def _again(self, place: Place) -> Iterator[Client]:
+    def _again(self, place: Workplace) -> Iterator[Client]:
         from distributed import Client
 
         patience = self.cluster.patience_s
@@ -131,7 +131,7 @@ def _any_worker(client: Client, end: float) -> bool:
     return True
 
 
-def _guard(client: Client, place: Place, probe: Callable[[], None] | None) -> str:
+def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -> str:
     """Compare versions, put plugins on scheduler and workers, and probe; return the guard's name.
 
     Raises
