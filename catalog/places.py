@@ -68,7 +68,9 @@ def place(where: str | Place) -> Place:
         remote.fs.retries = ROUNDS
     except ImportError as error:
         raise OSError(
-            errno.ENOTSUP, "object storage needs s3fs; install it with pip install 'flexroad[s3]'", text
+            errno.ENOTSUP,
+            "object storage needs s3fs; install it with pip install 'flexroad[s3]'",
+            normal(text),
         ) from error
     return remote
 

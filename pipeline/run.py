@@ -407,7 +407,10 @@ def _record(run: Place) -> dict[str, Any] | None:
     """Return what run.json holds, or None if it is not there or damaged."""
     try:
         found: dict[str, Any] = json.loads(read(run / "run.json"))
-    except (OSError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
+    except OSError as error:
+        # Storage that refuses or does not answer is no proof that there is no run.
+        raise ConfigError(f"cannot read {run / 'run.json'}: {error.strerror or error}") from error
     known = {"config", "store", "shared_store", "origin", "checksum", "versions"}
     return found if isinstance(found, dict) and known <= found.keys() else None

@@ -1,5 +1,6 @@
 """A file behaves alike on disk and in a bucket."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,13 @@ def test_a_place_says_what_it_was_called(tmp_path, bucket):
         assert str(place(told)) == address
         assert places.is_remote(place(told))
     assert places.gdal_name(place(address)) == address.replace("s3://", "/vsis3/")
+
+
+def test_without_s3fs_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
+    with pytest.raises(OSError, match=r"install it with pip install 'flexroad\[s3\]'.*s3://bucket/name"):
+        place("s3://bucket/name")
 
 
 def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):

@@ -16,6 +16,7 @@ from pipeline import codec
 from pipeline.cli import main
 from pipeline.config import compose
 from pipeline.dataset import open_tile
+from pipeline.errors import ConfigError
 from pipeline.execute import SerialExecutor
 from pipeline.query import Ground
 from pipeline.report import write_report
@@ -208,6 +209,15 @@ def test_a_source_that_cannot_be_read_is_one_failed_tile(run, storage, local, an
     assert how.exit_code == 0
     assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
     assert_same(run, local)
+
+
+def test_a_run_that_cannot_be_asked_for_is_not_called_none(run, storage):
+    storage.fail(Fault("denied"))
+    with pytest.raises(ConfigError, match=r"cannot read s3://.*/run.json"):
+        Run.open(run.path)
+    storage.fail()
+    with pytest.raises(ConfigError, match="is no run"):
+        Run.open(run.path / "none")
 
 
 def test_a_missing_source_is_named_by_its_address(run):
