@@ -124,11 +124,13 @@ class DaskExecutor:
 
 
 def _any_worker(client: Client, end: float) -> bool:
-    while not client.nthreads():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.2)
-    return True
+    with contextlib.suppress(OSError):
+        while not client.nthreads():
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.2)
+        return True
+    return False
 
 
 def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -> str:
@@ -138,16 +140,22 @@ def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -
     ------
     ConfigError
         If a worker is not fit for the work.
+    ClusterLost
+        If nobody answers any more.
     """
     from pipeline.execute import workers
     from pipeline.execute.scheduler import no_second_try
 
     here = workers.versions()
-    _compare(client, here)
     name = uuid.uuid4().hex[:8]
     try:
+        _compare(client, here)
         client.register_plugin(no_second_try(client.id, name), name=f"flexroad-{name}")
         _post(client, workers.Guard(here, probe, deaf=place.own), name)
+    except ConfigError:
+        raise
+    except OSError as error:
+        raise ClusterLost(f"{place.name} went away before its first tile: {error}") from error
     except Exception as error:
         # Of whatever kind unpickling gave; only a line of it helps.
         told = " ".join(str(error).split()) or repr(error)
