@@ -251,7 +251,8 @@ def _from_parquet(data: bytes) -> Iterable[Item]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pq.read_table(pa.BufferReader(data))
+    # Threads of so short a work may be alive when the process ends, and abort it then.
+    table = pq.read_table(pa.BufferReader(data), use_threads=False, pre_buffer=False)
     plain = [name for name in table.column_names if name.startswith(("proj:", "flexroad:", "datetime"))]
     rows = table.select(["id", "assets", *plain]).to_pylist()
     return ({"id": row["id"], "assets": row["assets"], "properties": row} for row in rows)
