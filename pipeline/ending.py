@@ -62,11 +62,10 @@ def overseen(
 
     before = read_summary(run)
     ending = Ending()
-    with contextlib.ExitStack() as stack:
+    with _end_as_ctrl_c(), contextlib.ExitStack() as stack:
         # Leaves in the opposite order: the alarm rings when the file is written.
         stack.callback(_alarm, ending, run, before, on_failure, warn)
         try:
-            _end_as_ctrl_c()
             ending.textfile = _textfile(stack, run, prometheus)
             yield ending
         except KeyboardInterrupt:
@@ -90,12 +89,26 @@ def unread(words: Sequence[str], warn: Callable[[str], None]) -> None:
     _alarm(Ending(CANNOT_START, text), run, {}, target, warn)
 
 
-def _end_as_ctrl_c() -> None:
-    """Let an operator's `kill`, or a terminal that goes away, end it as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # Who started it with nohup wants it to go on.
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
+@contextlib.contextmanager
+def _end_as_ctrl_c() -> Iterator[None]:
+    """Let an operator's `kill`, or a terminal that goes away, end it as Ctrl-C does; the first one counts."""
+    before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+
+    def interrupt(*_: object) -> None:
+        for which in before:
+            # The ending takes seconds. Whoever cannot wait would make it longer, and leave workers behind.
+            signal.signal(which, lambda *_: None)
+        raise KeyboardInterrupt
+
+    for which, handler in before.items():
+        # Who started it in the background or with nohup wants it to go on.
+        if which == signal.SIGTERM or handler is not signal.SIG_IGN:
+            signal.signal(which, interrupt)
+    try:
+        yield
+    finally:
+        for which, handler in before.items():
+            signal.signal(which, handler)
 
 
 def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Textfile | None:

@@ -66,16 +66,19 @@ def workers(pid: int) -> list[psutil.Process]:
     return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
 
-def test_the_whole_run_is_killed(place, undisturbed, tmp_path):
+@pytest.mark.parametrize("kill", [os.killpg, os.kill], ids=["with its workers", "alone"])
+def test_the_whole_run_is_killed(place, undisturbed, tmp_path, kill):
     out = tmp_path / "run"
     process = subprocess.Popen(command(place, out), start_new_session=True, stderr=subprocess.DEVNULL)
     until(lambda: len(markers(out)) >= 2)
-    os.killpg(process.pid, signal.SIGKILL)
+    left = workers(process.pid)
+    kill(process.pid, signal.SIGKILL)
     process.wait()
     kept = {path: path.stat().st_mtime_ns for path in markers(out)}
     assert 2 <= len(kept) < 9
     subprocess.run(command(place, out), check=True, capture_output=True)
     assert all(path.stat().st_mtime_ns == before for path, before in kept.items())
+    until(lambda: not any(worker.is_running() for worker in left))
     table = read_metrics(out).drop(columns="seconds")
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
 
@@ -98,8 +101,10 @@ def test_an_interrupt_ends_in_seconds_and_keeps_what_is_done(place, undisturbed,
     process = subprocess.Popen(command(place, out), start_new_session=True, stderr=subprocess.PIPE, text=True)
     until(lambda: len(markers(out)) >= 1)
     if how == "ctrl-c":
-        # A terminal sends it to all processes of the command, workers too.
-        os.killpg(process.pid, signal.SIGINT)
+        # A terminal sends it to all processes of the command, workers too; and somebody is impatient.
+        for _ in range(3):
+            os.killpg(process.pid, signal.SIGINT)
+            time.sleep(0.3)
     else:
         process.terminate()
     _, said = process.communicate(timeout=30)
