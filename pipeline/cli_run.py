@@ -13,6 +13,7 @@ import typer
 
 from pipeline.ending import ON_FAILURE, Ending, line, overseen
 from pipeline.errors import ClusterLost, ConfigError
+from pipeline.unheard import patient
 
 if TYPE_CHECKING:
     from catalog import Catalog, Tile
@@ -42,6 +43,7 @@ Prometheus = Annotated[
 ]
 
 
+@patient()
 def run(
     config: Annotated[str, typer.Option(help="Configuration: a YAML file or a shipped name (paper).")],
     catalog: Annotated[Path, typer.Option(help="Catalog of tiles.")],
@@ -107,6 +109,7 @@ def run(
     _leave(ending)
 
 
+@patient()
 def rerun(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     tile: Annotated[list[str] | None, typer.Option(help="These tiles.")] = None,
@@ -209,7 +212,7 @@ def _carry_out(
         return
     except OSError as error:
         ending.exit_code = 1
-        ending.text = f"{error}; make room, then `flexroad rerun {folder}` goes on from here"
+        ending.text = f"{error}; make room or mend that, then `flexroad rerun {folder}` goes on from here"
         return
     finally:
         _draw(run)
@@ -292,18 +295,19 @@ def _tell(run: Run, as_json: bool) -> None:
     import json
     from dataclasses import asdict
 
-    from pipeline.lock import holder
+    from pipeline.lock import at_work, dead, holder
     from pipeline.summary import summary
 
     how, who = summary(run), holder(run.path)
     if as_json:
         found = asdict(how)
         found["failures"] = [{k: v for k, v in one.items() if k != "trace"} for one in found["failures"]]
+        who = None if who is None or dead(who) else who
         found["at_work"] = {"host": who.host, "pid": who.pid, "since": who.since} if who else None
         typer.echo(json.dumps(found, indent=1))
         return
     typer.echo(line(how))
     if who:
-        typer.echo(f"pid {who.pid} on {who.host} is at work since {who.since}")
+        typer.echo(at_work(who))
     for failure in how.failures:
         typer.echo(f"  {failure.notice}")

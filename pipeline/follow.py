@@ -17,7 +17,7 @@ from rich.text import Text
 from catalog.places import Place
 from pipeline.ledger import NAME as LEDGER
 from pipeline.ledger import Ledger
-from pipeline.lock import Holder, holder
+from pipeline.lock import Holder, at_work, holder
 
 SHOWN = 5
 """Failures that are named."""
@@ -68,7 +68,7 @@ class Snapshot:
         """Tell who is at work, and how fast it goes since an earlier look."""
         if self.holder is None:
             return "no run goes on"
-        who = f"pid {self.holder.pid} on {self.holder.host} at work since {self.holder.since}"
+        who = at_work(self.holder)
         minutes, tried = (self.when - first.when) / 60, first.pending - self.pending
         if tried <= 0 or minutes <= 0:
             return who

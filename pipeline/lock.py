@@ -89,6 +89,19 @@ class Holder:
         return None
 
 
+def dead(who: Holder) -> str | None:
+    """Tell why a holder is known to be dead: a process of this machine that is gone; None if it may live."""
+    here = Holder.me()
+    return who.gone(here, started) if (who.host, who.machine) == (here.host, here.machine) else None
+
+
+def at_work(who: Holder) -> str:
+    """Return a line about who holds a run's lock."""
+    why = dead(who)
+    name = f"pid {who.pid} on {who.host}"
+    return f"{name} ended in the middle ({why})" if why else f"{name} at work since {who.since}"
+
+
 @contextlib.contextmanager
 def held(
     run: Place, say: Callable[[str], None] = lambda line: None, pace: Pace | None = None
@@ -214,7 +227,7 @@ class _Lock:
     def _dead(self, who: Holder | None, seen: Sight) -> str | None:
         """Tell why a lock's holder counts as dead; None if it may live."""
         if who is not None and (who.host, who.machine) == (self.me.host, self.me.machine):
-            return who.gone(self.me, started)
+            return dead(who)
         if abs(seen.age_s) <= self.pace.stale_s:
             return None
         watch_s = 1.5 * self.pace.beat_s

@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.lock import Holder, Pace, held, holder, started
+from pipeline.lock import Holder, Pace, at_work, held, holder, started
 
 HOLD = """
 import sys, time
@@ -58,10 +58,12 @@ def test_a_second_holder_is_refused_by_host_and_pid(process, tmp_path):
 
 
 def test_of_a_killed_holder_it_is_taken_over_at_once_and_said_in_one_line(process, tmp_path):
+    assert "at work since" in at_work(holder(tmp_path))
     process.send_signal(signal.SIGKILL)
     # Not waited for: a dead process that nobody buried still has its number.
     while started(process.pid) is not None:
         time.sleep(0.01)
+    assert "ended in the middle (that process is gone)" in at_work(holder(tmp_path))
     assert taken(tmp_path) == [
         f"took over the lock of pid {process.pid} on {Holder.me().host}: that process is gone"
     ]
