@@ -75,8 +75,11 @@ class OnDisk:
                 data, written = file.read(), os.fstat(file.fileno()).st_mtime
         except FileNotFoundError:
             return None
-        with tempfile.TemporaryFile(dir=self.path.parent) as probe:
-            return Sight(data, written, os.fstat(probe.fileno()).st_mtime - written)
+        age_s = 0.0
+        # On a full disk no age can be told: others' locks count as young, and one's own is given back.
+        with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=self.path.parent) as probe:
+            age_s = os.fstat(probe.fileno()).st_mtime - written
+        return Sight(data, written, age_s)
 
     def replace(self, seen: Sight, data: bytes) -> bool:
         """Put another in its place; False if it is no longer the one seen."""

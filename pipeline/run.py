@@ -398,6 +398,10 @@ def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
 
 
 def _config(where: Place) -> Config:
+    seen = stat(where)
+    if seen is not None and not seen.size:
+        # It would be read as one that changes no default.
+        raise ConfigError(f"{where} is empty, as a power failure leaves it; `flexroad run` writes it anew")
     if isinstance(where, Path):
         return load_config(where)
     return compose(yaml.safe_load(read(where)), str(where))

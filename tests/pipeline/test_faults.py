@@ -5,11 +5,14 @@ The faults that belong to one part are tested beside that part; `docs/operations
 
 import contextlib
 import ctypes
+import errno
 import json
 import os
 import random
 import resource
 import shutil
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -178,6 +181,15 @@ def test_whatever_files_of_a_run_are_damaged(seed, finished, undisturbed, night)
         assert not kept or after[name] == written, f"{name} was made again"
 
 
+def test_an_empty_configuration_is_not_taken_for_the_default(finished, undisturbed, night, flexroad):
+    (finished / "config.yaml").write_bytes(b"")
+    said = flexroad("rerun", finished, "--executor", "serial")
+    assert said.code == 2
+    assert f"{finished / 'config.yaml'} is empty" in said.errors[0]
+    assert "4 cached" in night().out
+    assert_whole(finished, undisturbed)
+
+
 def test_a_tile_folder_deleted_by_hand_costs_its_export(finished, undisturbed, night):
     shutil.rmtree(min((finished / "tiles").iterdir()))
     since = events(finished)
@@ -303,6 +315,54 @@ def test_a_log_that_cannot_be_written_stops_nothing(night, undisturbed, out):
     (out / "log.jsonl").symlink_to("/dev/full")
     assert night().code == 0
     assert_whole(out, undisturbed)
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, out, undisturbed):
+    """As when the disk of cron's log is full; one tile fails, and that is said at once."""
+    tile = Catalog.read(survey).tiles[0]
+    (file,) = tile.paths(tile.layer("dsm"))
+    whole = file.with_suffix(".whole")
+    shutil.copy2(file, whole)
+    file.write_bytes(b"")
+    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", "--executor", "serial"]
+    call += ["--config", config, "--catalog", survey, "--out", out]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(call, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, stream: full})
+    assert done.returncode == 1
+    assert json.loads((out / "summary.json").read_text())["done"] == 3
+    assert b"3 done" in (done.stdout or b"3 done")
+    assert b"Traceback" not in (done.stderr or b"")
+    whole.rename(file)
+    assert subprocess.run(call, check=False, capture_output=True).returncode == 0
+    assert_whole(out, undisturbed)
+
+
+def test_a_lock_is_given_back_on_a_full_disk(monkeypatch, tmp_path):
+    def full(**_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with held(tmp_path):
+        monkeypatch.setattr("tempfile.TemporaryFile", full)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
+    """Numba refuses to be imported where it can keep nothing."""
+    root = Path(__file__).parents[2]
+    for name in ("catalog", "tasks", "pipeline"):
+        shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
+        # Not to be written by root, either.
+        (folder / "__pycache__").touch()
+    code = "import os, pipeline, tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
+    elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
+    environment |= {"HOME": "/dev/null"}
+    call = [sys.executable, "-c", code]
+    done = subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert not Path(done.stdout.strip()).exists()
 
 
 # --- clocks -------------------------------------------------------------------------------------------
