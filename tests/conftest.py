@@ -92,6 +92,16 @@ def cluster():
         yield cluster
 
 
+@pytest.fixture
+def processes(tmp_path):
+    """Scheduler and workers of one's own, to kill."""
+    from tests.dask_processes import Processes
+
+    found = Processes(tmp_path)
+    yield found
+    found.end()
+
+
 @pytest.fixture(params=["serial", "dask"])
 def executor(request):
     if request.param == "serial":

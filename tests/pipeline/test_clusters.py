@@ -1,16 +1,11 @@
 """Clusters that run already, in real processes on loopback; and what is asked of SLURM and Kubernetes."""
 
-import contextlib
 import ctypes
-import json
 import os
-import signal
-import subprocess
 import sys
 import threading
 import time
 from itertools import islice
-from pathlib import Path
 
 import cloudpickle
 import psutil
@@ -21,66 +16,12 @@ from pipeline.config import load_config
 from pipeline.errors import ClusterLost, ConfigError
 from pipeline.execute import DaskExecutor
 from pipeline.execute.clusters import kubernetes_options, opened, slurm_options
+from tests.dask_processes import Processes, until, wait_for
 
 # Workers have no tests to import.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 IMPATIENT = Cluster(patience_s=1)
-
-
-class Processes:
-    """A scheduler and workers, each a process started by Dask's own commands."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.started: list[subprocess.Popen] = []
-        self.address = ""
-
-    def scheduler(self) -> subprocess.Popen:
-        """Start one, where it was before if there was one; its settings are others than one's own."""
-        file = self.folder / "scheduler.json"
-        file.unlink(missing_ok=True)
-        port = self.address.rpartition(":")[2] or "0"
-        options = ["--host", "127.0.0.1", "--port", port, "--scheduler-file", file, "--no-dashboard"]
-        process = self._start("scheduler", *options, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="7")
-        self.address = until(lambda: file.exists() and json.loads(file.read_text() or "{}")).get("address")
-        return process
-
-    def worker(self, *options: str, **env: str) -> subprocess.Popen:
-        options = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder), *options)
-        return self._start("worker", self.address, *options, **env)
-
-    def end(self) -> None:
-        for process in self.started:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-    def _start(self, *words, **env: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "dask", *map(str, words)]
-        with (self.folder / "said.txt").open("a") as said:
-            process = subprocess.Popen(
-                command, env={**os.environ, **env}, stdout=said, stderr=said, start_new_session=True
-            )
-        self.started.append(process)
-        return process
-
-
-def until(condition, seconds: float = 60):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.02)
-    raise AssertionError("waited in vain")
-
-
-@pytest.fixture
-def processes(tmp_path):
-    found = Processes(tmp_path)
-    yield found
-    found.end()
 
 
 @pytest.fixture(scope="module")
@@ -97,13 +38,6 @@ def running(shared):
     """A cluster of two workers that tests share; whoever kills one gets it back from its nanny."""
     wait_for(shared.address, 2)
     return shared
-
-
-def wait_for(address: str, workers: int) -> None:
-    from distributed import Client
-
-    with Client(address, set_as_default=False) as client:
-        client.wait_for_workers(workers, 60)
 
 
 def lost(job, why):

@@ -28,9 +28,11 @@ import yaml
 from catalog import Catalog, places
 from pipeline.config import load_config
 from pipeline.execute import SerialExecutor
+from pipeline.journal import Journal
 from pipeline.lock import Holder, held
 from pipeline.run import Run, execute
 from pipeline.tables import read_metrics
+from tests.dask_processes import wait_for
 
 LIGHT = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
@@ -133,6 +135,42 @@ def before_tile(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
         monkeypatch.setattr(SerialExecutor, "map", map_)
 
     return arrange
+
+
+# --- processes ----------------------------------------------------------------------------------------
+
+
+def test_a_scheduler_that_is_killed_for_good(
+    processes, config, made_survey, flexroad, night, monkeypatch, undisturbed, out
+):
+    """The run ends with what is done, in one line; the next goes on from there, here without a cluster."""
+    scheduler = processes.scheduler()
+    processes.worker()
+    wait_for(processes.address, 1)
+    impatient = config.with_name("impatient.yaml")
+    impatient.write_text("extends: light.yaml\ncluster: {patience_s: 1}\n")
+    noted = Journal.tile
+
+    def kill(self, result) -> None:
+        noted(self, result)
+        scheduler.kill()
+
+    monkeypatch.setattr(Journal, "tile", kill)
+    words = ["--config", impatient, "--catalog", made_survey / "catalog.parquet", "--out", out]
+    said = flexroad("run", *words, "--scheduler", processes.address)
+    assert said.code == 1
+    there = f"the Dask scheduler at {processes.address}"
+    assert f"{there} is gone; waiting up to 1 s for it" in said.err
+    assert said.errors == [f"error: {there} was gone for 1 s; the same command goes on from here"]
+    told = json.loads((out / "summary.json").read_text())
+    assert told["exit_code"] == 1
+    assert 1 <= told["done"] < 4
+    assert rows(out).tile_id.nunique() == told["done"]
+    before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
+    processes.end()
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+    assert all(path.stat().st_mtime_ns == written for path, written in before.items())
 
 
 # --- files of a run -----------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from pipeline.config import load_config
 from pipeline.execute import SerialExecutor
 from pipeline.run import Run, execute
 from pipeline.tables import read_metrics
+from tests.dask_processes import until
 
 CONFIG = """
 fit: {control_points: [20, 20], iterations: 3000}
@@ -45,16 +46,6 @@ def command(place, out) -> list[str]:
     words = ["--config", place / "slow.yaml", "--catalog", place / "survey" / "catalog.parquet"]
     call = "from pipeline.cli import main; main()"
     return [sys.executable, "-c", call, "run", *map(str, words), "--out", str(out), "--workers", "2"]
-
-
-def until(condition, seconds: float = 60):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.02)
-    raise AssertionError("waited in vain")
 
 
 def markers(out) -> list:
