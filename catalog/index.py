@@ -252,7 +252,7 @@ def _from_parquet(data: bytes) -> Iterable[Item]:
     import pyarrow.parquet as pq
 
     # Threads of so short a work may be alive when the process ends, and abort it then.
-    table = pq.read_table(pa.BufferReader(data), use_threads=False, pre_buffer=False)
+    table = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False).read(use_threads=False)
     plain = [name for name in table.column_names if name.startswith(("proj:", "flexroad:", "datetime"))]
     rows = table.select(["id", "assets", *plain]).to_pylist()
     return ({"id": row["id"], "assets": row["assets"], "properties": row} for row in rows)

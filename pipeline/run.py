@@ -42,7 +42,7 @@ from pipeline.look import Folders, stands
 from pipeline.meter import now
 from pipeline.registry import register
 from pipeline.store import TileFolder, check_writable
-from pipeline.summary import Summary, summarise, write_summary
+from pipeline.summary import Summary, read_summary, summarise, write_summary
 from pipeline.tables import write_tables
 from pipeline.warm import warm
 from pipeline.work import Job, TileResult, do_tile, failed_row, give_up
@@ -86,7 +86,8 @@ class Run:
         """
         check_models(config)
         old = _record(path)
-        origin = old["origin"] if old else _origin(catalog)
+        # Meshes of before are placed against it: the last summary has it, too.
+        origin = (old or read_summary(path)).get("origin") or _origin(catalog)
         store = store or (place(old["store"]) if old and old["shared_store"] else path / "store")
         exported = _exported(old, config)
         place_of = (origin[0], origin[1])

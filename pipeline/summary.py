@@ -98,6 +98,7 @@ def write_summary(run: Run, how: Summary, start: str, end: str) -> None:
         "start": start,
         "end": end,
         "config": run.config.name,
+        "origin": list(run.origin),
         "flexroad": importlib.metadata.version("flexroad"),
     }
     write(run.path / NAME, json.dumps(told, indent=1).encode())

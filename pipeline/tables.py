@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import islice
@@ -105,6 +104,23 @@ def read_metrics(run: Place) -> pd.DataFrame:
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
         # Runs of earlier days lack the later columns.
-        return pd.read_parquet(io.BytesIO(read(path))).reindex(columns=list(COLUMNS))
+        return frame_of(read(path)).reindex(columns=list(COLUMNS))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error
+
+
+def frame_of(data: bytes) -> pd.DataFrame:
+    """Return a table of a Parquet file's bytes.
+
+    Raises
+    ------
+    OSError, ValueError
+        If they are no such file.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    # pandas' own way starts threads, which may be alive when a short command ends, and abort it then.
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    found: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
+    return found

@@ -206,7 +206,7 @@ def _dashboard(client: Client) -> str:
     try:
         import bokeh  # noqa: F401
     except ImportError:
-        return "no dashboard: it needs bokeh (pip install bokeh)"
+        return "no dashboard: it needs bokeh (pip install 'flexroad[dashboard]')"
     return f"dashboard: {client.dashboard_link}"
 
 

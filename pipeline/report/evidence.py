@@ -14,7 +14,7 @@ from pipeline.errors import ConfigError
 from pipeline.report.content import FIGURES
 from pipeline.run import Run
 from pipeline.store import write_atomic
-from pipeline.tables import read_metrics
+from pipeline.tables import frame_of, read_metrics
 
 FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
@@ -153,7 +153,7 @@ def _kept(rows: pd.DataFrame) -> bytes:
 
 
 def _read(path: Path) -> pd.DataFrame:
-    return pd.read_parquet(path).astype(dict.fromkeys(KEYS, "str"))
+    return frame_of(path.read_bytes()).astype(dict.fromkeys(KEYS, "str"))
 
 
 def _rows(run: Run) -> pd.DataFrame:

@@ -228,6 +228,19 @@ def test_an_empty_configuration_is_not_taken_for_the_default(finished, undisturb
     assert_whole(finished, undisturbed)
 
 
+def test_a_lost_record_leaves_meshes_where_they_are(night, made_survey, config, out, tmp_path):
+    """Though a catalog that grew would place them otherwise."""
+    tiles = Catalog.read(made_survey / "catalog.parquet").tiles
+    east = tuple(tile for tile in tiles if tile.grid.west > tiles[0].grid.west)
+    run = Run.create(out, load_config(config), Catalog(east))
+    execute(run, SerialExecutor())
+    (out / "run.json").unlink()
+    assert night().code == 0
+    found = Run.open(out)
+    assert found.origin == run.origin
+    assert found.origin != Run.create(tmp_path / "new", run.config, Catalog(tiles)).origin
+
+
 def test_a_tile_folder_deleted_by_hand_costs_its_export(finished, undisturbed, night):
     shutil.rmtree(min((finished / "tiles").iterdir()))
     since = events(finished)
