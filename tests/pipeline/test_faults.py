@@ -369,7 +369,7 @@ def test_a_log_that_cannot_be_written_stops_nothing(night, undisturbed, out):
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
-def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, out, undisturbed):
+def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, night, out, undisturbed):
     """As when the disk of cron's log is full; one tile fails, and that is said at once."""
     tile = Catalog.read(survey).tiles[0]
     (file,) = tile.paths(tile.layer("dsm"))
@@ -385,7 +385,7 @@ def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, out, un
     assert b"3 done" in (done.stdout or b"3 done")
     assert b"Traceback" not in (done.stderr or b"")
     whole.rename(file)
-    assert subprocess.run(call, check=False, capture_output=True).returncode == 0
+    assert night(catalog=survey).code == 0
     assert_whole(out, undisturbed)
 
 
