@@ -80,24 +80,36 @@ def opened(
 
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return processes of one thread on this machine."""
+    """Return processes of one thread on this machine.
+
+    Raises
+    ------
+    ConfigError
+        If they cannot be started.
+    """
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
     # As far as a container may use them.
     workers = cluster.workers or CPU_COUNT
-    return LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=cluster.memory or MEMORY_LIMIT // workers,
-        dashboard_address="127.0.0.1:8787" if dashboard else None,
-        worker_dashboard_address=None,
-        local_directory=scratch,
-        env=ONE_THREAD,
-        silence_logs=logging.CRITICAL,
-    )
+    try:
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=cluster.memory or MEMORY_LIMIT // workers,
+            dashboard_address="127.0.0.1:8787" if dashboard else None,
+            worker_dashboard_address=None,
+            local_directory=scratch,
+            env=ONE_THREAD,
+            silence_logs=logging.CRITICAL,
+        )
+    except (OSError, RuntimeError) as error:
+        raise ConfigError(
+            f"cannot start {workers} worker processes here: {_line(error).rstrip('.')}; take fewer "
+            "--workers, or allow more processes and open files (ulimit -u, ulimit -n)"
+        ) from error
 
 
 def slurm(cluster: Cluster, scratch: str, dashboard: bool) -> Any:

@@ -173,6 +173,18 @@ def test_a_scheduler_that_is_killed_for_good(
     assert all(path.stat().st_mtime_ns == written for path, written in before.items())
 
 
+def test_workers_that_cannot_be_started_are_said_in_one_line(config, made_survey, night, undisturbed, out):
+    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", "--workers", "2"]
+    call += ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
+    few = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh"]
+    done = subprocess.run([*few, *call], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: cannot start 2 worker processes here: ")
+    assert done.stderr.count("\n") == 1
+    assert night().code == 0
+    assert_whole(out, undisturbed)
+
+
 # --- files of a run -----------------------------------------------------------------------------------
 
 
