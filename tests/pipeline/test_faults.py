@@ -437,7 +437,8 @@ def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbe
 
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
-        monkeypatch.setattr("pipeline.meter.now", lambda: "2001-01-01T00:00:00.000+00:00")
+        for module in ("meter", "work", "journal", "run"):
+            monkeypatch.setattr(f"pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
         monkeypatch.setattr(places, "write", write_then)
 
     def write_then(where, data) -> None:
@@ -446,6 +447,9 @@ def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbe
 
     before_tile(2, set_back)
     assert night().code == 0
+    assert sum(path.stat().st_mtime < now() - DAY_S for path in out.glob("tiles/*/item.json")) == 2
+    told = json.loads((out / "summary.json").read_text())
+    assert told["end"] < told["start"]
     assert_whole(out, undisturbed)
     assert "4 done (4 cached)" in night().out
 
