@@ -10,11 +10,12 @@ from __future__ import annotations
 import posixpath
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from catalog.errors import CatalogError
 from catalog.index import Catalog
 from catalog.places import Place, absolute, joined, normal, place
+from catalog.tile import LAYERS
 
 MOST = 4
 """Folders to allow that are named one by one; of more, those that they lie in."""
@@ -22,7 +23,9 @@ ADDRESS = re.compile(r"(?!s3:)[a-zA-Z][a-zA-Z0-9+.-]*:/")
 TOPS = ("/", "s3:/", "s3:")
 
 
-def refuse_outside(catalog: Catalog, folder: Place | str, allowed: Sequence[str] = ()) -> None:
+def refuse_outside(
+    catalog: Catalog, folder: Place | str, allowed: Sequence[str] = (), layers: Collection[str] = LAYERS
+) -> None:
     """Refuse a catalog that names files elsewhere.
 
     Parameters
@@ -31,13 +34,15 @@ def refuse_outside(catalog: Catalog, folder: Place | str, allowed: Sequence[str]
         The catalog's own.
     allowed : sequence of str
         Folders or addresses (s3://BUCKET/NAME) below which files may lie besides.
+    layers : collection of str
+        Those that will be read; what nobody reads may lie anywhere.
 
     Raises
     ------
     CatalogError
         The line names the tile, the layer, the file and the option that allows it.
     """
-    for tile, layer, name in _outside(catalog, folder, allowed):
+    for tile, layer, name in _outside(catalog, folder, allowed, layers):
         where = f"tile {tile}: {layer} names {name}"
         if ADDRESS.match(name):
             raise CatalogError(f"{where}; only files on disk and in s3:// are read: fetch it first")
@@ -45,9 +50,9 @@ def refuse_outside(catalog: Catalog, folder: Place | str, allowed: Sequence[str]
         raise CatalogError(f"{where}, outside the catalog's folder {folder}; if that is meant, add {option}")
 
 
-def needed(catalog: Catalog, folder: Place | str) -> tuple[str, ...]:
-    """Return what has to be allowed for a catalog in such a folder: few folders."""
-    names = (name for *_, name in _outside(catalog, folder, ()) if not ADDRESS.match(name))
+def needed(catalog: Catalog, folder: Place | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
+    """Return what has to be allowed for a catalog in such a folder if such layers are read: few folders."""
+    names = (name for *_, name in _outside(catalog, folder, (), layers) if not ADDRESS.match(name))
     found = _outermost(map(posixpath.dirname, names))
     while len(found) > MOST:
         above = _outermost(map(posixpath.dirname, found))
@@ -57,13 +62,15 @@ def needed(catalog: Catalog, folder: Place | str) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def _outside(catalog: Catalog, folder: Place | str, allowed: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    """Yield tile, layer and file of all that lie elsewhere."""
+def _outside(
+    catalog: Catalog, folder: Place | str, allowed: Sequence[str], layers: Collection[str]
+) -> Iterator[tuple[str, str, str]]:
+    """Yield tile, layer and file of all in the layers that lie elsewhere."""
     # The folder by the name it was given, and as it is without links.
     grounds = {normal(str(folder)), normal(str(absolute(place(folder)))), *map(normal, allowed)}
     starts = tuple(ground.rstrip("/") + "/" for ground in grounds)
     for tile in catalog.tiles:
-        for layer in tile.layers:
+        for layer in (layer for layer in tile.layers if layer.name in layers):
             for file in layer.files:
                 named = next((text for text in (file, tile.root) if ADDRESS.match(text)), None)
                 name = named or normal(joined(tile.root, file))

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from catalog import Catalog, Tile
     from catalog.places import Place
     from pipeline.cluster import Cluster
+    from pipeline.config import Config
     from pipeline.execute import Executor
     from pipeline.run import Run
     from pipeline.work import TileResult
@@ -74,15 +75,16 @@ def run(
     from catalog.places import absolute, normal, place
     from catalog.trust import refuse_outside
     from pipeline.config import load_config
+    from pipeline.graph import layers_read
     from pipeline.run import Run, asked, select
 
     path, listed, root = place(out), place(catalog), place(store) if store else None
     # What its own folder holds is a catalog's to name.
     allowed = [str(absolute(listed).parent), *(normal(text) for text in allow or ())]
 
-    def wanted() -> tuple[Catalog, Catalog]:
+    def wanted(chosen: Config) -> tuple[Catalog, Catalog]:
         whole = Catalog.read(listed)
-        refuse_outside(whole, listed.parent, allowed)
+        refuse_outside(whole, listed.parent, allowed, layers_read(chosen))
         found = whole.select(tile or (), bbox)
         if not found.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
@@ -92,13 +94,14 @@ def run(
         from pipeline.graph import tile_graphs
         from pipeline.plan import plan
 
-        for line in plan(
-            tile_graphs(wanted()[1], load_config(config), checksum), root or path / "store", path
-        ):
+        chosen = load_config(config)
+        graphs = tile_graphs(wanted(chosen)[1], chosen, checksum)
+        for line in plan(graphs, root or path / "store", path):
             typer.echo(line)
         return
     with overseen(path, on_failure, prometheus, _warn) as ending:
-        chosen, (whole, tiles) = load_config(config), wanted()
+        chosen = load_config(config)
+        whole, tiles = wanted(chosen)
         some = bool(tile) or bbox is not None
         with _alone(path, make=True):
             about = asked(path, whole, tiles) if some else whole
@@ -128,7 +131,7 @@ def rerun(
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
     from catalog.places import place
     from catalog.trust import refuse_outside
-    from pipeline.graph import STAGE_NAMES
+    from pipeline.graph import STAGE_NAMES, layers_read
     from pipeline.run import Run, select
 
     where = place(path)
@@ -140,7 +143,7 @@ def rerun(
             opened = Run.open(where)
             if opened.allowed:
                 # A run of old does not know.
-                refuse_outside(opened.catalog, where, opened.allowed)
+                refuse_outside(opened.catalog, where, opened.allowed, layers_read(opened.config))
             only = select(opened, tile or (), failed)
             with_whom = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
             _carry_out(opened, with_whom, only, anew, verify, ending)
@@ -248,13 +251,15 @@ def _warn(line: str, kind: str = "warning") -> None:
 
 
 def next_run(catalog: Path) -> str:
-    """Return the command that runs a catalog, with leave for all that it names."""
+    """Return the command that runs a catalog, with leave for all that it reads."""
     from catalog import Catalog
     from catalog.trust import needed
+    from pipeline.config import load_config
+    from pipeline.graph import layers_read
 
-    allowed = "".join(
-        f" --allow {shlex.quote(where)}" for where in needed(Catalog.read(catalog), catalog.parent)
-    )
+    read = layers_read(load_config("paper"))
+    folders = needed(Catalog.read(catalog), catalog.parent, read)
+    allowed = "".join(f" --allow {shlex.quote(folder)}" for folder in folders)
     return f"flexroad run --config paper --catalog {shlex.quote(str(catalog))} --out RUN{allowed}"
 
 

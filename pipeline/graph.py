@@ -242,6 +242,12 @@ def files_read(graph: TileGraph, node: Node) -> list[Place]:
     return [*paths, *model_files(node.options)]
 
 
+def layers_read(config: Config) -> frozenset[str]:
+    """Return the layers that some stage of some variant reads."""
+    chosen = (options for chain in config.chains.values() for options in chain.values())
+    return frozenset(name for options in chosen for name in getattr(stage_module(options), "READS", ()))
+
+
 def any_gone(graph: TileGraph) -> bool:
     """Tell whether a file that the tile's stages might read is not there."""
     return None in graph.seen.values()

@@ -34,7 +34,7 @@ from pipeline.config import Config, compose, load_config
 from pipeline.entry import FAILED, Failure
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor
-from pipeline.graph import Look, Pattern, Recorded, TileGraph, model_files
+from pipeline.graph import Look, Pattern, Recorded, TileGraph, any_gone, model_files
 from pipeline.journal import Journal
 from pipeline.ledger import NAME as LEDGER
 from pipeline.ledger import Ledger, Standing
@@ -210,7 +210,7 @@ def execute(
     Raises
     ------
     ConfigError
-        If a model is missing.
+        If a model is missing, or each of several tiles lacks a file.
     OSError
         If the ledger or the tables cannot be written, as on a full disk.
     """
@@ -228,9 +228,9 @@ def execute(
                     watch(result)
         except BaseException as error:
             # What is done is in the tables.
-            close(stock, interrupted=isinstance(error, KeyboardInterrupt))
+            close(stock, error)
             raise
-        return close(stock, interrupted=False)
+        return close(stock)
 
 
 def take_stock(
@@ -241,9 +241,16 @@ def take_stock(
     watch: Callable[[TileResult], None],
     verify: bool,
 ) -> Stock:
-    """Look at every tile once, bring the ledger up to date, and tell what there is to do."""
-    todo, standings, new, changed = array("L"), list[Standing](), 0, 0
+    """Look at every tile once, bring the ledger up to date, and tell what there is to do.
+
+    Raises
+    ------
+    ConfigError
+        If each of several tiles lacks a file.
+    """
+    todo, standings, new, changed, gone = array("L"), list[Standing](), 0, 0, 0
     for position, found in enumerate(stands(run, ledger)):
+        gone += any_gone(found.graph)
         wanted = only(found.graph.tile)
         if wanted and verify and found.done and not run.folder(found.graph.tile.id).verified():
             found = replace(found, current=False)
@@ -258,10 +265,21 @@ def take_stock(
         elif wanted:
             todo.append(position)
         standings.append(standing)
+    if gone == len(run.catalog.tiles) > 1:
+        # Not to be told by each tile, whose results would be lost by it.
+        raise ConfigError(_nothing_there(run, found.graph))
     ledger.flush()
     names = (tile.id for tile in run.catalog.tiles)
     vanished = ledger.ask(zip(names, standings, strict=True))
     return Stock(todo, new, changed, vanished)
+
+
+def _nothing_there(run: Run, graph: TileGraph) -> str:
+    path = next(path for path, seen in graph.seen.items() if seen is None)
+    return (
+        f"each of the {len(run.catalog.tiles)} tiles lacks a file, as tile {graph.tile.id} does {path}; "
+        "is the disk with the survey mounted?"
+    )
 
 
 def _jobs(run: Run, stock: Stock, anew: frozenset[str]) -> Iterator[Job]:
@@ -304,10 +322,12 @@ def _close(
     start: str,
     began: float,
     stock: Stock | None,
-    interrupted: bool,
+    error: BaseException | None = None,
 ) -> Summary:
     """Write the tables and the summary, as far as the run came."""
-    how = replace(summarise(len(run.catalog.tiles), ledger), interrupted=interrupted)
+    refused = str(error) if isinstance(error, ConfigError) else ""
+    interrupted = isinstance(error, KeyboardInterrupt)
+    how = replace(summarise(len(run.catalog.tiles), ledger), interrupted=interrupted, refused=refused)
     if stock:
         how = replace(how, new=stock.new, changed=stock.changed, vanished=stock.vanished)
         write_tables(run.path, ledger.rows(), ledger.failures())

@@ -44,13 +44,17 @@ class Summary:
     seconds: float = 0.0
     """How long the last run took."""
     interrupted: bool = False
+    refused: str = ""
+    """Why the last run did not go on, where that was not for single tiles to tell."""
     failures: tuple[Failure, ...] = ()
     """The first of them, in the catalog's order."""
 
     @property
     def exit_code(self) -> int:
-        """What the command ends with: 0 if all is done, 1 if not, 130 after an interruption."""
-        return 130 if self.interrupted else int(self.failed + self.pending > 0)
+        """What the command ends with: 0 if all is done, 1 if not, 2 if refused, 130 after an interruption."""
+        if self.interrupted:
+            return 130
+        return 2 if self.refused else int(self.failed + self.pending > 0)
 
 
 def summarise(tiles: int, ledger: Ledger) -> Summary:
@@ -79,7 +83,7 @@ def summary(run: Run) -> Summary:
     left = tiles - counts["done"] - counts["failed"]
     found = Summary(tiles, counts["done"], counts["failed"], counts["cached"], left, failures=tuple(failures))
     last = read_summary(run.path)
-    known = ("new", "changed", "vanished", "seconds", "interrupted")
+    known = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(found, **{name: last[name] for name in known if name in last})
 
 

@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 import pytest
 
 from catalog import Catalog, CatalogError, Grid, Layer, Tile
+from catalog.tile import LAYERS
 from catalog.trust import needed, refuse_outside
 
 
@@ -80,3 +81,12 @@ def test_what_needs_to_be_allowed_is_few(tmp_path):
     assert asked(*(f"/d/{i}/a.tif" for i in range(9))) == ("/d",)
     assert asked(*(f"/{i}/a.tif" for i in range(9))) == tuple(f"/{i}" for i in range(9))
     assert asked(*(f"s3://b/d/{i}/a.tif" for i in range(9))) == ("s3://b/d",)
+
+
+def test_what_nobody_reads_may_lie_anywhere(tmp_path):
+    found = catalog("/elsewhere/a.tif", root=tmp_path)
+    others = set(LAYERS) - {"dsm"}
+    refuse_outside(found, tmp_path, layers=others)
+    assert needed(found, tmp_path, others) == ()
+    with pytest.raises(CatalogError, match="--allow /elsewhere"):
+        refuse_outside(found, tmp_path, layers={"dsm"})

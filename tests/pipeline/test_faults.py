@@ -531,16 +531,16 @@ def test_a_catalog_that_points_to_a_url(night, made_survey, out, tmp_path):
 
 
 def test_a_survey_that_is_not_mounted_for_one_night(survey, night, undisturbed, out):
-    """All tiles fail; the night after, nothing is computed that the store has."""
+    """Refused at once, not told by each tile; the night after, nothing has to be done."""
     assert night(catalog=survey).code == 0
     for name in ("dsm", "dtm"):
         (survey.parent / name).rename(survey.parent / f"{name} elsewhere")
     said = night(catalog=survey)
-    assert (said.code, len(said.errors)) == (1, 4)
-    assert all("is missing" in line for line in said.errors)
+    assert said.code == json.loads((out / "summary.json").read_text())["exit_code"] == 2
+    assert "each of the 4 tiles lacks a file" in said.err
     for name in ("dsm", "dtm"):
         (survey.parent / f"{name} elsewhere").rename(survey.parent / name)
     since = events(out)
     assert night(catalog=survey).code == 0
-    assert computed(out, since) == {"export": 4}
+    assert computed(out, since) == {}
     assert_whole(out, undisturbed)
