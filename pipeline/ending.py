@@ -93,8 +93,11 @@ def unread(words: Sequence[str], warn: Callable[[str], None]) -> None:
 def _end_as_ctrl_c() -> Iterator[None]:
     """Let an operator's `kill`, or a terminal that goes away, end it as Ctrl-C does; the first one counts."""
     before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    heard = False
 
     def interrupt(*_: object) -> None:
+        nonlocal heard
+        heard = True
         for which in before:
             # The ending takes seconds. Whoever cannot wait would make it longer, and leave workers behind.
             signal.signal(which, lambda *_: None)
@@ -108,7 +111,8 @@ def _end_as_ctrl_c() -> Iterator[None]:
         yield
     finally:
         for which, handler in before.items():
-            signal.signal(which, handler)
+            # The process is about to end with its exit code; an impatient signal must not give it another.
+            signal.signal(which, signal.SIG_IGN if heard else handler)
 
 
 def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Textfile | None:
