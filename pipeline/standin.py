@@ -12,10 +12,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from catalog import Catalog, Layer, Tile
+from catalog.places import write
 from catalog.sources import prepared
 from pipeline.errors import ConfigError
 from pipeline.execute import Executor, SerialExecutor
-from pipeline.store import write_atomic
 from tasks.synthetic import dsc3d, glb
 from tasks.synthetic.dsc3d import Place
 from tasks.synthetic.photogrammetry import photogrammetry
@@ -88,7 +88,7 @@ def _write_scene(job: _Job) -> str:
     }
     name = NAME.format(job.seed)
     prepared.write_tile(home / KNOWN, scene.name, truth.grid, known, truth.stratum, MADE, name)
-    write_atomic(home / "mesh.glb", glb.encode(scene.mesh))
+    write(home / "mesh.glb", glb.encode(scene.mesh))
     roads = home / KNOWN / "road_mask" / f"{scene.name}.tif"
     asked = Asked(roads=roads, date=MADE, dataset=name)
     prepare_mesh(home / "mesh.glb", home, asked, MeshAsked(), POINTS, SerialExecutor(), lambda _: None)

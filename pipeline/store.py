@@ -29,17 +29,6 @@ from pipeline.graph import Node, TileGraph
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
-def write_atomic(where: Place, data: bytes) -> None:
-    """Write a file whole or not at all, on disk or in a bucket.
-
-    Raises
-    ------
-    OSError
-        If the disk is full or the folder cannot be written; it names the file, and nothing is left behind.
-    """
-    places.write(where, data)
-
-
 @dataclass(frozen=True)
 class Store:
     """Results of stages by fingerprint; may be shared by runs."""
@@ -57,7 +46,7 @@ class Store:
     def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
         """Keep a result and what each stage up to it took; return how many bytes that is."""
         data = codec.encode(value, seconds)
-        write_atomic(self._path(node), data)
+        places.write(self._path(node), data)
         return len(data)
 
     def has(self, node: Node) -> bool:
@@ -111,14 +100,14 @@ class TileFolder:
         """
         places.remove(self.path / "item.json")
         for name, data in products.items():
-            write_atomic(self.path / name, data)
-        write_atomic(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
+            places.write(self.path / name, data)
+        places.write(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
         places.remove(self.path / "failed.json")
 
     def fail(self, failure: dict[str, Any]) -> None:
         """Write down a failure; the tile no longer counts as done."""
         places.remove(self.path / "item.json")
-        write_atomic(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
+        places.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
@@ -162,5 +151,5 @@ def check_writable(folder: Place) -> None:
         With the reason and the path.
     """
     probe = folder / f".probe-{uuid.uuid4().hex}"
-    write_atomic(probe, b"")
+    places.write(probe, b"")
     places.remove(probe)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from catalog.places import Place
+from catalog.places import Place, write
 from pipeline.report.content import gather
 from pipeline.report.pages import csv_page, html_page, markdown_page
 from pipeline.run import Run
-from pipeline.store import write_atomic
 
 FORMATS = ("md", "csv", "html")
 
@@ -32,5 +31,5 @@ def write_report(run: Run, form: str) -> Place:
     else:
         text = {"md": markdown_page, "csv": csv_page}[form](content)
     path = run.path / f"report.{form}"
-    write_atomic(path, text.encode())
+    write(path, text.encode())
     return path

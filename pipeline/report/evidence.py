@@ -9,11 +9,10 @@ from typing import Final
 
 import pandas as pd
 
-from catalog.places import Place
+from catalog.places import Place, write
 from pipeline.errors import ConfigError
 from pipeline.report.content import FIGURES
 from pipeline.run import Run
-from pipeline.store import write_atomic
 from pipeline.tables import frame_of, read_metrics
 
 FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
@@ -130,10 +129,10 @@ def _about(rows: pd.DataFrame) -> set[tuple[str, str]]:
 
 def write_evidence(evidence: Evidence, folder: Path) -> None:
     """Write the figures; those for DSC3D to a file of their own, if there are any."""
-    write_atomic(folder / FILE, _kept(evidence.rows))
+    write(folder / FILE, _kept(evidence.rows))
     if evidence.dsc3d:
         rows = pd.concat([beside.rows for beside in evidence.dsc3d], ignore_index=True)
-        write_atomic(folder / DSC3D_FILE, _kept(rows))
+        write(folder / DSC3D_FILE, _kept(rows))
     else:
         (folder / DSC3D_FILE).unlink(missing_ok=True)
 

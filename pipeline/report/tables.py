@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pandas as pd
 
+from catalog.places import write
 from pipeline.errors import ConfigError
 from pipeline.report.comparison import Comparison, compare
 from pipeline.report.evidence import Evidence, collect, write_evidence
 from pipeline.report.pages import are_numbers, markdown, template
 from pipeline.run import Run
-from pipeline.store import write_atomic
 
 TITLE = "The paper's tables, and ours"
 LATEX = {
@@ -58,7 +58,7 @@ def write_comparison(
         folder.mkdir(parents=True, exist_ok=True)
         write_evidence(evidence, folder)
         for name, text in made.items():
-            write_atomic(folder / name, text.encode())
+            write(folder / name, text.encode())
     except OSError as error:
         raise ConfigError(f"cannot write the tables to {folder}: {error}; choose another -o") from error
     return tuple(folder / name for name in made)

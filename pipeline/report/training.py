@@ -14,10 +14,11 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from catalog.places import write
 from pipeline.report.pages import template
 from pipeline.report.render import curves, found_map
 from pipeline.run import versions
-from pipeline.store import no_nan, write_atomic
+from pipeline.store import no_nan
 from pipeline.train import Judged, Outcome
 from tasks.mask_quality import Quality
 
@@ -48,9 +49,9 @@ def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
     """
     path = path if path.suffix else path.with_suffix(outcome.trained.suffix)
     page, facts = path.with_name(f"{path.name}.html"), path.with_name(f"{path.name}.json")
-    write_atomic(page, _page(outcome, path.name).encode())
-    write_atomic(facts, json.dumps(_facts(outcome), indent=1).encode())
-    write_atomic(path, outcome.trained.model)
+    write(page, _page(outcome, path.name).encode())
+    write(facts, json.dumps(_facts(outcome), indent=1).encode())
+    write(path, outcome.trained.model)
     return path, page, facts
 
 

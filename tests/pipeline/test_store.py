@@ -5,12 +5,13 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from catalog import Catalog
-from pipeline import codec, store
+from catalog import Catalog, places
+from catalog.places import write
+from pipeline import codec
 from pipeline.config import compose
 from pipeline.graph import tile_graph
 from pipeline.pull import Pull
-from pipeline.store import DAMAGED, Store, TileFolder, file_entry, write_atomic
+from pipeline.store import DAMAGED, Store, TileFolder, file_entry
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
@@ -108,7 +109,7 @@ def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeyp
             raise PermissionError(13, "denied", str(path))
         path.write_bytes(data)
 
-    monkeypatch.setattr(store, "write_atomic", denied)
+    monkeypatch.setattr(places, "write", denied)
     with pytest.raises(PermissionError):
         folder.finish({"is": 1}, {"a": b"new", "b": b"new"})
     assert sorted(path.name for path in folder.path.iterdir()) == ["a", "b"]
@@ -116,9 +117,9 @@ def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeyp
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     path = tmp_path / "a" / "b.json"
-    write_atomic(path, b"old")
+    write(path, b"old")
     with pytest.raises(TypeError):
-        write_atomic(path, "not bytes")
+        write(path, "not bytes")
     assert path.read_bytes() == b"old"
     assert [p.name for p in path.parent.iterdir()] == ["b.json"]
 

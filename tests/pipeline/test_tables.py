@@ -13,6 +13,7 @@ import pytest
 import scipy.stats
 
 from catalog import LAYERS, Catalog, Grid, Layer, Tile
+from catalog.places import write
 from pipeline.config import load_config
 from pipeline.errors import ConfigError
 from pipeline.report.bootstrap import bootstrap
@@ -23,7 +24,6 @@ from pipeline.report.evidence import KEPT, Evidence, collect, read_evidence, wri
 from pipeline.report.published import TABLE_I_DSC3D, TABLE_II, published
 from pipeline.report.tables import pages, write_comparison
 from pipeline.run import Run
-from pipeline.store import write_atomic
 from pipeline.tables import metrics_frame
 
 VARIANTS = list(load_config("ablation").chains)
@@ -252,7 +252,7 @@ def made_run(path, config="ablation", dataset=("made",), factor=1.0, layers=LAYE
     ]
     buffer = io.BytesIO()
     metrics_frame(rows).to_parquet(buffer, index=False)
-    write_atomic(run.path / "metrics.parquet", buffer.getvalue())
+    write(run.path / "metrics.parquet", buffer.getvalue())
     return run
 
 

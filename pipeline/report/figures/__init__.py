@@ -6,13 +6,13 @@ from pathlib import Path
 
 from matplotlib import rc_context
 
+from catalog.places import write
 from pipeline.report.evidence import collect
 from pipeline.report.figures import dataset, maps, profile, renders, trade_off
 from pipeline.report.figures.cast import Cast, cast_of
 from pipeline.report.figures.plate import STYLE, Plate, save
 from pipeline.report.figures.view import TileView, typical_tile, view_tile
 from pipeline.run import Run
-from pipeline.store import write_atomic
 from pipeline.tables import read_metrics
 
 
@@ -54,7 +54,7 @@ def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast
         for plate in plates:
             if plate.figure is not None:
                 save(plate.figure, folder, plate.name)
-    write_atomic(folder / "figures.md", _page(evidence.line, plates).encode())
+    write(folder / "figures.md", _page(evidence.line, plates).encode())
     return missing
 
 

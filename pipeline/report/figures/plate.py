@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
-from pipeline.store import write_atomic
+from catalog.places import write
 
 WIDTH_IN = 7.0
 """Width of a page's text."""
@@ -66,4 +66,4 @@ def save(figure: Figure, folder: Path, name: str) -> None:
         buffer = io.BytesIO()
         with rc_context(STYLE):
             figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
-        write_atomic(folder / f"{name}.{kind}", buffer.getvalue())
+        write(folder / f"{name}.{kind}", buffer.getvalue())
