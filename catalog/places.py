@@ -264,14 +264,28 @@ def write(where: Place, data: bytes) -> None:
         with named(where):
             where.fs.pipe_file(where.path, data)
         return
-    temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
-    try:
+    with aside(where) as temporary:
         where.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def aside(where: Path) -> Iterator[Path]:
+    """Give another file to write beside one, whose place it takes when it is whole.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; it names the place, and nothing is left behind.
+    """
+    temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
+    try:
+        yield temporary
         temporary.replace(where)
     except OSError as error:
         # A full disk names no file, a failed renaming the temporary one.
-        raise OSError(error.errno, error.strerror, str(where)) from error
+        number = error.errno or errno.EIO
+        raise OSError(number, error.strerror or str(error), str(where)) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

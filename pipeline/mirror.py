@@ -6,14 +6,12 @@ On disk a mirror is the file itself, and costs nothing.
 from __future__ import annotations
 
 import contextlib
-import errno
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
-from catalog.places import Place, read, write
+from catalog.places import Place, aside, read, write
 
 PUT_S = 60.0
 """How often a mirror is put back."""
@@ -106,14 +104,5 @@ def whole(where: Place) -> Iterator[Path]:
             yield local
             write(where, local.read_bytes())
         return
-    temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
-    try:
+    with aside(where) as temporary:
         yield temporary
-        temporary.replace(where)
-    except OSError as error:
-        # A full disk names no file, a failed renaming the temporary one.
-        number = error.errno or errno.EIO
-        raise OSError(number, error.strerror or str(error), str(where)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
