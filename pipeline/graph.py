@@ -6,7 +6,8 @@ Read `STAGES` and then the files it names, in that order, and you have read the 
 
 Beside them, `assess` says without ground truth how far the fitted surface can be trusted: not the paper's.
 
-A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``. A source layer counts
+A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; the method is one of the
+options. No module's name is part of it, so that files may move and stores stay valid. A source layer counts
 by (path relative to the catalog, size, mtime), or by its bytes, for the stages whose module names it in
 `READS`; a file that only the options name (a model), told by the module's `files`, counts by its bytes.
 Variants that agree up to a stage share its node, so it is computed once; a node whose artefact lies in the
@@ -98,6 +99,12 @@ class TileGraph:
 def stage_module(options: Options) -> ModuleType:
     """Return the file that does the work: where the options' model is defined, with its `VERSION`."""
     return sys.modules[type(options).__module__]
+
+
+def stage_version(stage: str, options: Options) -> tuple[str, int]:
+    """Return the name of a stage with its method, such as ``fit.nurbs``, and its `VERSION`."""
+    method = options.model_dump().get("method")
+    return f"{stage}.{method}" if method else stage, stage_module(options).VERSION
 
 
 def stage_function(stage: str, options: Options) -> Callable[..., Any]:
@@ -211,7 +218,7 @@ class Pattern:
 
 def _step(stage: Stage, options: Options, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
     module = stage_module(options)
-    head = [stage.name, module.__name__, module.VERSION, options.model_dump(mode="json")]
+    head = [stage.name, module.VERSION, options.model_dump(mode="json")]
     stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
     reads = getattr(module, "READS", ())
     return Step(stage.name, options, _json(head)[1:-1], inputs, reads, model_files(options), stored)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from catalog.index import item
 from catalog.places import place, stat
 from pipeline.entry import MARKERS, Entry, Failure, Marker, Row, State, from_item, to_failed
-from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_module
+from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_version
 from pipeline.meter import Span, now
 from pipeline.products import products
 from pipeline.pull import Pull, StageError, failure_of
@@ -225,5 +225,4 @@ def _item(
 
 
 def _versions(graph: TileGraph) -> dict[str, int]:
-    modules = [stage_module(node.options) for node in graph.nodes.values()]
-    return {module.__name__: module.VERSION for module in modules}
+    return dict(stage_version(node.stage, node.options) for node in graph.nodes.values())

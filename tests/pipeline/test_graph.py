@@ -4,13 +4,14 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 from dataclasses import asdict, replace
 
 import pytest
 
 from catalog import Catalog, Layer
 from pipeline.config import compose, load_config
-from pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, tile_graph
+from pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, stage_version, tile_graph
 from tasks import ecsrc
 from tasks.segment import mask
 
@@ -61,7 +62,6 @@ def literally(graph, config) -> dict[str, dict[str, str]]:
             module = stage_module(options)
             made_of = [
                 stage.name,
-                module.__name__,
                 module.VERSION,
                 options.model_dump(mode="json"),
                 [made[name] for name in stage.inputs] or asdict(tile.grid),
@@ -90,6 +90,22 @@ def test_a_version_changes_its_stage_and_what_follows(survey, monkeypatch):
     before = names(survey)
     monkeypatch.setattr(ecsrc, "VERSION", ecsrc.VERSION + 1)
     assert changed(before, names(survey)) == ["ecsrc", "fit", "sample", "evaluate", "assess"]
+
+
+def test_stage_under_another_module_name_keeps_its_fingerprint(survey, monkeypatch):
+    before = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    monkeypatch.setitem(sys.modules, "elsewhere", ecsrc)
+    monkeypatch.setattr(ecsrc, "__name__", "elsewhere")
+    monkeypatch.setattr(ecsrc.Options, "__module__", "elsewhere")
+    after = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
+    moved = after.nodes[after.variants["flexroad"]["ecsrc"]]
+    assert stage_module(moved.options).__name__ == "elsewhere"
+    assert after == before
+    assert dict(map(versions_of, after.nodes.values())) == dict(map(versions_of, before.nodes.values()))
+
+
+def versions_of(node) -> tuple[str, int]:
+    return stage_version(node.stage, node.options)
 
 
 def test_variants_share_what_they_have_in_common(survey):
