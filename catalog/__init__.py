@@ -1,8 +1,8 @@
 """What exists: tiles, where they lie, and where their layers are."""
 
-from catalog.errors import CatalogError
-from catalog.grid import Bounds, Grid
-from catalog.index import Catalog
-from catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.index import Catalog
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 __all__ = ["LAYERS", "Bounds", "Catalog", "CatalogError", "Grid", "Layer", "Tile"]

@@ -14,8 +14,8 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 
-from catalog.clouds import chunks
-from catalog.grid import Bounds
+from flexroad.catalog.clouds import chunks
+from flexroad.catalog.grid import Bounds
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]

@@ -10,8 +10,8 @@ from pyproj.database import query_crs_info, query_utm_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
 
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
 
 Unit = tuple[str, float]
 """Name of a unit of length (or angle) and how many metres (or radians) it has."""

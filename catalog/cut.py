@@ -18,11 +18,11 @@ import shapely
 from numpy.typing import NDArray
 from rasterio.warp import transform_bounds
 
-from catalog.crs import same, short
-from catalog.errors import CatalogError
-from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from catalog.raster_files import RasterFile, require_metric, some, zoned
-from catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.crs import same, short
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.raster_files import RasterFile, require_metric, some, zoned
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 REACH_M = 100.0
 """A tile names the files within this distance of it, so that `load` can read a halo around it."""

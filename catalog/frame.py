@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.crs import (
+from flexroad.catalog.crs import (
     degrees,
     height_unit,
     in_plan,
@@ -21,7 +21,7 @@ from catalog.crs import (
     transformer,
     utm_of,
 )
-from catalog.errors import CatalogError
+from flexroad.catalog.errors import CatalogError
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from catalog.errors import CatalogError
+from flexroad.catalog.errors import CatalogError
 
 Bounds = tuple[float, float, float, float]
 """West, south, east, north in metres."""

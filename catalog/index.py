@@ -21,11 +21,11 @@ import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from catalog import places
-from catalog.errors import CatalogError
-from catalog.grid import Bounds, Grid
-from catalog.places import Place, absolute, joined, normal, place
-from catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog import places
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.places import Place, absolute, joined, normal, place
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 Item = dict[str, Any]
 

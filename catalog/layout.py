@@ -14,11 +14,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from catalog.cut import MASKS, Indexed, assumed, taken
-from catalog.errors import CatalogError
-from catalog.grid import Grid
-from catalog.raster_files import RasterFile, opened, require_metric, some
-from catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.cut import MASKS, Indexed, assumed, taken
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.raster_files import RasterFile, opened, require_metric, some
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 NEEDED = ("dsm", "dtm")
 PLACEHOLDER = re.compile(r"\{(.*?)\}")

@@ -15,10 +15,10 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.warp import transform_bounds
 
-from catalog.crs import in_plan, plan_unit, short, utm_of
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
-from catalog.places import gdal_options
+from flexroad.catalog.crs import in_plan, plan_unit, short, utm_of
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.places import gdal_options
 
 GDAL = {
     # A folder of 10,000 files is not listed anew for each of them; side-car files are still found.

@@ -10,12 +10,12 @@ import numpy as np
 import shapely
 from pyproj.exceptions import ProjError
 
-from catalog.crs import transformer
-from catalog.cut import REACH_M
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
-from catalog.raster_files import matching
-from catalog.tile import Layer, Tile
+from flexroad.catalog.crs import transformer
+from flexroad.catalog.cut import REACH_M
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.raster_files import matching
+from flexroad.catalog.tile import Layer, Tile
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
-from catalog.grid import Grid
-from catalog.places import Place, joined, place
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.places import Place, joined, place
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and

@@ -12,10 +12,10 @@ import re
 import shlex
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
-from catalog.errors import CatalogError
-from catalog.index import Catalog
-from catalog.places import Place, absolute, joined, normal, place
-from catalog.tile import LAYERS
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.index import Catalog
+from flexroad.catalog.places import Place, absolute, joined, normal, place
+from flexroad.catalog.tile import LAYERS
 
 MOST = 4
 """Folders to allow that are named one by one; of more, those that they lie in."""

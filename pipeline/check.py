@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from catalog import LAYERS, Catalog, Tile
-from catalog.crs import short
-from catalog.places import Place, Sightings
-from tasks import load, registration
-from tasks.errors import TaskError
-from tasks.photo import read_photo
+from flexroad.catalog import LAYERS, Catalog, Tile
+from flexroad.catalog.crs import short
+from flexroad.catalog.places import Place, Sightings
+from flexroad.tasks import load, registration
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.photo import read_photo
 
 MOST = 12
 """Tiles whose photo is compared with the heights: spread evenly over the catalog."""

@@ -14,19 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from catalog.errors import CatalogError
-from catalog.places import Place, absolute, exists, listing, remove
-from pipeline.entry import DONE, FAILED
-from pipeline.errors import ConfigError
-from pipeline.graph import STAGE_NAMES
-from pipeline.ledger import NAME as LEDGER
-from pipeline.ledger import Ledger
-from pipeline.lock import held
-from pipeline.look import stands
-from pipeline.products import SUFFIXES
-from pipeline.registry import FOLDER, users
-from pipeline.run import Run, check_models
-from pipeline.store import plain_name
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.places import Place, absolute, exists, listing, remove
+from flexroad.pipeline.entry import DONE, FAILED
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph import STAGE_NAMES
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.ledger import Ledger
+from flexroad.pipeline.lock import held
+from flexroad.pipeline.look import stands
+from flexroad.pipeline.products import SUFFIXES
+from flexroad.pipeline.registry import FOLDER, users
+from flexroad.pipeline.run import Run, check_models
+from flexroad.pipeline.store import plain_name
 
 Kind = Literal["artefacts", "products", "tiles", "temporary files"]
 MEANING: dict[Kind, str] = {

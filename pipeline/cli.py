@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from catalog.errors import CatalogError
-from pipeline.cli_clean import clean
-from pipeline.cli_prepare import prepare
-from pipeline.cli_run import next_run, rerun, run, status
-from pipeline.cli_train import train
-from pipeline.ending import unread
-from pipeline.errors import ConfigError
+from flexroad.catalog.errors import CatalogError
+from flexroad.pipeline.cli_clean import clean
+from flexroad.pipeline.cli_prepare import prepare
+from flexroad.pipeline.cli_run import next_run, rerun, run, status
+from flexroad.pipeline.cli_train import train
+from flexroad.pipeline.ending import unread
+from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from catalog.cut import Indexed
+    from flexroad.catalog.cut import Indexed
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -132,7 +132,7 @@ def catalog_rasters(
     crs: Annotated[str | None, typer.Option(help="CRS of files that carry none: EPSG:25832.")] = None,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
-    from catalog.sources import rasters
+    from flexroad.catalog.sources import rasters
 
     asked = {
         "dsm": dsm,
@@ -167,7 +167,7 @@ def catalog_nrw(
     date: Date = None,
 ) -> None:
     """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
-    from catalog.sources import nrw
+    from flexroad.catalog.sources import nrw
 
     found = nrw.index(
         root,
@@ -192,8 +192,8 @@ def catalog_gerod(
     date: Date = None,
 ) -> None:
     """List the tiles of the GeRoD dataset."""
-    from catalog.sources import gerod
-    from pipeline.config import load_config
+    from flexroad.catalog.sources import gerod
+    from flexroad.pipeline.config import load_config
 
     _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output)
 
@@ -208,14 +208,14 @@ def catalog_dsc3d(
     date: Date = None,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
-    from catalog.sources import dsc3d
-    from pipeline.config import load_config
+    from flexroad.catalog.sources import dsc3d
+    from flexroad.pipeline.config import load_config
 
     _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
 
 
 def _write_catalog(found: Indexed, output: Path) -> None:
-    from catalog import Catalog
+    from flexroad.catalog import Catalog
 
     for note in found.notes:
         typer.echo(f"note: {note}", err=True)
@@ -242,8 +242,8 @@ def catalog_synthetic(
     dop: Annotated[bool, typer.Option("--dop", help="Orthophotos of 0.5 m, too.")] = False,
 ) -> None:
     """Make scenes with known truth: rasters, truth and a catalog."""
-    from catalog import Catalog
-    from pipeline.synthesis import write_scenes
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.synthesis import write_scenes
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     _say(f"{len(Catalog.read(path).tiles)} tiles in {path}")
@@ -253,7 +253,7 @@ def catalog_synthetic(
 @catalogs.command("show")
 def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
     """List the tiles of a catalog."""
-    from catalog import Catalog
+    from flexroad.catalog import Catalog
 
     catalog = Catalog.read(path)
     for tile in catalog.tiles:
@@ -268,8 +268,8 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
 @catalogs.command("check")
 def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
     """Look a catalog over: layers, missing files, and how far the photo lies off the heights."""
-    from catalog import Catalog
-    from pipeline.check import check
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.check import check
 
     faults = 0
     for remark in check(Catalog.read(path)):
@@ -288,9 +288,9 @@ def report(
     form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
 ) -> None:
     """Write RUN/report.<format>: the paper's main table over the run, worst tiles, steps, failures."""
-    from catalog.places import read
-    from pipeline.report import FORMATS, write_report
-    from pipeline.run import Run
+    from flexroad.catalog.places import read
+    from flexroad.pipeline.report import FORMATS, write_report
+    from flexroad.pipeline.run import Run
 
     if form not in FORMATS:
         raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
@@ -317,8 +317,8 @@ def tables(
     ] = None,
 ) -> None:
     """Write the paper's tables and claims with a run's figures beside them: Markdown, LaTeX, CSV, HTML."""
-    from pipeline.report.tables import write_comparison
-    from pipeline.run import Run
+    from flexroad.pipeline.report.tables import write_comparison
+    from flexroad.pipeline.run import Run
 
     others = [Run.open(other) if other else None for other in (true, dsc3d, dsc3d_true)]
     for written in write_comparison(Run.open(path), others[0], output, *others[1:]):
@@ -334,8 +334,8 @@ def figures(
     ] = None,
 ) -> None:
     """Draw the paper's figures from a run, as PDF and PNG with a page of captions."""
-    from pipeline.report.figures import write_figures
-    from pipeline.run import Run
+    from flexroad.pipeline.report.figures import write_figures
+    from flexroad.pipeline.run import Run
 
     for note in write_figures(Run.open(path), output, tile):
         typer.echo(f"note: {note}", err=True)
@@ -349,7 +349,7 @@ def query(
     variant: Annotated[str | None, typer.Option(help="Which surface; default: the exported one.")] = None,
 ) -> None:
     """Tell height, unit normal, tile and class of the ground under points, as CSV."""
-    from pipeline.query import query_csv
+    from flexroad.pipeline.query import query_csv
 
     missed = query_csv(path, points, variant, sys.stdout)
     if missed:
@@ -368,7 +368,7 @@ def config_show(
     """Show a configuration as it is resolved, every option of every variant."""
     import yaml
 
-    from pipeline.config import load_config, shipped
+    from flexroad.pipeline.config import load_config, shipped
 
     if name is None:
         for known, path in shipped().items():
@@ -386,7 +386,7 @@ def config_show(
 @configs.command("template")
 def config_template() -> None:
     """Print a configuration with every option, its default and its meaning."""
-    from pipeline.config import template
+    from flexroad.pipeline.config import template
 
     typer.echo(template(), nl=False)
 
@@ -396,6 +396,6 @@ def config_schema() -> None:
     """Print the JSON schema of a configuration, for editors."""
     import json
 
-    from pipeline.config import schema
+    from flexroad.pipeline.config import schema
 
     _say(json.dumps(schema(), indent=1))

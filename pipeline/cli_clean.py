@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.errors import ConfigError
+from flexroad.pipeline.errors import ConfigError
 
 
 def clean(
@@ -20,12 +20,12 @@ def clean(
     ] = None,
 ) -> None:
     """Drop what no run needs: artefacts, tiles and products that are gone, leftovers of killed writers."""
-    from catalog.places import absolute, place
-    from pipeline.clean import MEANING, alone, drop, waste
-    from pipeline.lock import held
-    from pipeline.registry import forget as strike
-    from pipeline.registry import users
-    from pipeline.run import Run
+    from flexroad.catalog.places import absolute, place
+    from flexroad.pipeline.clean import MEANING, alone, drop, waste
+    from flexroad.pipeline.lock import held
+    from flexroad.pipeline.registry import forget as strike
+    from flexroad.pipeline.registry import users
+    from flexroad.pipeline.run import Run
 
     def say(line: str) -> None:
         typer.echo(f"note: {line}", err=True)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pipeline.cli_run import next_run
-from pipeline.prepare.asked import Asked
+from flexroad.pipeline.cli_run import next_run
+from flexroad.pipeline.prepare.asked import Asked
 
 if TYPE_CHECKING:
-    from pipeline.execute import Executor
-    from pipeline.prepare.sheet import Published
-    from tasks.acquire.points import Options
+    from flexroad.pipeline.execute import Executor
+    from flexroad.pipeline.prepare.sheet import Published
+    from flexroad.tasks.acquire.points import Options
 
 prepare = typer.Typer(
     no_args_is_help=True, help="Make DSM, DTM, orthophoto and a catalog where there are none yet."
@@ -98,8 +98,8 @@ def _points_options(
     slope: float | None, radius: float | None, fill: float | None, void: float | None, **more: Any
 ) -> Options:
     """Return how points become rasters: the defaults but for what was asked."""
-    from tasks.acquire.ground import Options as Filter
-    from tasks.acquire.points import Options
+    from flexroad.tasks.acquire.ground import Options as Filter
+    from flexroad.tasks.acquire.points import Options
 
     ground_filter = Filter(**_told(slope=slope, radius_m=radius))
     return Options(filter=ground_filter, **_told(fill_m=fill, void_m=void, **more))
@@ -111,7 +111,7 @@ def _told(**options: Any) -> dict[str, Any]:
 
 
 def _executor(workers: int | None) -> Executor:
-    from pipeline.execute import DaskExecutor, SerialExecutor
+    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 
     return SerialExecutor() if workers == 1 else DaskExecutor(workers)
 
@@ -124,8 +124,8 @@ def _carry_out(make: Callable[[], Published]) -> None:
     """Make it; an operator's `kill` ends it as Ctrl-C does, with nothing left behind."""
     import signal
 
-    from pipeline.errors import ConfigError
-    from tasks.errors import TaskError
+    from flexroad.pipeline.errors import ConfigError
+    from flexroad.tasks.errors import TaskError
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -168,7 +168,7 @@ def prepare_points(
     workers: Workers = None,
 ) -> None:
     """Raster laser scans and other point clouds: highest point per cell, ground, bridges, colours."""
-    from pipeline.prepare import points
+    from flexroad.pipeline.prepare import points
 
     options = _points_options(
         slope,
@@ -215,7 +215,7 @@ def prepare_mesh(
     workers: Workers = None,
 ) -> None:
     """Raster a textured mesh as the paper does: sampled points, highest per cell, view from above."""
-    from pipeline.prepare import mesh as meshes
+    from flexroad.pipeline.prepare import mesh as meshes
 
     of_mesh = meshes.MeshAsked(up, offset, density, seed, dop=not no_dop, refine=not no_refine)
     options = _points_options(slope, radius, fill, void, ground="filter")
@@ -237,7 +237,7 @@ def prepare_odm(
     workers: Workers = None,
 ) -> None:
     """Take what an OpenDroneMap project has: its rasters, else its textured mesh, else its points."""
-    from pipeline.prepare import mesh, odm
+    from flexroad.pipeline.prepare import mesh, odm
 
     of_mesh = mesh.MeshAsked(density=density, seed=seed)
     options = _points_options(slope, radius, fill, void, ground="filter")
@@ -271,8 +271,8 @@ def prepare_photos(
     workers: Workers = None,
 ) -> None:
     """Reconstruct a place from photographs: cameras, dense stereo, Poisson mesh, and that as `mesh` does."""
-    from pipeline.prepare import photos
-    from tasks.acquire import dense, patchmatch, photogrammetry
+    from flexroad.pipeline.prepare import photos
+    from flexroad.tasks.acquire import dense, patchmatch, photogrammetry
 
     of_photos = photos.PhotosAsked(
         control,

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.ending import ON_FAILURE, Ending, line, overseen
-from pipeline.errors import ClusterLost, ConfigError
-from pipeline.unheard import patient
+from flexroad.pipeline.ending import ON_FAILURE, Ending, line, overseen
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.unheard import patient
 
 if TYPE_CHECKING:
-    from catalog import Catalog, Tile
-    from catalog.places import Place
-    from pipeline.cluster import Cluster
-    from pipeline.config import Config
-    from pipeline.execute import Executor
-    from pipeline.run import Run
-    from pipeline.work import TileResult
+    from flexroad.catalog import Catalog, Tile
+    from flexroad.catalog.places import Place
+    from flexroad.pipeline.cluster import Cluster
+    from flexroad.pipeline.config import Config
+    from flexroad.pipeline.execute import Executor
+    from flexroad.pipeline.run import Run
+    from flexroad.pipeline.work import TileResult
 
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")]
@@ -71,12 +71,12 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the graph, do nothing.")] = False,
 ) -> None:
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
-    from catalog import Catalog
-    from catalog.places import absolute, normal, place
-    from catalog.trust import refuse_outside
-    from pipeline.config import load_config
-    from pipeline.graph import layers_read
-    from pipeline.run import Run, asked, select
+    from flexroad.catalog import Catalog
+    from flexroad.catalog.places import absolute, normal, place
+    from flexroad.catalog.trust import refuse_outside
+    from flexroad.pipeline.config import load_config
+    from flexroad.pipeline.graph import layers_read
+    from flexroad.pipeline.run import Run, asked, select
 
     path, listed, root = place(out), place(catalog), place(store) if store else None
     # What its own folder holds is a catalog's to name.
@@ -91,8 +91,8 @@ def run(
         return whole, found
 
     if dry_run:
-        from pipeline.graph import tile_graphs
-        from pipeline.plan import plan
+        from flexroad.pipeline.graph import tile_graphs
+        from flexroad.pipeline.plan import plan
 
         chosen = load_config(config)
         graphs = tile_graphs(wanted(chosen)[1], chosen, checksum)
@@ -129,10 +129,10 @@ def rerun(
     prometheus: Prometheus = None,
 ) -> None:
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
-    from catalog.places import place
-    from catalog.trust import refuse_outside
-    from pipeline.graph import STAGE_NAMES, layers_read
-    from pipeline.run import Run, select
+    from flexroad.catalog.places import place
+    from flexroad.catalog.trust import refuse_outside
+    from flexroad.pipeline.graph import STAGE_NAMES, layers_read
+    from flexroad.pipeline.run import Run, select
 
     where = place(path)
     with overseen(where, on_failure, prometheus, _warn) as ending:
@@ -153,7 +153,7 @@ def rerun(
 @contextlib.contextmanager
 def _alone(path: Place, make: bool = False) -> Iterator[None]:
     """Keep other runs out of the folder; ``make`` it if it is not there."""
-    from pipeline.lock import held
+    from flexroad.pipeline.lock import held
 
     try:
         if make and isinstance(path, Path):
@@ -172,7 +172,7 @@ def _executor(
     dashboard: bool,
     say: Callable[[str], None],
 ) -> Executor:
-    from pipeline.execute import DaskExecutor, SerialExecutor
+    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 
     if name == "serial":
         return SerialExecutor()
@@ -192,8 +192,8 @@ def _carry_out(
     """Do the tiles, and fill in how that ended."""
     from rich.console import Console
 
-    from pipeline.progress import Watch
-    from pipeline.run import execute
+    from flexroad.pipeline.progress import Watch
+    from flexroad.pipeline.run import execute
 
     folder = shlex.quote(str(run.path))
     console = Console(stderr=True)
@@ -231,7 +231,7 @@ def _carry_out(
 
 def _draw(run: Run) -> None:
     """Write the map of the tiles' states; a run without one is a run all the same."""
-    from pipeline.states import NAME, write_states
+    from flexroad.pipeline.states import NAME, write_states
 
     try:
         write_states(run, run.path / NAME)
@@ -252,10 +252,10 @@ def _warn(line: str, kind: str = "warning") -> None:
 
 def next_run(catalog: Path) -> str:
     """Return the command that runs a catalog, with leave for all that it reads."""
-    from catalog import Catalog
-    from catalog.trust import needed
-    from pipeline.config import load_config
-    from pipeline.graph import layers_read
+    from flexroad.catalog import Catalog
+    from flexroad.catalog.trust import needed
+    from flexroad.pipeline.config import load_config
+    from flexroad.pipeline.graph import layers_read
 
     read = layers_read(load_config("paper"))
     folders = needed(Catalog.read(catalog), catalog.parent, read)
@@ -273,22 +273,22 @@ def status(
     every: Annotated[float, typer.Option(min=0.1, help="With --watch: how often to look (s).")] = 2,
 ) -> None:
     """Tell how a run stands, and what failed why."""
-    from catalog.places import exists, place
-    from pipeline.run import Run
+    from flexroad.catalog.places import exists, place
+    from flexroad.pipeline.run import Run
 
     where = place(path)
     # Not opened for a look at its ledger: that reads the catalog.
     if watch and exists(where / "run.json"):
         from rich.console import Console
 
-        from pipeline.follow import follow
+        from flexroad.pipeline.follow import follow
 
         with contextlib.suppress(KeyboardInterrupt):
             follow(where, Console(), every)
         return
     opened = Run.open(where)
     if geojson is not None:
-        from pipeline.states import write_states
+        from flexroad.pipeline.states import write_states
 
         write_states(opened, place(geojson))
         typer.echo(str(geojson))
@@ -300,8 +300,8 @@ def _tell(run: Run, as_json: bool) -> None:
     import json
     from dataclasses import asdict
 
-    from pipeline.lock import at_work, dead, holder
-    from pipeline.summary import summary
+    from flexroad.pipeline.lock import at_work, dead, holder
+    from flexroad.pipeline.summary import summary
 
     how, who = summary(run), holder(run.path)
     if as_json:

@@ -41,13 +41,13 @@ def train(
     ] = None,
 ) -> None:
     """Train a segmenter on labelled tiles and judge it on others: MODEL, MODEL.html, MODEL.json."""
-    from catalog import Catalog
-    from pipeline.config import load_config
-    from pipeline.errors import ConfigError
-    from pipeline.report.training import summary, write_model
-    from pipeline.store import check_writable
-    from pipeline.train import Asked, train
-    from tasks.errors import TaskError
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.config import load_config
+    from flexroad.pipeline.errors import ConfigError
+    from flexroad.pipeline.report.training import summary, write_model
+    from flexroad.pipeline.store import check_writable
+    from flexroad.pipeline.train import Asked, train
+    from flexroad.tasks.errors import TaskError
 
     asked = Asked(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
     found, chosen = Catalog.read(catalog), load_config(config)
@@ -69,7 +69,7 @@ def _settings(words: list[str]) -> dict[str, Any]:
     """Return settings by name; values are read as YAML has them."""
     import yaml
 
-    from pipeline.errors import ConfigError
+    from flexroad.pipeline.errors import ConfigError
 
     found: dict[str, Any] = {}
     for word in words:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import ByteSize, Field
 
-from tasks.options import Options
+from flexroad.tasks.options import Options
 
 
 class Cluster(Options):

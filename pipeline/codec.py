@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from catalog import Grid
-from pipeline.config import methods
-from tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
+from flexroad.catalog import Grid
+from flexroad.pipeline.config import methods
+from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
 HEADER = "header.json"
 SHA256_BYTES = 32
@@ -70,6 +70,6 @@ def _types() -> dict[str, type]:
     known: dict[str, type] = {
         kind.__name__: kind for kind in (Mesh, Metrics, Quality, RoadClusters, RoadMask)
     }
-    for module in methods("tasks.fit").values():
+    for module in methods("flexroad.tasks.fit").values():
         known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
     return known

@@ -18,10 +18,10 @@ from typing import Annotated, Any, Literal, Union
 import yaml
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from pipeline.cluster import Cluster
-from pipeline.errors import ConfigError
-from tasks import assess, ecsrc, evaluate, grounded, load, sample
-from tasks.options import Options
+from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks import assess, ecsrc, evaluate, grounded, load, sample
+from flexroad.tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method", "cluster": "kind"}
 """The option that a bare word stands for, by stage or section."""
@@ -84,9 +84,9 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
 
     return {
         "load": TypeAdapter(load.Options),
-        "segment": one_of("tasks.segment"),
+        "segment": one_of("flexroad.tasks.segment"),
         "ecsrc": TypeAdapter(Annotated[ecsrc.Options | grounded.Options, Field(discriminator="variant")]),
-        "fit": one_of("tasks.fit"),
+        "fit": one_of("flexroad.tasks.fit"),
         "sample": TypeAdapter(sample.Options),
         "evaluate": TypeAdapter(evaluate.Options),
         "assess": TypeAdapter(assess.Options),
@@ -103,9 +103,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 def shipped() -> dict[str, Path]:
     """Return the configurations that come with the program, by name."""
-    here = Path(__file__).parent
-    # Installed, they lie inside the package; in a checkout, beside it.
-    folder = here / "configs" if (here / "configs").is_dir() else here.parent / "configs"
+    # In a checkout the package is a link to this folder, and the configurations lie beside it, too.
+    folder = Path(__file__).resolve().parents[1] / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
@@ -176,7 +175,7 @@ def schema() -> dict[str, Any]:
 def template() -> str:
     """Return a configuration file with every option at its default and its meaning beside it."""
     lines = ["# Every option with its default. Delete what you do not change."]
-    packages = {"segment": "tasks.segment", "fit": "tasks.fit"}
+    packages = {"segment": "flexroad.tasks.segment", "fit": "flexroad.tasks.fit"}
     for stage in stage_models():
         lines.append(f"{stage}:")
         if stage in packages:

@@ -1,6 +1,6 @@
 """One tile of a run as an xarray Dataset, to look into.
 
->>> from pipeline.dataset import open_tile
+>>> from flexroad.pipeline.dataset import open_tile
 >>> tile = open_tile("RUN", "295500_5629250")                    # doctest: +SKIP
 >>> (tile.surface - tile.reference).where(tile.road).plot()      # doctest: +SKIP
 """
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from catalog.places import Place, place
-from pipeline.errors import ConfigError
-from pipeline.look import look_at
-from pipeline.pull import Pull, StageError
-from pipeline.run import Run
-from pipeline.store import Store
+from flexroad.catalog.places import Place, place
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from catalog.errors import CatalogError
-from catalog.places import Place
-from pipeline.errors import ConfigError
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.places import Place
+from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.prometheus import Textfile
-    from pipeline.summary import Summary
+    from flexroad.pipeline.prometheus import Textfile
+    from flexroad.pipeline.summary import Summary
 
 CANNOT_START = 2
 INTERRUPTED = 130
@@ -58,7 +58,7 @@ def overseen(
     ConfigError
         If the file for Prometheus cannot be written.
     """
-    from pipeline.summary import read_summary
+    from flexroad.pipeline.summary import read_summary
 
     before = read_summary(run)
     ending = Ending()
@@ -118,7 +118,7 @@ def _end_as_ctrl_c() -> Iterator[None]:
 def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Textfile | None:
     if path is None:
         return None
-    from pipeline.prometheus import Textfile
+    from flexroad.pipeline.prometheus import Textfile
 
     name = str(run.resolve()) if isinstance(run, Path) else str(run)
     try:
@@ -138,8 +138,8 @@ def _alarm(
 ) -> None:
     if not target or not ending.exit_code:
         return
-    from pipeline.notify import notify
-    from pipeline.summary import read_summary
+    from flexroad.pipeline.notify import notify
+    from flexroad.pipeline.summary import read_summary
 
     now = read_summary(run)
     told = {

@@ -14,10 +14,10 @@ from rich.padding import Padding
 from rich.progress_bar import ProgressBar
 from rich.text import Text
 
-from catalog.places import Place
-from pipeline.ledger import NAME as LEDGER
-from pipeline.ledger import Ledger
-from pipeline.lock import Holder, at_work, holder
+from flexroad.catalog.places import Place
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.ledger import Ledger
+from flexroad.pipeline.lock import Holder, at_work, holder
 
 SHOWN = 5
 """Failures that are named."""

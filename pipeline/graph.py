@@ -6,10 +6,10 @@ Read `STAGES` and then the files it names, in that order, and you have read the 
 
 Beside them, `assess` says without ground truth how far the fitted surface can be trusted: not the paper's.
 
-A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; the method is one of the
-options. No module's name is part of it, so that files may move and stores stay valid. A source layer counts
-by (path relative to the catalog, size, mtime), or by its bytes, for the stages whose module names it in
-`READS`; a file that only the options name (a model), told by the module's `files`, counts by its bytes.
+A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inputs)``; the method is one of
+the options. No module's name is part of it, so that files may move and stores stay valid. A source layer
+counts by (path relative to the catalog, size, mtime), or by its bytes, for the stages whose module names it
+in `READS`; a file that only the options name (a model), told by the module's `files`, counts by its bytes.
 Variants that agree up to a stage share its node, so it is computed once; a node whose artefact lies in the
 store is not computed at all.
 """
@@ -26,10 +26,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from catalog import Catalog, Layer, Tile
-from catalog.places import Place, Seen, read, stat
-from pipeline.config import Config, Export
-from tasks.options import Options
+from flexroad.catalog import Catalog, Layer, Tile
+from flexroad.catalog.places import Place, Seen, read, stat
+from flexroad.pipeline.config import Config, Export
+from flexroad.tasks.options import Options
 
 Look = Callable[[Place], Seen | None]
 Recorded = Sequence[Any]

@@ -16,10 +16,10 @@ import json
 from dataclasses import asdict
 from typing import IO, Any
 
-from catalog.places import Place, is_remote
-from pipeline.meter import now
-from pipeline.mirror import Mirror
-from pipeline.work import TileResult
+from flexroad.catalog.places import Place, is_remote
+from flexroad.pipeline.meter import now
+from flexroad.pipeline.mirror import Mirror
+from flexroad.pipeline.work import TileResult
 
 
 class Journal:

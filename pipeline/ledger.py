@@ -23,9 +23,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-from catalog.places import Place
-from pipeline.entry import Entry, Failure, Row
-from pipeline.mirror import Mirror
+from flexroad.catalog.places import Place
+from flexroad.pipeline.entry import Entry, Failure, Row
+from flexroad.pipeline.mirror import Mirror
 
 NAME = "ledger.sqlite"
 VERSION = 1

@@ -21,9 +21,9 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from catalog.places import Place, read
-from pipeline.errors import ConfigError
-from pipeline.lock_file import LockFile, OnDisk, Sight
+from flexroad.catalog.places import Place, read
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.lock_file import LockFile, OnDisk, Sight
 
 NAME = "lock.json"
 TRIES = 20
@@ -252,7 +252,7 @@ class _Lock:
 def _file(path: Place) -> LockFile:
     if isinstance(path, Path):
         return OnDisk(path)
-    from pipeline.lock_bucket import InBucket
+    from flexroad.pipeline.lock_bucket import InBucket
 
     return InBucket(path)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from upath import UPath
 
-from catalog.places import named, read, remove
-from pipeline.lock_file import Sight
+from flexroad.catalog.places import named, read, remove
+from flexroad.pipeline.lock_file import Sight
 
 REFUSED = (409, 412)
 """Answers to a conditional request: another came in between, a condition not met."""

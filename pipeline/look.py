@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from catalog import Tile
-from catalog.places import Place, Seen, is_remote, listing, read
-from pipeline.entry import DONE, FAILED, Entry, Marker, from_failed, from_item
-from pipeline.graph import Look, TileGraph, any_gone
-from pipeline.ledger import NAME, Ledger
-from pipeline.store import TileFolder
+from flexroad.catalog import Tile
+from flexroad.catalog.places import Place, Seen, is_remote, listing, read
+from flexroad.pipeline.entry import DONE, FAILED, Entry, Marker, from_failed, from_item
+from flexroad.pipeline.graph import Look, TileGraph, any_gone
+from flexroad.pipeline.ledger import NAME, Ledger
+from flexroad.pipeline.store import TileFolder
 
 if TYPE_CHECKING:
-    from pipeline.run import Run
+    from flexroad.pipeline.run import Run
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from catalog.places import Place
-from pipeline.graph import STAGE_NAMES, TileGraph
-from pipeline.store import Store, TileFolder
+from flexroad.catalog.places import Place
+from flexroad.pipeline.graph import STAGE_NAMES, TileGraph
+from flexroad.pipeline.store import Store, TileFolder
 
 
 def plan(graphs: Iterable[TileGraph], store: Place, run: Place) -> Iterator[str]:

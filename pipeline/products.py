@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pipeline.graph import TileGraph
-from pipeline.store import plain_name
-from tasks.export import cog, glb, npz, ply
-from tasks.nurbs import NurbsSurface
-from tasks.support import of_faces
+from flexroad.pipeline.graph import TileGraph
+from flexroad.pipeline.store import plain_name
+from flexroad.tasks.export import cog, glb, npz, ply
+from flexroad.tasks.nurbs import NurbsSurface
+from flexroad.tasks.support import of_faces
 
 Product = tuple[bytes, str]
 """Bytes and media type."""

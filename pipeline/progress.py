@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from pipeline.work import TileResult
+from flexroad.pipeline.work import TileResult
 
 PLAIN_EVERY_S = 10.0
 

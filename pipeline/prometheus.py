@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
-    from pipeline.summary import Summary
-    from pipeline.work import TileResult
+    from flexroad.pipeline.summary import Summary
+    from flexroad.pipeline.work import TileResult
 
 EVERY_S = 10.0
 STATES = ("done", "cached", "failed", "pending")

@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from catalog import Tile
-from catalog.places import stat
-from pipeline.entry import Failure
-from pipeline.graph import Node, TileGraph, files_read
-from pipeline.meter import Span
-from pipeline.store import Store
-from tasks.errors import TaskError
+from flexroad.catalog import Tile
+from flexroad.catalog.places import stat
+from flexroad.pipeline.entry import Failure
+from flexroad.pipeline.graph import Node, TileGraph, files_read
+from flexroad.pipeline.meter import Span
+from flexroad.pipeline.store import Store
+from flexroad.tasks.errors import TaskError
 
 
 class StageError(Exception):

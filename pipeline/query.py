@@ -1,6 +1,6 @@
 """Ask a run for the ground under points.
 
->>> from pipeline.query import Ground
+>>> from flexroad.pipeline.query import Ground
 >>> ground = Ground.open("RUN")                       # doctest: +SKIP
 >>> ground.at(eastings, northings).height             # doctest: +SKIP
 """
@@ -17,14 +17,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
-from catalog.places import Place, place
-from pipeline.errors import ConfigError
-from pipeline.graph import TileGraph
-from pipeline.look import look_at
-from pipeline.pull import Pull, StageError
-from pipeline.run import Run
-from pipeline.store import Store
-from tasks.types import Floats, RoadMask, Surface
+from flexroad.catalog.places import Place, place
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph import TileGraph
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
+from flexroad.tasks.types import Floats, RoadMask, Surface
 
 
 @dataclass(frozen=True, eq=False)

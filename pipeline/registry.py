@@ -7,10 +7,10 @@ import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from catalog.places import Place, absolute, exists, listing, place, read, remove, write
+from flexroad.catalog.places import Place, absolute, exists, listing, place, read, remove, write
 
 if TYPE_CHECKING:
-    from pipeline.run import Run
+    from flexroad.pipeline.run import Run
 
 FOLDER = "runs"
 

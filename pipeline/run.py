@@ -28,24 +28,24 @@ from typing import Any
 
 import yaml
 
-from catalog import Catalog, Tile
-from catalog.places import Place, Sightings, absolute, exists, is_remote, place, read, stat, write
-from pipeline.config import Config, compose, load_config
-from pipeline.entry import FAILED, Failure
-from pipeline.errors import ConfigError
-from pipeline.execute import Executor
-from pipeline.graph import Look, Pattern, Recorded, TileGraph, any_gone, model_files
-from pipeline.journal import Journal
-from pipeline.ledger import NAME as LEDGER
-from pipeline.ledger import Ledger, Standing
-from pipeline.look import Folders, stands
-from pipeline.meter import now
-from pipeline.registry import register
-from pipeline.store import TileFolder, check_writable
-from pipeline.summary import Summary, read_summary, summarise, write_summary
-from pipeline.tables import write_tables
-from pipeline.warm import warm
-from pipeline.work import Job, TileResult, do_tile, failed_row, give_up
+from flexroad.catalog import Catalog, Tile
+from flexroad.catalog.places import Place, Sightings, absolute, exists, is_remote, place, read, stat, write
+from flexroad.pipeline.config import Config, compose, load_config
+from flexroad.pipeline.entry import FAILED, Failure
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.graph import Look, Pattern, Recorded, TileGraph, any_gone, model_files
+from flexroad.pipeline.journal import Journal
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.ledger import Ledger, Standing
+from flexroad.pipeline.look import Folders, stands
+from flexroad.pipeline.meter import now
+from flexroad.pipeline.registry import register
+from flexroad.pipeline.store import TileFolder, check_writable
+from flexroad.pipeline.summary import Summary, read_summary, summarise, write_summary
+from flexroad.pipeline.tables import write_tables
+from flexroad.pipeline.warm import warm
+from flexroad.pipeline.work import Job, TileResult, do_tile, failed_row, give_up
 
 PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
 

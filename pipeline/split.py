@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catalog import Bounds, Grid, Tile
-from pipeline.errors import ConfigError
-from tasks.types import Bools
+from flexroad.catalog import Bounds, Grid, Tile
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks.types import Bools
 
 DIRECTIONS = 8
 

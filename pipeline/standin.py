@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from catalog import Catalog, Layer, Tile
-from catalog.places import write
-from catalog.sources import prepared
-from pipeline.errors import ConfigError
-from pipeline.execute import Executor, SerialExecutor
-from tasks.synthetic import dsc3d, glb
-from tasks.synthetic.dsc3d import Place
-from tasks.synthetic.photogrammetry import photogrammetry
+from flexroad.catalog import Catalog, Layer, Tile
+from flexroad.catalog.places import write
+from flexroad.catalog.sources import prepared
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor, SerialExecutor
+from flexroad.tasks.synthetic import dsc3d, glb
+from flexroad.tasks.synthetic.dsc3d import Place
+from flexroad.tasks.synthetic.photogrammetry import photogrammetry
 
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
 """The same command gives the same files."""
@@ -75,8 +75,8 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
 
 
 def _write_scene(job: _Job) -> str:
-    from pipeline.prepare.asked import Asked
-    from pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+    from flexroad.pipeline.prepare.asked import Asked
+    from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
 
     scene = photogrammetry(job.place, job.seed)
     home = Path(job.folder) / scene.name

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog import Tile
-from catalog.crs import transformer
-from catalog.places import Place
-from pipeline.entry import Entry
-from pipeline.ledger import NAME as LEDGER
-from pipeline.ledger import Ledger, Standing
-from pipeline.mirror import whole
-from pipeline.run import Run
+from flexroad.catalog import Tile
+from flexroad.catalog.crs import transformer
+from flexroad.catalog.places import Place
+from flexroad.pipeline.entry import Entry
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.ledger import Ledger, Standing
+from flexroad.pipeline.mirror import whole
+from flexroad.pipeline.run import Run
 
 NAME = "tiles.geojson"
 AT_ONCE = 10_000

@@ -21,10 +21,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from catalog import places
-from catalog.places import Place
-from pipeline import codec
-from pipeline.graph import Node, TileGraph
+from flexroad.catalog import places
+from flexroad.catalog.places import Place
+from flexroad.pipeline import codec
+from flexroad.pipeline.graph import Node, TileGraph
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 

@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from catalog.places import Place, read, write
-from pipeline.entry import Failure
-from pipeline.ledger import NAME as LEDGER
-from pipeline.ledger import Ledger
+from flexroad.catalog.places import Place, read, write
+from flexroad.pipeline.entry import Failure
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.ledger import Ledger
 
 if TYPE_CHECKING:
-    from pipeline.run import Run
+    from flexroad.pipeline.run import Run
 
 NAME = "summary.json"
 MOST_TOLD = 1000
@@ -68,7 +68,7 @@ def summarise(tiles: int, ledger: Ledger) -> Summary:
 
 def summary(run: Run) -> Summary:
     """Return how a run stands now: every tile, its sources and its products are looked at."""
-    from pipeline.look import stands
+    from flexroad.pipeline.look import stands
 
     counts: Counter[str] = Counter()
     failures: list[Failure] = []

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from catalog import Catalog, Grid, Tile
-from catalog.roads import opened, with_roads
-from catalog.sources import prepared
-from pipeline.errors import ConfigError
-from pipeline.execute import DaskExecutor, Executor, SerialExecutor
-from pipeline.standin import write_stand_in
-from tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
-from tasks.synthetic.centrelines import CentreLine, centre_lines
-from tasks.synthetic.orthophoto import orthophoto
+from flexroad.catalog import Catalog, Grid, Tile
+from flexroad.catalog.roads import opened, with_roads
+from flexroad.catalog.sources import prepared
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
+from flexroad.pipeline.standin import write_stand_in
+from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
+from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
+from flexroad.tasks.synthetic.orthophoto import orthophoto
 
 WORTH_PROCESSES = 12
 """Tiles from which on starting worker processes pays."""

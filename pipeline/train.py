@@ -18,19 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from catalog import Bounds, Catalog, Grid, Tile
-from pipeline.config import Config, methods
-from pipeline.errors import ConfigError
-from pipeline.split import Piece, Split, halves, inside, split
-from tasks import load, road_vectors
-from tasks.errors import TaskError
-from tasks.hygiene import NOTHING, within
-from tasks.mask_quality import Quality, judge, together
-from tasks.options import Options
-from tasks.photo import read_photo
-from tasks.survey import outside
-from tasks.training.types import Round, Sample, Trained
-from tasks.types import Bools, Floats, RoadMask, TileData
+from flexroad.catalog import Bounds, Catalog, Grid, Tile
+from flexroad.pipeline.config import Config, methods
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.split import Piece, Split, halves, inside, split
+from flexroad.tasks import load, road_vectors
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import NOTHING, within
+from flexroad.tasks.mask_quality import Quality, judge, together
+from flexroad.tasks.options import Options
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.survey import outside
+from flexroad.tasks.training.types import Round, Sample, Trained
+from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
 Labels = Literal["mask", "vector"]
 Say = Callable[[str], None]
@@ -216,7 +216,7 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
         say(f"round {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
 
     trained: Trained = method.train(*sides_read, settings, progress)
-    segment = methods("tasks.segment")[asked.method]
+    segment = methods("flexroad.tasks.segment")[asked.method]
     with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
@@ -231,7 +231,7 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
 def segment_options(config: Config, method: str, model: Path) -> Options:
     """Return how a model is applied to be judged: as configured, without hygiene."""
     configured = _chain(config)["segment"]
-    module = methods("tasks.segment")[method]
+    module = methods("flexroad.tasks.segment")[method]
     given = configured.model_dump() if isinstance(configured, module.Options) else {"method": method}
     options: Options = module.Options(**given | {"model": model, "hygiene": NOTHING})
     return options
@@ -302,10 +302,10 @@ def _check_labels(pieces: Sequence[Piece], asked: Asked) -> None:
 
 
 def _method(asked: Asked) -> Any:
-    known = [name for name in methods("tasks.training") if name != "types"]
+    known = [name for name in methods("flexroad.tasks.training") if name != "types"]
     if asked.method not in known:
         raise ConfigError(f"--method {asked.method}: there are {', '.join(known)}")
-    return import_module(f"tasks.training.{asked.method}")
+    return import_module(f"flexroad.tasks.training.{asked.method}")
 
 
 def _settings(method: Any, asked: Asked) -> Options:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 
-from pipeline.config import Config
-from pipeline.graph import STAGES, stage_function
-from tasks.synthetic import SceneOptions, block, make_scene
-from tasks.types import TileData
+from flexroad.pipeline.config import Config
+from flexroad.pipeline.graph import STAGES, stage_function
+from flexroad.tasks.synthetic import SceneOptions, block, make_scene
+from flexroad.tasks.types import TileData
 
 SIZE_M = 50
 STREETS = SceneOptions(block_m=30)

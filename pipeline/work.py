@@ -12,15 +12,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from catalog.index import item
-from catalog.places import place, stat
-from pipeline.entry import MARKERS, Entry, Failure, Marker, Row, State, from_item, to_failed
-from pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_version
-from pipeline.meter import Span, now
-from pipeline.products import products
-from pipeline.pull import Pull, StageError, failure_of
-from pipeline.store import Store, TileFolder, file_entry, no_nan
-from tasks.types import Metrics, Quality
+from flexroad.catalog.index import item
+from flexroad.catalog.places import place, stat
+from flexroad.pipeline.entry import MARKERS, Entry, Failure, Marker, Row, State, from_item, to_failed
+from flexroad.pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_version
+from flexroad.pipeline.meter import Span, now
+from flexroad.pipeline.products import products
+from flexroad.pipeline.pull import Pull, StageError, failure_of
+from flexroad.pipeline.store import Store, TileFolder, file_entry, no_nan
+from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
 """Figures of a row that need no ground truth."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 

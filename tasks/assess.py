@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt, label, uniform_filter
 
-from tasks import options as base
-from tasks.fit.nurbs import MAX_LOG_WEIGHT
-from tasks.nurbs import NurbsSurface
-from tasks.spread import mean, nmad
-from tasks.support import AGREE_M, Support, rise, support
-from tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
+from flexroad.tasks import options as base
+from flexroad.tasks.fit.nurbs import MAX_LOG_WEIGHT
+from flexroad.tasks.nurbs import NurbsSurface
+from flexroad.tasks.spread import mean, nmad
+from flexroad.tasks.support import AGREE_M, Support, rise, support
+from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
 VERSION = 1
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tasks.adam import BETA_1, BETA_2, EPSILON, Schedule
-from tasks.errors import TaskError
-from tasks.nurbs import dense
-from tasks.objective import NEIGHBOURS, Objective
-from tasks.types import Floats
+from flexroad.tasks.adam import BETA_1, BETA_2, EPSILON, Schedule
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.nurbs import dense
+from flexroad.tasks.objective import NEIGHBOURS, Objective
+from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import torch

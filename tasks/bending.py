@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tasks.normal import gram, pairs
-from tasks.nurbs import basis, dense
-from tasks.types import Floats
+from flexroad.tasks.normal import gram, pairs
+from flexroad.tasks.nurbs import basis, dense
+from flexroad.tasks.types import Floats
 
 Derivatives = tuple[Floats, Floats, Floats]
 """Basis functions at the cells of one axis, and their first and second derivatives, ``(N, points)`` each."""

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.acquire.types import Photo
-from tasks.errors import TaskError
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.errors import TaskError
 
 if TYPE_CHECKING:
     import torch

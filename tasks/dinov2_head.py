@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from tasks.dinov2 import Backbone, missing_extra
-from tasks.errors import TaskError
-from tasks.options import Options
-from tasks.windows import Predict
+from flexroad.tasks.dinov2 import Backbone, missing_extra
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import Options
+from flexroad.tasks.windows import Predict
 
 KEY = "flexroad"
 """Under which the file's metadata holds `About`."""

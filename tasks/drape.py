@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.types import Floats, Mesh
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.types import Floats, Mesh
 
 TOLERANCE_M = 1e-6
 """A centre this far outside a triangle still counts as inside: borders and shared edges are never missed."""

@@ -13,9 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options as base
-from tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
-from tasks.types import Floats, RoadClusters, RoadMask, TileData
+from flexroad.tasks import options as base
+from flexroad.tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
+from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 1
 

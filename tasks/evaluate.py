@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from tasks import options as base
-from tasks.drape import drape
-from tasks.mad import mean_angles
-from tasks.nearest import nearest
-from tasks.spread import mean, nmad
-from tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, TileData
+from flexroad.tasks import options as base
+from flexroad.tasks.drape import drape
+from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.nearest import nearest
+from flexroad.tasks.spread import mean, nmad
+from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, TileData
 
 VERSION = 1
 

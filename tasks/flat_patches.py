@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 PATCH_M = 3.0
 """Side of a patch (m); at least three cells."""

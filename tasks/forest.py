@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.types import Bools
+from flexroad.tasks.types import Bools
 
 Roots = NDArray[np.int32]
 """Flat index of each cell's parent, ``(H * W,)``; a root is its own parent, -1 is no member."""

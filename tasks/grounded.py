@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import binary_erosion, distance_transform_edt, label
 
-from tasks import options as base
-from tasks.flat_patches import Patches, flat_patches
-from tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
-from tasks.local_plane import ALONE, ON, against_known
-from tasks.support import unsound
-from tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
+from flexroad.tasks import options as base
+from flexroad.tasks.flat_patches import Patches, flat_patches
+from flexroad.tasks.forest import Roots, clean, flatten, half_disc, least_cells, plant, root
+from flexroad.tasks.local_plane import ALONE, ON, against_known
+from flexroad.tasks.support import unsound
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 2
 

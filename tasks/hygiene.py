@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options, road_vectors
-from tasks.errors import TaskError
-from tasks.survey import outside
-from tasks.types import Bools, TileData
+from flexroad.tasks import options, road_vectors
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import Bools, TileData
 
 SLACK = 1e-9
 """Sizes count as reached within this part of a cell: 0.6 m is three cells of 0.2 m."""

@@ -18,12 +18,12 @@ from numba import njit
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
-from tasks.bending import Plate
-from tasks.normal import band, factor, gram, pairs, solve
-from tasks.nurbs import dense
-from tasks.objective import NEIGHBOURS, Objective, range_term
-from tasks.soft_range import add_soft_range
-from tasks.types import Bools, Floats
+from flexroad.tasks.bending import Plate
+from flexroad.tasks.normal import band, factor, gram, pairs, solve
+from flexroad.tasks.nurbs import dense
+from flexroad.tasks.objective import NEIGHBOURS, Objective, range_term
+from flexroad.tasks.soft_range import add_soft_range
+from flexroad.tasks.types import Bools, Floats
 
 SHARP_M, FIRST_M = 0.003, 0.03
 """Smaller differences weigh as if they were this large: under L1 in the end, and in the first step."""

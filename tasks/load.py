@@ -14,13 +14,13 @@ import numpy as np
 from pydantic import Field
 from rasterio.enums import Resampling
 
-from catalog import Grid, Layer, Tile
-from catalog.crs import Unit, height_unit
-from catalog.raster_files import quiet
-from tasks import options
-from tasks.errors import TaskError
-from tasks.patch import Patch, Unreadable, misfit, onto, read
-from tasks.types import Bools, Floats, Source, TileData
+from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.crs import Unit, height_unit
+from flexroad.catalog.raster_files import quiet
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.patch import Patch, Unreadable, misfit, onto, read
+from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 VERSION = 1
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 ALONE, OFF, ON = np.uint8(0), np.uint8(1), np.uint8(2)
 """Nothing known is near; the cell is off what is known; it lies on it."""

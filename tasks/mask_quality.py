@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from catalog.grid import Grid
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.types import Bools, Floats
 
 STEPS = 100
 """Thresholds of the precision-recall curve: every hundredth."""

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 Indices = NDArray[np.int32]
 

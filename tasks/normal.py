@@ -11,8 +11,8 @@ import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse import csr_array
 
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 RIDGE = 1e-9
 """Part of the diagonal's mean added to it: control points that nothing holds then stay where they are."""

@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from catalog.grid import Bounds
-from tasks.types import Floats
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Floats
 
 Starts = NDArray[np.intp]
 

@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.nurbs import Starts, basis
-from tasks.types import Floats
+from flexroad.tasks.nurbs import Starts, basis
+from flexroad.tasks.types import Floats
 
 NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 

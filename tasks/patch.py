@@ -17,11 +17,11 @@ from rasterio.errors import RasterioError
 from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
-from catalog.crs import same, short
-from catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from catalog.places import Place, gdal_name, is_remote, namesakes, stat
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.catalog.crs import same, short
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.places import Place, gdal_name, is_remote, namesakes, stat
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 
 class Unreadable(TaskError):

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.vrt import WarpedVRT
 
-from catalog.grid import LATTICE_TOLERANCE, Grid
-from catalog.places import Place
-from catalog.raster_files import quiet
-from tasks.acquire.types import Photo
-from tasks.errors import TaskError
-from tasks.patch import Lattice, Unreadable, opened, place
-from tasks.types import Bools, Source
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.catalog.places import Place
+from flexroad.catalog.raster_files import quiet
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.patch import Lattice, Unreadable, opened, place
+from flexroad.tasks.types import Bools, Source
 
 BITS = {"uint8": 8, "uint16": 16}
 """Depth of the colours that are understood, where a file does not say it uses fewer."""

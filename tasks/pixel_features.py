@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.acquire.types import Photo
-from tasks.photo import read_photo
-from tasks.types import TileData
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.types import TileData
 
 Layer = NDArray[np.float32]
 """One value a cell, ``(H, W)``; NaN where unknown."""

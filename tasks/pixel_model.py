@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks.errors import TaskError
-from tasks.options import Options
-from tasks.pixel_features import Features
-from tasks.types import Bools
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import Options
+from flexroad.tasks.pixel_features import Features
+from flexroad.tasks.types import Bools
 
 TRUSTED = ("sklearn.ensemble._hist_gradient_boosting.predictor.TreePredictor",)
 """What skops does not know of itself: scikit-learn's holder of a tree's array of nodes."""

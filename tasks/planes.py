@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 
 def least_squares_plane(easting: Floats, northing: Floats, height: Floats) -> tuple[float, float, float]:

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.acquire.types import Photo
-from tasks.types import Bools, Floats, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.types import Bools, Floats, TileData
 
 Singles = NDArray[np.float32]
 Sun = tuple[float, float]

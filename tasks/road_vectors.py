@@ -13,11 +13,11 @@ import shapely
 from numpy.typing import NDArray
 from pydantic import Field
 
-from catalog.grid import Grid
-from tasks import road_widths
-from tasks.errors import TaskError
-from tasks.types import Bools, Floats, Source, TileData
-from tasks.vector_files import Asked, near
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import road_widths
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats, Source, TileData
+from flexroad.tasks.vector_files import Asked, near
 
 CLASS_TAGS = ("highway", "area:highway")
 """OSM's tags of a road's class: in tables that have them, features without are no roads."""

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from tasks import options as base
-from tasks.types import Floats
+from flexroad.tasks import options as base
+from flexroad.tasks.types import Floats
 
 CLASS_WIDTH_M = {
     "motorway": 12.0,

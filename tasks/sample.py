@@ -16,10 +16,10 @@ import startinpy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from catalog.grid import Bounds
-from tasks import options as base
-from tasks.errors import TaskError
-from tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks import options as base
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
 
 VERSION = 1
 

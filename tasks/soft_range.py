@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 LEAST_M = 1e-6
 """Least temperature (m)."""

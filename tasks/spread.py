@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 GAUSSIAN = 1.4826
 """Standard deviations of a Gaussian in its median absolute deviation."""

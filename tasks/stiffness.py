@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.bending import Plate
-from tasks.irls import Convex, Solution, freedom
-from tasks.types import Bools, Floats
+from flexroad.tasks.bending import Plate
+from flexroad.tasks.irls import Convex, Solution, freedom
+from flexroad.tasks.types import Bools, Floats
 
 CANDIDATES_M3 = (1000.0, 300.0, 100.0, 30.0, 10.0)
 WORSE = 0.03

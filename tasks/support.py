@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, distance_transform_edt
 
-from tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, TileData
 
 
 class Support(IntEnum):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from tasks.types import Bools, TileData
+from flexroad.tasks.types import Bools, TileData
 
 
 def outside(data: TileData) -> Bools:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks.options import Options
-from tasks.training.types import Progress, Round
-from tasks.types import Floats
+from flexroad.tasks.options import Options
+from flexroad.tasks.training.types import Progress, Round
+from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import torch

@@ -8,8 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.grid import Bounds, Grid
-from catalog.places import Place
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.places import Place
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -23,11 +23,11 @@ import shapely
 from pyproj.exceptions import ProjError
 from upath import UPath
 
-from catalog.crs import short, transformer
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
-from catalog.places import Place, Seen, fetch, stat
-from tasks.errors import TaskError
+from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.places import Place, Seen, fetch, stat
+from flexroad.tasks.errors import TaskError
 
 SQUARE_M = 4000.0
 """Side of the squares that indexed files are read by (m)."""

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.types import Bools
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.types import Bools
 
 Image = NDArray[np.float32]
 """``(bands, h, w)``."""

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import pytest
 import yaml
 
-from pipeline import ONE_THREAD
-from pipeline.cli import main
-from pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline.cli import main
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},
@@ -62,7 +62,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def made_survey(tmp_path_factory) -> Path:
     """A folder of four neighbouring tiles of 60 m with known truth."""
-    from pipeline.synthesis import write_scenes
+    from flexroad.pipeline.synthesis import write_scenes
 
     folder = tmp_path_factory.mktemp("survey")
     write_scenes(folder, 4, seed=3, size_m=60)
@@ -138,7 +138,7 @@ def storage(storage_server, monkeypatch):
 @pytest.fixture
 def bucket(storage, request):
     """A folder in a bucket of one's own."""
-    from catalog.places import place
+    from flexroad.catalog.places import place
 
     made = place(f"s3://{abs(hash(request.node.nodeid)):x}/area")
     made.fs.mkdir(made.parent.path)

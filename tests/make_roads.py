@@ -5,8 +5,8 @@ from pathlib import Path
 import geopandas
 import numpy as np
 
-from catalog import Grid
-from tasks.types import Source, TileData
+from flexroad.catalog import Grid
+from flexroad.tasks.types import Source, TileData
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 100, 100)
 """The tile that the roads lie on."""

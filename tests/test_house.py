@@ -31,6 +31,7 @@ def imports(path: Path) -> list[tuple[str, int]]:
 def test_imports(path):
     here = path.relative_to(ROOT)
     for name, column in imports(path):
+        name = name.removeprefix("flexroad.")
         head = name.split(".")[0]
         if head in ORDER:
             assert ORDER[head] <= ORDER[here.parts[0]], f"{here} imports {name}"
@@ -51,6 +52,6 @@ def test_no_drawer_for_everything(path):
 
 def test_the_command_line_starts_light():
     heavy = "numba torch pyvista trimesh distributed pandas rasterio scipy matplotlib".split()
-    code = f"import sys, pipeline.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, flexroad.pipeline.cli; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.strip() == "[]"

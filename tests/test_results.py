@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.report.content import FIGURES
-from pipeline.report.evidence import FILE, KEPT, read_evidence, write_evidence
-from pipeline.report.tables import pages
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.report.evidence import FILE, KEPT, read_evidence, write_evidence
+from flexroad.pipeline.report.tables import pages
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -49,8 +49,8 @@ def published(tmp_path):
     """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
     import pandas as pd
 
-    from pipeline.report.evidence import Evidence
-    from pipeline.report.published import TABLE_I
+    from flexroad.pipeline.report.evidence import Evidence
+    from flexroad.pipeline.report.published import TABLE_I
 
     rows = [
         ("made", "segmented", f"t{i}", "", row.variant, *map(row.value, FIGURES))

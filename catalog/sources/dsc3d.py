@@ -13,9 +13,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from catalog.cut import Indexed
-from catalog.layout import Layout, read
-from catalog.raster_files import some
+from flexroad.catalog.cut import Indexed
+from flexroad.catalog.layout import Layout, read
+from flexroad.catalog.raster_files import some
 
 DATASET = "DSC3D"
 

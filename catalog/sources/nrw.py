@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from catalog.bridges import deck_raster
-from catalog.crs import short
-from catalog.cut import Indexed, cut
-from catalog.errors import CatalogError
-from catalog.grid import Bounds
-from catalog.raster_files import RasterFile, opened, scan, some
-from catalog.roads import find, with_roads
-from catalog.tile import Tile
+from flexroad.catalog.bridges import deck_raster
+from flexroad.catalog.crs import short
+from flexroad.catalog.cut import Indexed, cut
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.raster_files import RasterFile, opened, scan, some
+from flexroad.catalog.roads import find, with_roads
+from flexroad.catalog.tile import Tile
 
 CRS = "EPSG:25832"
 """The state's own, which its XYZ files do not carry."""

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, RasterioIOError
 
-from catalog.errors import CatalogError
-from catalog.grid import Grid
-from catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 HEIGHTS = ("dsm", "dtm", "reference")
 MASKS = ("road_mask", "reference_road")

@@ -4,8 +4,8 @@ One Dask task is one tile: its graph is pulled inside a single process, so that 
 (``docs/decisions.md`` has the measurement against one task per stage).
 """
 
-from pipeline.execute.dask import DaskExecutor
-from pipeline.execute.executor import Executor
-from pipeline.execute.serial import SerialExecutor
+from flexroad.pipeline.execute.dask import DaskExecutor
+from flexroad.pipeline.execute.executor import Executor
+from flexroad.pipeline.execute.serial import SerialExecutor
 
 __all__ = ["DaskExecutor", "Executor", "SerialExecutor"]

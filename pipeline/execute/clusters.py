@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
-from pipeline import ONE_THREAD
-from pipeline.cluster import Cluster
-from pipeline.errors import ConfigError
+from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.errors import ConfigError
 
 SETTINGS = {
     "distributed.worker.memory.target": False,

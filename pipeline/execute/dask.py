@@ -11,10 +11,10 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
-from pipeline.cluster import Cluster
-from pipeline.errors import ClusterLost, ConfigError
-from pipeline.execute.clusters import Workplace, opened
-from pipeline.execute.executor import J, R
+from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute.clusters import Workplace, opened
+from flexroad.pipeline.execute.executor import J, R
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -68,7 +68,7 @@ class DaskExecutor:
         if not first:
             # Nothing to do needs no workers.
             return
-        from pipeline.execute.session import SchedulerGone, Session, Todo
+        from flexroad.pipeline.execute.session import SchedulerGone, Session, Todo
 
         todo = Todo(chain(first, queue))
         with _quiet(), opened(self.cluster, self.workers, self.scheduler, self.dashboard) as place:
@@ -143,8 +143,8 @@ def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -
     ClusterLost
         If nobody answers any more.
     """
-    from pipeline.execute import workers
-    from pipeline.execute.scheduler import no_second_try
+    from flexroad.pipeline.execute import workers
+    from flexroad.pipeline.execute.scheduler import no_second_try
 
     here = workers.versions()
     name = uuid.uuid4().hex[:8]
@@ -184,7 +184,7 @@ def _post(client: Client, guard: Any, name: str) -> None:
 
 def _compare(client: Client, here: dict[str, str]) -> None:
     """Compare versions by Dask's own message: what differs too much could not load anything of ours."""
-    from pipeline.execute.workers import PICKLING
+    from flexroad.pipeline.execute.workers import PICKLING
 
     found = client.get_versions(packages=[name for name in here if name != "python"])
     _refuse("the scheduler", found["scheduler"], {name: here[name] for name in PICKLING})
@@ -193,7 +193,7 @@ def _compare(client: Client, here: dict[str, str]) -> None:
 
 
 def _refuse(who: str, found: Any, here: dict[str, str]) -> None:
-    from pipeline.execute.workers import difference, unlike
+    from flexroad.pipeline.execute.workers import difference, unlike
 
     there = {name: found["packages"].get(name) or "missing" for name in here}
     there["python"] = ".".join(found["host"]["python"].split(".")[:3])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
 
-from pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.executor import J, R
 
 
 class SerialExecutor:

@@ -20,10 +20,10 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
-from pipeline.errors import ClusterLost, ConfigError
-from pipeline.execute.executor import J, R
-from pipeline.execute.scheduler import carrier
-from pipeline.execute.workers import work
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.scheduler import carrier
+from flexroad.pipeline.execute.workers import work
 
 TICK_S = 1.0
 """How long nothing must happen before one looks whether scheduler and workers are there."""

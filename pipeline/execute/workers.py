@@ -14,8 +14,8 @@ from typing import Any
 
 from distributed import WorkerPlugin
 
-from pipeline import ONE_THREAD
-from pipeline.execute.executor import J, R
+from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline.execute.executor import J, R
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """What must be alike for messages to be understood; also on the scheduler."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from pipeline.errors import ConfigError
+from flexroad.pipeline.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from catalog import Grid
-from catalog.grid import Bounds
-from pipeline.errors import ConfigError
-from pipeline.execute import Executor
-from pipeline.prepare.sheet import GROUND, Sheet
-from pipeline.prepare.spool import Blocks, Place, Spooled, room
-from tasks.acquire.points import Options, rasterise, reach_m
-from tasks.acquire.types import Photo
+from flexroad.catalog import Grid
+from flexroad.catalog.grid import Bounds
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.sheet import GROUND, Sheet
+from flexroad.pipeline.prepare.spool import Blocks, Place, Spooled, room
+from flexroad.tasks.acquire.points import Options, rasterise, reach_m
+from flexroad.tasks.acquire.types import Photo
 
 
 @dataclass(frozen=True)

@@ -9,19 +9,19 @@ from typing import Literal
 
 import numpy as np
 
-from catalog import Grid
-from catalog.crs import short
-from catalog.frame import Frame
-from pipeline.execute import Executor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.blocks import fill, sheet_grid
-from pipeline.prepare.roads import add_roads
-from pipeline.prepare.sheet import GROUND, Published, Sheet
-from pipeline.prepare.spool import PER_METRE, RECORD, Blocks, Place, Spooled, edge_for, room
-from tasks.acquire import points, refine
-from tasks.acquire.mesh import TexturedMesh, in_metres, orthophoto, sample
-from tasks.acquire.mesh_files import read_mesh
-from tasks.acquire.placement import Offset
+from flexroad.catalog import Grid
+from flexroad.catalog.crs import short
+from flexroad.catalog.frame import Frame
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.blocks import fill, sheet_grid
+from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.sheet import GROUND, Published, Sheet
+from flexroad.pipeline.prepare.spool import PER_METRE, RECORD, Blocks, Place, Spooled, edge_for, room
+from flexroad.tasks.acquire import points, refine
+from flexroad.tasks.acquire.mesh import TexturedMesh, in_metres, orthophoto, sample
+from flexroad.tasks.acquire.mesh_files import read_mesh
+from flexroad.tasks.acquire.placement import Offset
 
 BAND = 1024
 """Rows of the orthophoto drawn at a time: memory does not grow with the area."""

@@ -17,19 +17,19 @@ from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from catalog import CatalogError, Grid
-from catalog.frame import Frame
-from pipeline.errors import ConfigError
-from pipeline.execute import Executor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.blocks import sheet_grid
-from pipeline.prepare.mesh import MeshAsked, prepare_mesh
-from pipeline.prepare.points import prepare_points
-from pipeline.prepare.roads import add_roads
-from pipeline.prepare.sheet import Published, Sheet
-from tasks.acquire import ground, points, voids
-from tasks.acquire.types import Photo
-from tasks.types import Floats
+from flexroad.catalog import CatalogError, Grid
+from flexroad.catalog.frame import Frame
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.blocks import sheet_grid
+from flexroad.pipeline.prepare.mesh import MeshAsked, prepare_mesh
+from flexroad.pipeline.prepare.points import prepare_points
+from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.sheet import Published, Sheet
+from flexroad.tasks.acquire import ground, points, voids
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.types import Floats
 
 DSM, DTM, PHOTO = "odm_dem/dsm.tif", "odm_dem/dtm.tif", "odm_orthophoto/odm_orthophoto.tif"
 MESHES = tuple(

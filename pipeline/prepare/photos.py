@@ -14,20 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from catalog.raster_files import some
-from pipeline.errors import ConfigError
-from pipeline.execute import Executor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.mesh import MeshAsked, publish_mesh
-from pipeline.prepare.sheet import Published
-from pipeline.prepare.spool import room, scratch
-from tasks import TaskError
-from tasks.acquire import dense, patchmatch, photogrammetry, points
-from tasks.acquire.dense import Cloud
-from tasks.acquire.photo_positions import Placed, place, read_control, read_shot
-from tasks.acquire.photogrammetry import Reconstruction, View
-from tasks.acquire.poisson import poisson
-from tasks.types import Floats
+from flexroad.catalog.raster_files import some
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.mesh import MeshAsked, publish_mesh
+from flexroad.pipeline.prepare.sheet import Published
+from flexroad.pipeline.prepare.spool import room, scratch
+from flexroad.tasks import TaskError
+from flexroad.tasks.acquire import dense, patchmatch, photogrammetry, points
+from flexroad.tasks.acquire.dense import Cloud
+from flexroad.tasks.acquire.photo_positions import Placed, place, read_control, read_shot
+from flexroad.tasks.acquire.photogrammetry import Reconstruction, View
+from flexroad.tasks.acquire.poisson import poisson
+from flexroad.tasks.types import Floats
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as this pycolmap has no CUDA"

@@ -6,18 +6,18 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
-from catalog import CatalogError
-from catalog.clouds import Cloud, find, inspect
-from catalog.crs import short
-from catalog.frame import Frame, agreed
-from catalog.raster_files import some
-from pipeline.execute import Executor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.blocks import fill, sheet_grid
-from pipeline.prepare.roads import add_roads
-from pipeline.prepare.sheet import Published, Sheet
-from pipeline.prepare.spool import Spooled, edge_m, scratch, spool
-from tasks.acquire.points import Options, facts, reach_m
+from flexroad.catalog import CatalogError
+from flexroad.catalog.clouds import Cloud, find, inspect
+from flexroad.catalog.crs import short
+from flexroad.catalog.frame import Frame, agreed
+from flexroad.catalog.raster_files import some
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.blocks import fill, sheet_grid
+from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.sheet import Published, Sheet
+from flexroad.pipeline.prepare.spool import Spooled, edge_m, scratch, spool
+from flexroad.tasks.acquire.points import Options, facts, reach_m
 
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01

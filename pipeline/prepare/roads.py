@@ -15,15 +15,15 @@ import shapely
 from rasterio.errors import RasterioError
 from rasterio.warp import Resampling, reproject
 
-from catalog import CatalogError, Grid
-from catalog.crs import short
-from catalog.frame import Frame
-from catalog.roads import VectorFile, opened
-from pipeline.errors import ConfigError
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.sheet import Sheet
-from tasks.road_vectors import cells
-from tasks.types import Bools
+from flexroad.catalog import CatalogError, Grid
+from flexroad.catalog.crs import short
+from flexroad.catalog.frame import Frame
+from flexroad.catalog.roads import VectorFile, opened
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.sheet import Sheet
+from flexroad.tasks.road_vectors import cells
+from flexroad.tasks.types import Bools
 
 MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
@@ -111,8 +111,8 @@ def _elsewhere(path: Path, grid: Grid) -> ConfigError:
 
 
 def _mesh(path: Path, grid: Grid) -> Bools:
-    from tasks.acquire.mesh import cover, in_metres
-    from tasks.acquire.mesh_files import read_mesh
+    from flexroad.tasks.acquire.mesh import cover, in_metres
+    from flexroad.tasks.acquire.mesh_files import read_mesh
 
     mesh = read_mesh(path, colours=False)
     return cover(in_metres(mesh, Frame.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)

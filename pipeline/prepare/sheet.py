@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from rasterio.errors import CRSError, RasterioError
 from rasterio.windows import Window
 
-from catalog import LAYERS, Catalog, Grid, Layer, Tile
-from catalog.cut import assumed, cut
-from catalog.raster_files import opened, some, zoned
-from catalog.roads import VectorFile, with_roads
-from pipeline.errors import ConfigError
-from tasks.acquire.types import Photo
+from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
+from flexroad.catalog.cut import assumed, cut
+from flexroad.catalog.raster_files import opened, some, zoned
+from flexroad.catalog.roads import VectorFile, with_roads
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks.acquire.types import Photo
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"

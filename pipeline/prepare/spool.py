@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog import Bounds, CatalogError, Grid
-from catalog.clouds import CHUNK, Chunk, Cloud, chunks
-from catalog.frame import Frame
-from pipeline.errors import ConfigError
-from tasks.acquire.types import Points
+from flexroad.catalog import Bounds, CatalogError, Grid
+from flexroad.catalog.clouds import CHUNK, Chunk, Cloud, chunks
+from flexroad.catalog.frame import Frame
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks.acquire.types import Points
 
 PER_METRE = 10_000
 """Units of the stored coordinates: tenths of a millimetre."""

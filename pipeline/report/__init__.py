@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from catalog.places import Place, write
-from pipeline.report.content import gather
-from pipeline.report.pages import csv_page, html_page, markdown_page
-from pipeline.run import Run
+from flexroad.catalog.places import Place, write
+from flexroad.pipeline.report.content import gather
+from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
+from flexroad.pipeline.run import Run
 
 FORMATS = ("md", "csv", "html")
 
@@ -25,7 +25,7 @@ def write_report(run: Run, form: str) -> Place:
     """
     content = gather(run)
     if form == "html":
-        from pipeline.report.pictures import tile_pictures
+        from flexroad.pipeline.report.pictures import tile_pictures
 
         text = html_page(content, tile_pictures(run, content))
     else:

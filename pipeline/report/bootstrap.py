@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 RESAMPLES = 2000
 SEED = 0

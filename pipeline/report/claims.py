@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.report.bootstrap import Means, interval
-from pipeline.report.published import BASE, DSC3D, GEROD, published
+from flexroad.pipeline.report.bootstrap import Means, interval
+from flexroad.pipeline.report.published import BASE, DSC3D, GEROD, published
 
 HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED = "held", "weaker", "stronger", "not held", "not tested"
 REACH = 2.0

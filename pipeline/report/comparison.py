@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from pipeline.errors import ConfigError
-from pipeline.report.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
-from pipeline.report.claims import (
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
+from flexroad.pipeline.report.claims import (
     CLAIMS,
     HELD,
     NOT_HELD,
@@ -20,11 +20,11 @@ from pipeline.report.claims import (
     check,
     percent,
 )
-from pipeline.report.content import FIGURES
-from pipeline.report.dsc3d import of_dsc3d
-from pipeline.report.evidence import Evidence
-from pipeline.report.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
-from pipeline.report.sections import Section, beside, numbers, short, shown, verdicts_table
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.report.dsc3d import of_dsc3d
+from flexroad.pipeline.report.evidence import Evidence
+from flexroad.pipeline.report.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
+from flexroad.pipeline.report.sections import Section, beside, numbers, short, shown, verdicts_table
 
 MASKS = {"segmented": "segmented mask", "reference": "true mask"}
 

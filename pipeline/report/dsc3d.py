@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from pipeline.report.bootstrap import bootstrap
-from pipeline.report.claims import CLAIMS, check
-from pipeline.report.evidence import Evidence
-from pipeline.report.published import DSC3D, TABLE_I_DSC3D
-from pipeline.report.sections import Section, beside, numbers, verdicts_table
+from flexroad.pipeline.report.bootstrap import bootstrap
+from flexroad.pipeline.report.claims import CLAIMS, check
+from flexroad.pipeline.report.evidence import Evidence
+from flexroad.pipeline.report.published import DSC3D, TABLE_I_DSC3D
+from flexroad.pipeline.report.sections import Section, beside, numbers, verdicts_table
 
 NAME = "Table I, DSC3D rows"
 ABOUT = tuple(claim for claim in CLAIMS if claim.dataset == DSC3D)

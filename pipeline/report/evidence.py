@@ -9,11 +9,11 @@ from typing import Final
 
 import pandas as pd
 
-from catalog.places import Place, write
-from pipeline.errors import ConfigError
-from pipeline.report.content import FIGURES
-from pipeline.run import Run
-from pipeline.tables import frame_of, read_metrics
+from flexroad.catalog.places import Place, write
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.tables import frame_of, read_metrics
 
 FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]

@@ -13,8 +13,8 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report import trust
-from pipeline.report.content import Content
+from flexroad.pipeline.report import trust
+from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as it is printed, perhaps with its interval."""

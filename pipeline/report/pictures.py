@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from pipeline.graph import TileGraph
-from pipeline.look import look_at
-from pipeline.pull import Pull, StageError
-from pipeline.report.content import Content
-from pipeline.report.pages import TilePictures
-from pipeline.report.render import error_map, filter_picture, hillshade, render_meshes, support_picture
-from pipeline.run import Run
-from pipeline.store import Store
-from tasks.drape import drape
-from tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
+from flexroad.pipeline.graph import TileGraph
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.report.pages import TilePictures
+from flexroad.pipeline.report.render import (
+    error_map,
+    filter_picture,
+    hillshade,
+    render_meshes,
+    support_picture,
+)
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
+from flexroad.tasks.drape import drape
+from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 MOST = 24
 """Tiles shown; of larger runs the worst."""

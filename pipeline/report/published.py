@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.report.content import FIGURES
+from flexroad.pipeline.report.content import FIGURES
 
 GEROD, DSC3D = "GeRoD", "DSC3D"
 """The paper's datasets: airborne laser scanning of Geobasis NRW, and photogrammetry."""

@@ -26,10 +26,10 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from PIL import Image
 
-from catalog import Grid
-from catalog.grid import Bounds
-from tasks.support import Support
-from tasks.types import Bools, Floats, Mesh
+from flexroad.catalog import Grid
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.support import Support
+from flexroad.tasks.types import Bools, Floats, Mesh
 
 log = logging.getLogger(__name__)
 

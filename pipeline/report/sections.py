@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from pipeline.report.bootstrap import Means
-from pipeline.report.claims import Verdict
-from pipeline.report.content import FIGURES
-from pipeline.report.published import Row
+from flexroad.pipeline.report.bootstrap import Means
+from flexroad.pipeline.report.claims import Verdict
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.report.published import Row
 
 GROUPS = (("l2_road_m", "l2_terrain_m"), ("mad_road_deg", "mad_terrain_deg"), ("triangles",))
 """Figures that stand side by side; all five with three numbers each are wider than a page."""

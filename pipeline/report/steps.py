@@ -12,12 +12,12 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
-from catalog import Grid, Tile
-from pipeline.graph import Node, TileGraph
-from pipeline.look import look_at
-from pipeline.run import Run
-from pipeline.store import Store
-from tasks.types import Floats, RoadMask, Surface
+from flexroad.catalog import Grid, Tile
+from flexroad.pipeline.graph import Node, TileGraph
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
+from flexroad.tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
 MOST = 2000

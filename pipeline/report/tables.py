@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from catalog.places import write
-from pipeline.errors import ConfigError
-from pipeline.report.comparison import Comparison, compare
-from pipeline.report.evidence import Evidence, collect, write_evidence
-from pipeline.report.pages import are_numbers, markdown, template
-from pipeline.run import Run
+from flexroad.catalog.places import write
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.comparison import Comparison, compare
+from flexroad.pipeline.report.evidence import Evidence, collect, write_evidence
+from flexroad.pipeline.report.pages import are_numbers, markdown, template
+from flexroad.pipeline.run import Run
 
 TITLE = "The paper's tables, and ours"
 LATEX = {

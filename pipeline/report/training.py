@@ -14,13 +14,13 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from catalog.places import write
-from pipeline.report.pages import template
-from pipeline.report.render import curves, found_map
-from pipeline.run import versions
-from pipeline.store import no_nan
-from pipeline.train import Judged, Outcome
-from tasks.mask_quality import Quality
+from flexroad.catalog.places import write
+from flexroad.pipeline.report.pages import template
+from flexroad.pipeline.report.render import curves, found_map
+from flexroad.pipeline.run import versions
+from flexroad.pipeline.store import no_nan
+from flexroad.pipeline.train import Judged, Outcome
+from flexroad.tasks.mask_quality import Quality
 
 SHOWN = 3
 """Best tiles shown, and as many of the worst."""

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.types import Floats
 
 Cells = NDArray[np.int64]
 """Index of each point's cell in row-major order, ``(n,)``; -1 is outside the grid."""

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options as base
-from tasks.acquire.photogrammetry import Reconstruction, View, colmap
-from tasks.types import Bools, Floats
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire.photogrammetry import Reconstruction, View, colmap
+from flexroad.tasks.types import Bools, Floats
 
 FEWEST_SHARED = 20
 """Sparse points two photographs must share to be a pair."""
@@ -191,7 +191,7 @@ def _read(view: View, size: int) -> NDArray[np.uint8]:
     """Return the photograph, reduced, as it lies on the sensor: blue, green, red."""
     import cv2
 
-    from tasks.errors import TaskError
+    from flexroad.tasks.errors import TaskError
 
     # The tag of orientation is for viewers; the poses are those of the sensor.
     image = cv2.imread(str(view.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -15,9 +15,9 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options as base
-from tasks.errors import TaskError
-from tasks.types import Bools, Floats
+from flexroad.tasks import options as base
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats
 
 Indices = NDArray[np.int64]
 

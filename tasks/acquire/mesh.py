@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from catalog.frame import Frame
-from catalog.grid import Bounds, Grid
-from tasks.acquire.types import Photo, Points
-from tasks.types import Bools, Floats
+from flexroad.catalog.frame import Frame
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.acquire.types import Photo, Points
+from flexroad.tasks.types import Bools, Floats
 
 CHUNK = 500_000
 """Points, or rays of the orthophoto, coloured at a time: memory does not grow with the area."""

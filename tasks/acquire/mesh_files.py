@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.acquire.mesh import TexturedMesh
-from tasks.acquire.placement import Offset, Placement, beside
-from tasks.acquire.textures import Images
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.tasks.acquire.mesh import TexturedMesh
+from flexroad.tasks.acquire.placement import Offset, Placement, beside
+from flexroad.tasks.acquire.textures import Images
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 UPRIGHT = 2.0

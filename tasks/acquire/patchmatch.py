@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from tasks import options as base
-from tasks.acquire.dense import Cloud
-from tasks.acquire.photogrammetry import Reconstruction, colmap
-from tasks.acquire.poisson import RECORD
-from tasks.errors import TaskError
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire.dense import Cloud
+from flexroad.tasks.acquire.photogrammetry import Reconstruction, colmap
+from flexroad.tasks.acquire.poisson import RECORD
+from flexroad.tasks.errors import TaskError
 
 
 class Options(base.Options):

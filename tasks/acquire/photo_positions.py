@@ -19,9 +19,9 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 from pyproj import Transformer
 
-from catalog.crs import in_plan, plan_unit, utm_of
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.catalog.crs import in_plan, plan_unit, utm_of
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 GNSS_M = (3.0, 5.0)
 """Accuracy in plan and height of a receiver without corrections, where the file says none (m)."""

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from tasks import options as base
-from tasks.acquire.photo_positions import Control, Placed, Shot
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire.photo_positions import Control, Placed, Shot
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 EXHAUSTIVE = 12
 """Up to so many photographs every pair is matched."""

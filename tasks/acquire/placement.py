@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from catalog.crs import in_plan
-from catalog.errors import CatalogError
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.catalog.crs import in_plan
+from flexroad.catalog.errors import CatalogError
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 Offset = tuple[float, float, float]
 """Easting, northing and height of the mesh's zero, in units of its CRS."""

@@ -11,15 +11,15 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from catalog.grid import Grid
-from tasks import options as base
-from tasks.acquire import ground as slope_filter
-from tasks.acquire import terrain, voids
-from tasks.acquire.bins import Cells, bins, means
-from tasks.acquire.topcolour import photo
-from tasks.acquire.tops import highest, spikes
-from tasks.acquire.types import Photo, Points, Rasters
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire import ground as slope_filter
+from flexroad.tasks.acquire import terrain, voids
+from flexroad.tasks.acquire.bins import Cells, bins, means
+from flexroad.tasks.acquire.topcolour import photo
+from flexroad.tasks.acquire.tops import highest, spikes
+from flexroad.tasks.acquire.types import Photo, Points, Rasters
+from flexroad.tasks.types import Bools, Floats
 
 
 class Options(base.Options):

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tasks.acquire.dense import Cloud
-from tasks.acquire.mesh import TexturedMesh
-from tasks.acquire.photogrammetry import colmap
-from tasks.errors import TaskError
-from tasks.types import Floats
+from flexroad.tasks.acquire.dense import Cloud
+from flexroad.tasks.acquire.mesh import TexturedMesh
+from flexroad.tasks.acquire.photogrammetry import colmap
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Floats
 
 CELLS = 2.0
 """Width of the octree's finest cells, in distances between points: with fewer points noise takes shape."""

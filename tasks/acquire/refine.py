@@ -19,10 +19,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import label
 
-from catalog.grid import Grid
-from tasks import ecsrc
-from tasks.acquire import voids
-from tasks.types import Bools, Floats, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import ecsrc
+from flexroad.tasks.acquire import voids
+from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
 CIRCULAR = "reference by ECSRC itself (circular)"
 """What the name of such data has to say."""

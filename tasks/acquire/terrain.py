@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks.acquire import voids
-from tasks.acquire.bins import Cells, means
-from tasks.acquire.tin import tin
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire import voids
+from flexroad.tasks.acquire.bins import Cells, means
+from flexroad.tasks.acquire.tin import tin
+from flexroad.tasks.types import Floats
 
 SPARSEST = 2 * math.sqrt(2)
 """Nodes of a gapless raster leave circles of up to so many cells empty, wherever they lie in their cells."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.errors import TaskError
+from flexroad.tasks.errors import TaskError
 
 
 class Images:

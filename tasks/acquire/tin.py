@@ -11,9 +11,9 @@ import numpy as np
 import startinpy
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.drape import drape
-from tasks.types import Floats, Mesh
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.drape import drape
+from flexroad.tasks.types import Floats, Mesh
 
 JITTER = 1e-6
 """Part of a cell by which nodes are moved to choose between triangulations that are equally good."""

@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.acquire.bins import Cells, bins
-from tasks.acquire.types import Photo, Points
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.bins import Cells, bins
+from flexroad.tasks.acquire.types import Photo, Points
+from flexroad.tasks.types import Floats
 
 Codes = NDArray[np.int32]
 """A colour as one number, red above green above blue; -1 is unknown."""

@@ -7,8 +7,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tasks.acquire.bins import Cells
-from tasks.types import Floats
+from flexroad.tasks.acquire.bins import Cells
+from flexroad.tasks.types import Floats
 
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 """The 8 neighbours of a cell."""

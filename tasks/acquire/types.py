@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.types import Bools, Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.acquire.tin import tin
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.tin import tin
+from flexroad.tasks.types import Floats
 
 DIAGONAL = math.sqrt(2)
 """Centres of touching cells are up to so many cells apart: where known cells have no void between them."""

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.io import MemoryFile
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats
 
 VERSION = 2
 NAME_HEIGHT = "_height.tif"

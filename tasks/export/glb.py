@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tasks.types import Bools, Floats, Mesh
+from flexroad.tasks.types import Bools, Floats, Mesh
 
 if TYPE_CHECKING:
     import trimesh

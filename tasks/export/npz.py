@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tasks.errors import TaskError
-from tasks.nurbs import NurbsSurface
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.nurbs import NurbsSurface
 
 VERSION = 1
 NAME = "_surface.npz"

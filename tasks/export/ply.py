@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.support import Support
-from tasks.types import Mesh
+from flexroad.tasks.support import Support
+from flexroad.tasks.types import Mesh
 
 VERSION = 2
 NAME = ".ply"

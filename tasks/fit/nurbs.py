@@ -15,17 +15,17 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from catalog.grid import Grid
-from tasks import adam, autograd, irls
-from tasks.bending import plate
-from tasks.errors import TaskError
-from tasks.nurbs import NurbsSurface, clamped_knots, greville
-from tasks.objective import Objective, objective
-from tasks.options import Options as BaseOptions
-from tasks.planes import least_squares_plane
-from tasks.stiffness import stiffest
-from tasks.support import without_unsound
-from tasks.types import Bools, Floats, RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import adam, autograd, irls
+from flexroad.tasks.bending import plate
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.nurbs import NurbsSurface, clamped_knots, greville
+from flexroad.tasks.objective import Objective, objective
+from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.planes import least_squares_plane
+from flexroad.tasks.stiffness import stiffest
+from flexroad.tasks.support import without_unsound
+from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
 

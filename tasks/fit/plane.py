@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from catalog.grid import Bounds
-from tasks.errors import TaskError
-from tasks.options import Options as BaseOptions
-from tasks.planes import least_squares_plane
-from tasks.types import Floats, RoadClusters, TileData
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.planes import least_squares_plane
+from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1
 

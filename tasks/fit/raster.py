@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 from pydantic import Field
 
-from catalog.grid import Bounds, Grid
-from tasks.options import Options as BaseOptions
-from tasks.types import Floats, RoadClusters, TileData
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1
 STORED = False

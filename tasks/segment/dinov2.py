@@ -15,17 +15,17 @@ from pydantic import Field
 from rasterio.enums import Resampling
 from rasterio.warp import reproject
 
-from catalog.grid import Grid
-from tasks import options, registration
-from tasks.acquire.types import Photo
-from tasks.dinov2 import PATCH, Backbone, Device, load_backbone, normalised
-from tasks.dinov2_head import Head, check, predictor, read_head
-from tasks.errors import TaskError
-from tasks.hygiene import Hygiene, clean
-from tasks.photo import read_photo
-from tasks.survey import outside
-from tasks.types import Bools, RoadMask, TileData
-from tasks.windows import blend, cover
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options, registration
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.dinov2 import PATCH, Backbone, Device, load_backbone, normalised
+from flexroad.tasks.dinov2_head import Head, check, predictor, read_head
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import Hygiene, clean
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import Bools, RoadMask, TileData
+from flexroad.tasks.windows import blend, cover
 
 VERSION = 1
 READS = ("dop", "roads")

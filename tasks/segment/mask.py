@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from tasks import options
-from tasks.errors import TaskError
-from tasks.survey import outside
-from tasks.types import RoadMask, TileData
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
 

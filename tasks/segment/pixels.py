@@ -7,14 +7,14 @@ from typing import Literal
 
 from pydantic import Field
 
-from tasks import options, registration
-from tasks.acquire.types import Photo
-from tasks.errors import TaskError
-from tasks.hygiene import Hygiene, clean
-from tasks.pixel_features import features, look
-from tasks.pixel_model import About, read_model
-from tasks.survey import outside
-from tasks.types import RoadMask, TileData
+from flexroad.tasks import options, registration
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import Hygiene, clean
+from flexroad.tasks.pixel_features import features, look
+from flexroad.tasks.pixel_model import About, read_model
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")

@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from tasks import road_vectors
-from tasks.errors import TaskError
-from tasks.hygiene import NOTHING, Hygiene, clean
-from tasks.survey import outside
-from tasks.types import RoadMask, TileData
+from flexroad.tasks import road_vectors
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import NOTHING, Hygiene, clean
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
 READS = ("roads",)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.synthetic.network import Street
-from tasks.synthetic.noise import generator
-from tasks.synthetic.objects import Car, GroundAt, House
-from tasks.types import Floats
+from flexroad.tasks.synthetic.network import Street
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.objects import Car, GroundAt, House
+from flexroad.tasks.types import Floats
 
 BAY_M, AISLE_M = 2.6, 16.0
 """Width of a bay, and from one double row's middle to the next."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks.synthetic.network import Plan, Stream, Street
-from tasks.synthetic.options import DEFAULTS, SceneOptions
-from tasks.synthetic.scene import plan_of
-from tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M, SUNKEN_M
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.synthetic.network import Plan, Stream, Street
+from flexroad.tasks.synthetic.options import DEFAULTS, SceneOptions
+from flexroad.tasks.synthetic.scene import plan_of
+from flexroad.tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M, SUNKEN_M
+from flexroad.tasks.types import Floats
 
 STEP_M = 5.0
 """Between the points of a line."""

@@ -14,12 +14,12 @@ from itertools import count
 import numpy as np
 from scipy.optimize import brentq
 
-from catalog.grid import Grid
-from tasks.synthetic.layout import SOUTH_M, WEST_M
-from tasks.synthetic.noise import generator
-from tasks.synthetic.options import SceneOptions
-from tasks.synthetic.reconstruction import Faults
-from tasks.synthetic.scene import make_scene
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.synthetic.layout import SOUTH_M, WEST_M
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.options import SceneOptions
+from flexroad.tasks.synthetic.reconstruction import Faults
+from flexroad.tasks.synthetic.scene import make_scene
 
 CRS = "EPSG:32632"
 """UTM as such, which is what DSC3D's own meshes are placed by."""

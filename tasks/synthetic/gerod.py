@@ -9,10 +9,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks.synthetic.layout import SOUTH_M, WEST_M
-from tasks.synthetic.noise import generator
-from tasks.synthetic.options import SceneOptions
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.synthetic.layout import SOUTH_M, WEST_M
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.options import SceneOptions
 
 STRATA = {"urban": 168, "suburban": 23, "rural": 49}
 """Tiles of the whole benchmark, as in the paper."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from itertools import islice
 
-from catalog.grid import Grid
+from flexroad.catalog.grid import Grid
 
 WEST_M, SOUTH_M = 500_000, 5_600_000
 """Where every block starts: on the central meridian of EPSG:25832, and a multiple of common tile sizes."""

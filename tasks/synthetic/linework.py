@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.synthetic.network import Street
-from tasks.synthetic.noise import generator
-from tasks.synthetic.objects import CORNER_M, GroundAt
-from tasks.types import Floats
+from flexroad.tasks.synthetic.network import Street
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.objects import CORNER_M, GroundAt
+from flexroad.tasks.types import Floats
 
 STEP_M = 0.25
 """Between the points a line is drawn by."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 WALL_M = 1.5
 """Least step to a neighbouring cell that counts as a wall."""

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from tasks.synthetic.noise import generator
-from tasks.synthetic.strata import Stratum, named, stratum_at
-from tasks.types import Floats
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.strata import Stratum, named, stratum_at
+from flexroad.tasks.types import Floats
 
 Box = tuple[float, float, float, float]
 """Lowest x and y, highest x and y (m) in the plan's frame."""

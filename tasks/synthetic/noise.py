@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 KEY_OFFSET = 2**31
 """Makes lattice indices non-negative, as seeds must be."""

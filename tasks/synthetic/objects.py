@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tasks.synthetic.network import Street
-from tasks.synthetic.noise import generator
-from tasks.synthetic.surfaces import Ground
-from tasks.types import Floats
+from flexroad.tasks.synthetic.network import Street
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.surfaces import Ground
+from flexroad.tasks.types import Floats
 
 GroundAt = Callable[[Floats, Floats], Ground]
 """The ground under points of the plan's frame."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from tasks.options import Options
+from flexroad.tasks.options import Options
 
 
 class SceneOptions(Options):

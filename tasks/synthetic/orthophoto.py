@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.synthetic.noise import generator, waves
-from tasks.synthetic.options import DEFAULTS, SceneOptions
-from tasks.synthetic.scene import Scene, make_scene
-from tasks.synthetic.spoilers import Kind
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.synthetic.noise import generator, waves
+from flexroad.tasks.synthetic.options import DEFAULTS, SceneOptions
+from flexroad.tasks.synthetic.scene import Scene, make_scene
+from flexroad.tasks.synthetic.spoilers import Kind
+from flexroad.tasks.types import Bools, Floats
 
 Picture = NDArray[np.float32]
 """``(H, W, 3)``, red, green and blue, 0 to 255."""

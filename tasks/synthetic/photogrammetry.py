@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.acquire.mesh import TexturedMesh
-from tasks.synthetic.dsc3d import Place
-from tasks.synthetic.noise import generator
-from tasks.synthetic.orthophoto import orthophoto
-from tasks.synthetic.reconstruction import Reconstruction, reconstruct
-from tasks.synthetic.scene import Scene, make_scene
-from tasks.synthetic.triangles import Faces, fragments, lattice, simplified
-from tasks.types import Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.mesh import TexturedMesh
+from flexroad.tasks.synthetic.dsc3d import Place
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.orthophoto import orthophoto
+from flexroad.tasks.synthetic.reconstruction import Reconstruction, reconstruct
+from flexroad.tasks.synthetic.scene import Scene, make_scene
+from flexroad.tasks.synthetic.triangles import Faces, fragments, lattice, simplified
+from flexroad.tasks.types import Floats
 
 NODE_M = 0.5
 """Spacing of the lattice that is simplified: 300 x 300 quads, 180,000 triangles."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.synthetic.noise import generator, waves
-from tasks.types import Bools, Floats
+from flexroad.tasks.synthetic.noise import generator, waves
+from flexroad.tasks.types import Bools, Floats
 
 THICKET_M = (6.0, 60.0)
 """Shortest and longest wave of the thickets."""

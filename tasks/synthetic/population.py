@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.synthetic import areas, linework
-from tasks.synthetic.areas import Area
-from tasks.synthetic.linework import Trace
-from tasks.synthetic.network import Street
-from tasks.synthetic.noise import generator
-from tasks.synthetic.objects import Car, Crown, GroundAt, House, Spot, cars, crowns, houses, spots
-from tasks.synthetic.options import SceneOptions
-from tasks.synthetic.towers import towers
+from flexroad.tasks.synthetic import areas, linework
+from flexroad.tasks.synthetic.areas import Area
+from flexroad.tasks.synthetic.linework import Trace
+from flexroad.tasks.synthetic.network import Street
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.objects import Car, Crown, GroundAt, House, Spot, cars, crowns, houses, spots
+from flexroad.tasks.synthetic.options import SceneOptions
+from flexroad.tasks.synthetic.towers import towers
 
 UNDER_WAY_M = 2.5
 """A car parked farther than this from the kerb stands in a roundabout's lane."""

@@ -15,12 +15,12 @@ from pydantic import Field
 from scipy import ndimage
 from scipy.stats import norm
 
-from catalog.grid import Grid
-from tasks import options as base
-from tasks.synthetic.noise import generator, waves
-from tasks.synthetic.scene import Scene
-from tasks.synthetic.spoilers import Kind
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options as base
+from flexroad.tasks.synthetic.noise import generator, waves
+from flexroad.tasks.synthetic.scene import Scene
+from flexroad.tasks.synthetic.spoilers import Kind
+from flexroad.tasks.types import Bools, Floats
 
 BUMP_M = (1.5, 15.0)
 """Shortest and longest bump."""

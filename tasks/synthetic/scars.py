@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tasks.synthetic.noise import generator
-from tasks.synthetic.objects import House
-from tasks.synthetic.spoilers import Canvas
-from tasks.types import Floats
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.objects import House
+from flexroad.tasks.synthetic.spoilers import Canvas
+from flexroad.tasks.types import Floats
 
 RIM_M = 1.5
 """How far beyond the walls the ground was lost with the house."""

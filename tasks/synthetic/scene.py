@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.synthetic.mixing import mixed
-from tasks.synthetic.network import Box, Plan
-from tasks.synthetic.noise import Waves, generator, waves
-from tasks.synthetic.objects import GroundAt
-from tasks.synthetic.options import DEFAULTS, SceneOptions
-from tasks.synthetic.plants import growth
-from tasks.synthetic.population import Objects, populate
-from tasks.synthetic.scars import scars
-from tasks.synthetic.spoilers import BARE, Canvas, Kind, segmentation, surface_model
-from tasks.synthetic.strata import named
-from tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.synthetic.mixing import mixed
+from flexroad.tasks.synthetic.network import Box, Plan
+from flexroad.tasks.synthetic.noise import Waves, generator, waves
+from flexroad.tasks.synthetic.objects import GroundAt
+from flexroad.tasks.synthetic.options import DEFAULTS, SceneOptions
+from flexroad.tasks.synthetic.plants import growth
+from flexroad.tasks.synthetic.population import Objects, populate
+from flexroad.tasks.synthetic.scars import scars
+from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, segmentation, surface_model
+from flexroad.tasks.synthetic.strata import named
+from flexroad.tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
+from flexroad.tasks.types import Bools, Floats
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 

@@ -8,14 +8,14 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from catalog.grid import Grid
-from tasks.synthetic.areas import Area
-from tasks.synthetic.linework import Trace
-from tasks.synthetic.network import Plan
-from tasks.synthetic.noise import Waves
-from tasks.synthetic.objects import Car, Crown, House
-from tasks.synthetic.population import Objects
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.synthetic.areas import Area
+from flexroad.tasks.synthetic.linework import Trace
+from flexroad.tasks.synthetic.network import Plan
+from flexroad.tasks.synthetic.noise import Waves
+from flexroad.tasks.synthetic.objects import Car, Crown, House
+from flexroad.tasks.synthetic.population import Objects
+from flexroad.tasks.types import Bools, Floats
 
 
 class Kind(IntEnum):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.errors import TaskError
-from tasks.synthetic.noise import generator
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.synthetic.noise import generator
 
 Range = tuple[float, float]
 

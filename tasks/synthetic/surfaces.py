@@ -8,9 +8,9 @@ from types import EllipsisType
 
 import numpy as np
 
-from tasks.synthetic.network import Stream, Street
-from tasks.synthetic.noise import Waves, generator, waves
-from tasks.types import Bools, Floats
+from flexroad.tasks.synthetic.network import Stream, Street
+from flexroad.tasks.synthetic.noise import Waves, generator, waves
+from flexroad.tasks.types import Bools, Floats
 
 CROSSFALL = 0.025
 """Mean fall from a street's middle to its edge."""

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tasks.synthetic.network import Street
-from tasks.synthetic.noise import generator
-from tasks.synthetic.objects import GroundAt, House
-from tasks.types import Floats
+from flexroad.tasks.synthetic.network import Street
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.objects import GroundAt, House
+from flexroad.tasks.types import Floats
 
 HALF_SIDE_M, HEIGHT_M = (1.5, 7.0), (22.0, 48.0)
 SETBACK_M = (10.0, 24.0)

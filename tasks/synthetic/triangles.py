@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 Faces = NDArray[np.int32]
 FRAGMENT_M = (0.4, 1.5)

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from catalog.grid import Grid
-from tasks.dinov2 import EXAMPLE, MEAN, PATCH, STD, Backbone, Device, load_backbone, normalised
-from tasks.dinov2_head import About, Head
-from tasks.errors import TaskError
-from tasks.photo import read_photo
-from tasks.token_regression import Labels, Line, Settings, Windows, best_threshold, regress
-from tasks.training.types import Progress, Sample, Trained
-from tasks.types import Bools
-from tasks.windows import corners, cover
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.dinov2 import EXAMPLE, MEAN, PATCH, STD, Backbone, Device, load_backbone, normalised
+from flexroad.tasks.dinov2_head import About, Head
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.token_regression import Labels, Line, Settings, Windows, best_threshold, regress
+from flexroad.tasks.training.types import Progress, Sample, Trained
+from flexroad.tasks.types import Bools
+from flexroad.tasks.windows import corners, cover
 
 
 class Options(Settings):

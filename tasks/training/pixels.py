@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from catalog.grid import Grid
-from tasks import options
-from tasks.errors import TaskError
-from tasks.pixel_features import features, look
-from tasks.pixel_model import About, Model
-from tasks.training.types import Progress, Round, Sample, Trained
-from tasks.types import Bools, Floats
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.pixel_features import features, look
+from flexroad.tasks.pixel_model import About, Model
+from flexroad.tasks.training.types import Progress, Round, Sample, Trained
+from flexroad.tasks.types import Bools, Floats
 
 BINS = 63
 """Values of a feature are told apart by so many quantiles; more take longer to find than to learn from."""

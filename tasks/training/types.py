@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from tasks.types import Bools, TileData
+from flexroad.tasks.types import Bools, TileData
 
 
 @dataclass(frozen=True, eq=False)

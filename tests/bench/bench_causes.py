@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from catalog import Catalog
-from pipeline.config import load_config
-from pipeline.graph import tile_graph
-from pipeline.pull import Pull
-from pipeline.store import Store
-from pipeline.synthesis import write_scenes
-from tasks import adam, ecsrc, evaluate, sample
-from tasks.fit import nurbs as fit
-from tasks.nurbs import NurbsSurface, basis_matrix
-from tasks.types import RoadClusters, TileData
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.graph import tile_graph
+from flexroad.pipeline.pull import Pull
+from flexroad.pipeline.store import Store
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.tasks import adam, ecsrc, evaluate, sample
+from flexroad.tasks.fit import nurbs as fit
+from flexroad.tasks.nurbs import NurbsSurface, basis_matrix
+from flexroad.tasks.types import RoadClusters, TileData
 
 TILES, SEED = 24, 1
 SOUND_M = 0.3

@@ -9,13 +9,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from catalog import Catalog
-from pipeline.config import Config, compose, load_config
-from pipeline.graph import STAGE_NAMES
-from pipeline.run import Run
-from pipeline.synthesis import write_scenes
-from pipeline.warm import warm
-from pipeline.work import do_tile
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import Config, compose, load_config
+from flexroad.pipeline.graph import STAGE_NAMES
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.warm import warm
+from flexroad.pipeline.work import do_tile
 
 TILES = 8
 MANY = 2000

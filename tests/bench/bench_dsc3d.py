@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from catalog import Catalog, Tile
-from pipeline.standin import write_stand_in
-from tasks import ecsrc, evaluate, load, sample
-from tasks.fit import plane, raster
-from tasks.segment import mask
-from tasks.synthetic.dsc3d import SITES
+from flexroad.catalog import Catalog, Tile
+from flexroad.pipeline.standin import write_stand_in
+from flexroad.tasks import ecsrc, evaluate, load, sample
+from flexroad.tasks.fit import plane, raster
+from flexroad.tasks.segment import mask
+from flexroad.tasks.synthetic.dsc3d import SITES
 
 PAPER = {
     "mesh triangles, least": 35_000,

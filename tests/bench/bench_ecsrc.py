@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from catalog.grid import Grid
-from tasks.ecsrc import Options, ecsrc
-from tasks.types import RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.ecsrc import Options, ecsrc
+from flexroad.tasks.types import RoadMask, TileData
 
 SIZE, SHARE = 250, 0.2
 

@@ -25,12 +25,12 @@ import rasterio
 from scipy.interpolate import griddata
 from scipy.ndimage import binary_dilation, label
 
-from catalog import Grid
-from tasks import ecsrc, evaluate, grounded, sample
-from tasks.fit import nurbs
-from tasks.synthetic import Scene, gerod, make_scene
-from tasks.synthetic.spoilers import BARE, Kind
-from tasks.types import Floats, RoadClusters, RoadMask, TileData
+from flexroad.catalog import Grid
+from flexroad.tasks import ecsrc, evaluate, grounded, sample
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.synthetic import Scene, gerod, make_scene
+from flexroad.tasks.synthetic.spoilers import BARE, Kind
+from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
 
 TILES, SEED = 2, 1
 HALO_M = 50

@@ -14,12 +14,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks import adam
-from tasks.fit import nurbs
-from tasks.nurbs import basis_matrix
-from tasks.objective import NEIGHBOURS, Objective
-from tasks.types import RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import adam
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.nurbs import basis_matrix
+from flexroad.tasks.objective import NEIGHBOURS, Objective
+from flexroad.tasks.types import RoadClusters, TileData
 
 SIZE, ITERATIONS, SAMPLED = 250, 200, 2
 OPTIONS = nurbs.Options(iterations=ITERATIONS, stop_tolerance=0)

@@ -12,12 +12,12 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks import ecsrc, evaluate, sample
-from tasks.fit import plane, raster
-from tasks.synthetic import SceneOptions, make_scene
-from tasks.synthetic.gerod import survey
-from tasks.types import RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import ecsrc, evaluate, sample
+from flexroad.tasks.fit import plane, raster
+from flexroad.tasks.synthetic import SceneOptions, make_scene
+from flexroad.tasks.synthetic.gerod import survey
+from flexroad.tasks.types import RoadMask, TileData
 
 PAPER = {
     "road share": 0.18,

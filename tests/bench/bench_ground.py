@@ -21,10 +21,10 @@ import laspy
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from tasks.acquire.ground import Options, ground, ground_cells
-from tasks.synthetic import Scene, gerod, make_scene
-from tasks.synthetic.spoilers import BARE, Kind
-from tasks.types import Bools, Floats
+from flexroad.tasks.acquire.ground import Options, ground, ground_cells
+from flexroad.tasks.synthetic import Scene, gerod, make_scene
+from flexroad.tasks.synthetic.spoilers import BARE, Kind
+from flexroad.tasks.types import Bools, Floats
 
 SEED, TILES = 2, 24
 SIDE_M = 500

@@ -24,13 +24,13 @@ import numpy as np
 import pandas as pd
 from scipy.ndimage import label
 
-from catalog import Catalog
-from catalog.sources.rasters import index
-from pipeline.synthesis import write_scenes
-from tasks import ecsrc, evaluate, load, sample
-from tasks.fit import nurbs
-from tasks.segment import mask
-from tasks.types import Bools, RoadClusters, RoadMask, TileData
+from flexroad.catalog import Catalog
+from flexroad.catalog.sources.rasters import index
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.tasks import ecsrc, evaluate, load, sample
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.segment import mask
+from flexroad.tasks.types import Bools, RoadClusters, RoadMask, TileData
 
 TILES, SEED = 48, 1
 SOUND_M = 0.3

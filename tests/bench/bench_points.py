@@ -118,10 +118,10 @@ def decode(task: str, files: list[Path], out: Path) -> None:
 
 
 def prepare(task: str, files: list[Path], out: Path, cell: float = 1) -> None:
-    from pipeline.execute import DaskExecutor, SerialExecutor
-    from pipeline.prepare.asked import Asked
-    from pipeline.prepare.points import prepare_points
-    from tasks.acquire.points import Options
+    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+    from flexroad.pipeline.prepare.asked import Asked
+    from flexroad.pipeline.prepare.points import prepare_points
+    from flexroad.tasks.acquire.points import Options
 
     executor = DaskExecutor() if task == "dask" else SerialExecutor()
     asked = Asked(crs="EPSG:2994", cell_m=cell, tile_size_m=500)

@@ -28,15 +28,15 @@ import pandas as pd
 import rasterio
 from bench_filter import NOISE_M, PAVED, Case, with_scars
 
-from catalog import Catalog, Tile
-from catalog.sources.rasters import index
-from pipeline.cli import main as flexroad
-from pipeline.config import load_config
-from pipeline.graph import STAGE_NAMES, STAGES, stage_function
-from pipeline.synthesis import write_scenes
-from tasks.synthetic import gerod, make_scene
-from tasks.synthetic.spoilers import Kind
-from tasks.types import Bools, Floats, RoadMask, TileData
+from flexroad.catalog import Catalog, Tile
+from flexroad.catalog.sources.rasters import index
+from flexroad.pipeline.cli import main as flexroad
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.graph import STAGE_NAMES, STAGES, stage_function
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.tasks.synthetic import gerod, make_scene
+from flexroad.tasks.synthetic.spoilers import Kind
+from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
 TILES, SEED = 4, 1
 OVER_M = 2.0
@@ -172,7 +172,7 @@ def spoil(folder: Path, patterns: dict[str, str]) -> None:
 
 
 def _as_case(dtm: Floats) -> Case:
-    from catalog import Grid
+    from flexroad.catalog import Grid
 
     grid = Grid("EPSG:25832", 0.0, float(dtm.shape[0]), 1.0, dtm.shape[1], dtm.shape[0])
     nothing = np.zeros(dtm.shape, bool)

@@ -12,16 +12,16 @@ import numpy as np
 import pandas as pd
 from scipy.ndimage import gaussian_filter, label
 
-from catalog.grid import Grid
-from tasks import ecsrc
-from tasks.assess import Options, assess
-from tasks.fit import nurbs
-from tasks.nurbs import NurbsSurface
-from tasks.support import unsound, without_unsound
-from tasks.synthetic import make_scene
-from tasks.synthetic.gerod import survey
-from tasks.synthetic.spoilers import Kind
-from tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import ecsrc
+from flexroad.tasks.assess import Options, assess
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.nurbs import NurbsSurface
+from flexroad.tasks.support import unsound, without_unsound
+from flexroad.tasks.synthetic import make_scene
+from flexroad.tasks.synthetic.gerod import survey
+from flexroad.tasks.synthetic.spoilers import Kind
+from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
 SPOILED_M = 0.3
 FREE, UNIT = nurbs.Options(), nurbs.Options(weights="unit")

@@ -13,9 +13,9 @@ import time
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks.acquire.points import Options, rasterise, reach_m
-from tasks.acquire.types import Points
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.points import Options, rasterise, reach_m
+from flexroad.tasks.acquire.types import Points
 
 POINTS = 4_000_000
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)

@@ -8,13 +8,13 @@ import trimesh
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from scipy.spatial import Delaunay
 
-from catalog.grid import Grid
-from tasks import ecsrc, evaluate, sample
-from tasks.drape import drape
-from tasks.fit import nurbs, raster
-from tasks.mad import mean_angles
-from tasks.synthetic.scene import make_scene
-from tasks.types import Mesh, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import ecsrc, evaluate, sample
+from flexroad.tasks.drape import drape
+from flexroad.tasks.fit import nurbs, raster
+from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.synthetic.scene import make_scene
+from flexroad.tasks.types import Mesh, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 

@@ -28,14 +28,14 @@ import psutil
 import rasterio
 from numpy.typing import NDArray
 
-from catalog import Catalog, Grid
-from catalog.sources import rasters
-from pipeline.config import compose
-from pipeline.execute import DaskExecutor
-from pipeline.ledger import NAME as LEDGER
-from pipeline.run import Run, execute
-from pipeline.work import Job, TileResult, failed_row
-from tasks.synthetic import SceneOptions, make_scene
+from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.sources import rasters
+from flexroad.pipeline.config import compose
+from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.ledger import NAME as LEDGER
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.work import Job, TileResult, failed_row
+from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
 """10,000 for docs/operations.md."""
@@ -114,7 +114,7 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
 
 def sleep_tile(job: Job) -> TileResult:
     """Take as long as a real tile, and send back as much."""
-    from pipeline.entry import Entry
+    from flexroad.pipeline.entry import Entry
 
     time.sleep(SLEEP_S)
     rows = tuple(failed_row(job.graph, v, "") | {"status": "done"} for v in job.graph.variants)
@@ -257,7 +257,7 @@ def resumed(folder: Path, tiles: int) -> None:
 
 
 def flexroad(folder: Path, words: list[str]) -> None:
-    code = "from pipeline.cli import main; main()"
+    code = "from flexroad.pipeline.cli import main; main()"
     root = Path(__file__).parents[2]
     subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(root)!r}); {code}", *words],

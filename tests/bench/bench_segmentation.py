@@ -19,22 +19,22 @@ from pathlib import Path
 
 import numpy as np
 
-from catalog import Catalog
-from pipeline.execute import SerialExecutor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.points import prepare_points
-from tasks import load, road_vectors
-from tasks.acquire import points
-from tasks.errors import TaskError
-from tasks.hygiene import NOTHING, Hygiene
-from tasks.photo import read_photo
-from tasks.pixel_features import features, look
-from tasks.pixel_model import read_model
-from tasks.segment import pixels, vector
-from tasks.survey import outside
-from tasks.training import pixels as training
-from tasks.training.types import Sample
-from tasks.types import Bools, Source, TileData
+from flexroad.catalog import Catalog
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.points import prepare_points
+from flexroad.tasks import load, road_vectors
+from flexroad.tasks.acquire import points
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import NOTHING, Hygiene
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.pixel_features import features, look
+from flexroad.tasks.pixel_model import read_model
+from flexroad.tasks.segment import pixels, vector
+from flexroad.tasks.survey import outside
+from flexroad.tasks.training import pixels as training
+from flexroad.tasks.training.types import Sample
+from flexroad.tasks.types import Bools, Source, TileData
 
 HALO_M = 60.0
 MIDDLE_M = 194_250.0

@@ -16,12 +16,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks import adam, irls
-from tasks.bending import Plate, plate
-from tasks.fit import nurbs
-from tasks.objective import Objective
-from tasks.types import Floats, RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import adam, irls
+from flexroad.tasks.bending import Plate, plate
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.objective import Objective
+from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 SIZE, ITERATIONS, ROUNDS = 250, 200, 5
 STIFFNESS_M3, TERRAIN = 100.0, 0.02

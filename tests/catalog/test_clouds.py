@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from laspy.vlrs.known import GeoKeyDirectoryVlr
 
-from catalog import CatalogError
-from catalog.clouds import chunks, find, inspect
-from catalog.crs import in_plan
+from flexroad.catalog import CatalogError
+from flexroad.catalog.clouds import chunks, find, inspect
+from flexroad.catalog.crs import in_plan
 from tests.make_clouds import write_cloud
 
 N = 120_000

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from catalog import CatalogError
-from catalog.clouds import inspect
-from catalog.crs import in_plan, metric_twin, plan_unit
-from catalog.frame import Frame, agreed
+from flexroad.catalog import CatalogError
+from flexroad.catalog.clouds import inspect
+from flexroad.catalog.crs import in_plan, metric_twin, plan_unit
+from flexroad.catalog.frame import Frame, agreed
 
 OREGON = (637000.0, 852000.0)
 COLOGNE = (6.95, 50.94)

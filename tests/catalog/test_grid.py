@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catalog import CatalogError, Grid
+from flexroad.catalog import CatalogError, Grid
 
 UTM = "EPSG:25832"
 TILE = Grid(UTM, 295500.0, 5629500.0, 1.0, 250, 250)

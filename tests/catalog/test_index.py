@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pystac
 import pytest
 
-from catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
+from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
 
 
 def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
@@ -123,7 +123,7 @@ def test_rows_and_tables_are_those_of_stac_geoparquet(tmp_path):
     """Its own way takes many times as long; it is the oracle for ours."""
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
 
-    from catalog.index import _everything, _tile, item
+    from flexroad.catalog.index import _everything, _tile, item
 
     tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS), tile(296000, tmp_path, layers=()))
     Catalog(tiles).write(tmp_path / "c.parquet")

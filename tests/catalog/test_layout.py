@@ -5,9 +5,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from catalog import CatalogError
-from catalog.layout import Layout, read
-from catalog.sources import dsc3d, gerod
+from flexroad.catalog import CatalogError
+from flexroad.catalog.layout import Layout, read
+from flexroad.catalog.sources import dsc3d, gerod
 from tests.make_rasters import UTM, write
 
 FLAT = np.full((20, 20), 100, np.float32)

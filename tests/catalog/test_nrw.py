@@ -9,9 +9,9 @@ from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catalog import CatalogError
-from catalog.sources.nrw import index, parse
-from tasks.load import Options, load
+from flexroad.catalog import CatalogError
+from flexroad.catalog.sources.nrw import index, parse
+from flexroad.tasks.load import Options, load
 from tests.make_rasters import UTM, write, write_xyz
 
 WEST, NORTH = 356000, 5700000

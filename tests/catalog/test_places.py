@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from catalog import places
-from catalog.places import Sightings, place
+from flexroad.catalog import places
+from flexroad.catalog.places import Sightings, place
 from tests.s3_server import Fault
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from catalog import Catalog, CatalogError
-from catalog.sources.rasters import index
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog.sources.rasters import index
 from tests.make_rasters import UTM, write, write_xyz
 
 FLAT = np.full((250, 250), 100, dtype=np.float32)

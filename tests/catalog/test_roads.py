@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from shapely import LineString, box
 
-from catalog import Catalog, CatalogError
-from catalog.sources import nrw, rasters
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog.sources import nrw, rasters
 from tests.make_rasters import write
 from tests.make_roads import write as write_roads
 from tests.make_roads import write_osm

@@ -4,9 +4,9 @@ from datetime import UTC, datetime
 
 import pytest
 
-from catalog import Catalog, CatalogError, Grid, Layer, Tile
-from catalog.tile import LAYERS
-from catalog.trust import needed, refuse_outside
+from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
+from flexroad.catalog.tile import LAYERS
+from flexroad.catalog.trust import needed, refuse_outside
 
 
 def catalog(*files, root) -> Catalog:

@@ -16,12 +16,12 @@ import rasterio
 from affine import Affine
 from rasterio.warp import transform_bounds
 
-from catalog import Catalog, Grid, Tile
-from catalog.sources import prepared
-from pipeline.config import compose
-from pipeline.execute import SerialExecutor
-from pipeline.run import Run, execute
-from pipeline.tables import read_metrics
+from flexroad.catalog import Catalog, Grid, Tile
+from flexroad.catalog.sources import prepared
+from flexroad.pipeline.config import compose
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.tables import read_metrics
 from tests.conftest import QUICK, Said
 from tests.make_rasters import write
 
@@ -658,7 +658,14 @@ def test_a_damaged_run_is_said_and_mended(
 def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
     words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
     words += ["--store", tmp_path / "store"]
-    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", *map(str, words), "--out"]
+    call = [
+        sys.executable,
+        "-c",
+        "from flexroad.pipeline.cli import main; main()",
+        "run",
+        *map(str, words),
+        "--out",
+    ]
     both = [
         subprocess.Popen([*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
         for name in "ab"

@@ -3,9 +3,9 @@
 import rasterio
 from affine import Affine
 
-from catalog import Catalog
-from pipeline.check import check
-from pipeline.synthesis import write_scenes
+from flexroad.catalog import Catalog
+from flexroad.pipeline.check import check
+from flexroad.pipeline.synthesis import write_scenes
 
 
 def test_a_moved_photo_and_a_lost_file_are_told(tmp_path):

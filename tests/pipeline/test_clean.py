@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from catalog import Catalog
-from catalog.places import listing
-from pipeline.clean import alone, drop, waste
-from pipeline.config import load_config
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.lock import held
-from pipeline.registry import forget, users
-from pipeline.run import Run, execute
+from flexroad.catalog import Catalog
+from flexroad.catalog.places import listing
+from flexroad.pipeline.clean import alone, drop, waste
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.lock import held
+from flexroad.pipeline.registry import forget, users
+from flexroad.pipeline.run import Run, execute
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from catalog import Catalog
-from pipeline.cli import spread
+from flexroad.catalog import Catalog
+from flexroad.pipeline.cli import spread
 
 
 def flexroad(*words, expect: int = 0) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", "from pipeline.cli import main; main()", *map(str, words)],
+        [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", *map(str, words)],
         capture_output=True,
         text=True,
         check=False,
@@ -114,7 +114,7 @@ def _headless(folder: Path) -> Path:
 def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
     import rasterio
 
-    from pipeline.query import Ground
+    from flexroad.pipeline.query import Ground
 
     tile = Catalog.read(made_survey / "catalog.parquet").tiles[1]
     with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from shapely import box
 
-from catalog import Catalog
+from flexroad.catalog import Catalog
 from tests.make_clouds import write_cloud
 
-CALL = [sys.executable, "-c", "from pipeline.cli import main; main()"]
+CALL = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()"]
 WEST, SOUTH = 356_000.0, 5_699_000.0
 
 

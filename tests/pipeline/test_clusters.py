@@ -11,11 +11,11 @@ import cloudpickle
 import psutil
 import pytest
 
-from pipeline.cluster import Cluster
-from pipeline.config import load_config
-from pipeline.errors import ClusterLost, ConfigError
-from pipeline.execute import DaskExecutor
-from pipeline.execute.clusters import kubernetes_options, opened, slurm_options
+from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.execute.clusters import kubernetes_options, opened, slurm_options
 from tests.dask_processes import Processes, until, wait_for
 
 # Workers have no tests to import.
@@ -120,7 +120,7 @@ def refused(processes, jobs=(1, 2, 3), **options) -> str:
 
 
 def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy, monkeypatch):
-    monkeypatch.setattr("pipeline.execute.clusters.GRACE_S", 0)
+    monkeypatch.setattr("flexroad.pipeline.execute.clusters.GRACE_S", 0)
     processes.scheduler()
     assert f"{processes.address} has no workers; start some" in refused(processes)
     unlike = processes.worker(**other_numpy)
@@ -159,7 +159,7 @@ def test_a_store_that_workers_cannot_write_is_refused(running):
 
 
 def test_nobody_answers(monkeypatch):
-    monkeypatch.setattr("pipeline.execute.dask.ANSWER_S", 1)
+    monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
     with pytest.raises(ConfigError, match=r"scheduler at tcp://127.0.0.1:9 does not answer"):
         list(DaskExecutor(scheduler="tcp://127.0.0.1:9").map(double, [1], lost))
 
@@ -327,8 +327,8 @@ def test_what_is_missing_is_named(kind, remedy, monkeypatch, tmp_path):
 
 
 def test_who_works_changes_no_fingerprint(made_survey, tmp_path):
-    from catalog import Catalog
-    from pipeline.graph import tile_graphs
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.graph import tile_graphs
 
     text = "extends: paper\ncluster: {kind: slurm, queue: night}\n"
     (tmp_path / "night.yaml").write_text(text)

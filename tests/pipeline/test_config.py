@@ -3,9 +3,9 @@ import json
 import pytest
 import yaml
 
-from pipeline.config import compose, load_config, schema, shipped, template
-from pipeline.errors import ConfigError
-from tasks import grounded
+from flexroad.pipeline.config import compose, load_config, schema, shipped, template
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks import grounded
 
 
 def test_every_shipped_configuration_is_valid():

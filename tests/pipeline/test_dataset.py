@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from catalog import Catalog, CatalogError
-from pipeline.config import load_config
-from pipeline.dataset import open_tile
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.query import Ground
-from pipeline.run import Run, execute
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.dataset import open_tile
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.query import Ground
+from flexroad.pipeline.run import Run, execute
 
 
 def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):

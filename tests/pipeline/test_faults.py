@@ -25,13 +25,13 @@ import pytest
 import rasterio
 import yaml
 
-from catalog import Catalog, places
-from pipeline.config import load_config
-from pipeline.execute import SerialExecutor
-from pipeline.journal import Journal
-from pipeline.lock import Holder, held
-from pipeline.run import Run, execute
-from pipeline.tables import read_metrics
+from flexroad.catalog import Catalog, places
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.journal import Journal
+from flexroad.pipeline.lock import Holder, held
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.tables import read_metrics
 from tests.dask_processes import wait_for
 
 LIGHT = {
@@ -174,7 +174,7 @@ def test_a_scheduler_that_is_killed_for_good(
 
 
 def test_workers_that_cannot_be_started_are_said_in_one_line(config, made_survey, night, undisturbed, out):
-    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", "--workers", "2"]
+    call = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", "run", "--workers", "2"]
     call += ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
     few = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh"]
     done = subprocess.run([*few, *call], capture_output=True, text=True, check=False)
@@ -388,7 +388,14 @@ def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, night, 
     whole = file.with_suffix(".whole")
     shutil.copy2(file, whole)
     file.write_bytes(b"")
-    call = [sys.executable, "-c", "from pipeline.cli import main; main()", "run", "--executor", "serial"]
+    call = [
+        sys.executable,
+        "-c",
+        "from flexroad.pipeline.cli import main; main()",
+        "run",
+        "--executor",
+        "serial",
+    ]
     call += ["--config", config, "--catalog", survey, "--out", out]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(call, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, stream: full})
@@ -418,7 +425,7 @@ def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
     for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
         # Not to be written by root, either.
         (folder / "__pycache__").touch()
-    code = "import os, pipeline, tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
+    code = "import os, pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
     elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
     environment |= {"HOME": "/dev/null"}

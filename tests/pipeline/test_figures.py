@@ -9,18 +9,18 @@ import rasterio
 from matplotlib import colormaps
 from PIL import Image
 
-from catalog import Catalog, Grid
-from catalog.errors import CatalogError
-from pipeline.config import compose, load_config
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.report import figures
-from pipeline.report.evidence import collect
-from pipeline.report.figures import cast as casting
-from pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
-from pipeline.report.figures.plate import DPI
-from pipeline.run import Run, execute
-from pipeline.tables import read_metrics
+from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.errors import CatalogError
+from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.report import figures
+from flexroad.pipeline.report.evidence import collect
+from flexroad.pipeline.report.figures import cast as casting
+from flexroad.pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
+from flexroad.pipeline.report.figures.plate import DPI
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.tables import read_metrics
 
 PLATES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
 BASE = {"fit": {"method": "nurbs", "control_points": [10, 10], "iterations": 30}}

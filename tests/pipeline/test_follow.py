@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from pipeline import follow as followed
-from pipeline.entry import Entry, Failure
-from pipeline.follow import Snapshot, follow
-from pipeline.ledger import NAME, Ledger
-from pipeline.lock import Holder, held
+from flexroad.pipeline import follow as followed
+from flexroad.pipeline.entry import Entry, Failure
+from flexroad.pipeline.follow import Snapshot, follow
+from flexroad.pipeline.ledger import NAME, Ledger
+from flexroad.pipeline.lock import Holder, held
 
 ME = Holder("node7", "m", "b", 4711, 99, "2026-11-21T02:00:00+00:00", "t")
 FIRST = Snapshot(when=0, tiles=10, done=4, cached=4, failed=0, holder=ME, failures=())

@@ -9,11 +9,11 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from catalog import Catalog, Layer
-from pipeline.config import compose, load_config
-from pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, stage_version, tile_graph
-from tasks import ecsrc
-from tasks.segment import mask
+from flexroad.catalog import Catalog, Layer
+from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, stage_version, tile_graph
+from flexroad.tasks import ecsrc
+from flexroad.tasks.segment import mask
 
 PAPER = {
     "variants": {

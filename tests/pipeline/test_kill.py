@@ -10,11 +10,11 @@ import pandas as pd
 import psutil
 import pytest
 
-from catalog import Catalog
-from pipeline.config import load_config
-from pipeline.execute import SerialExecutor
-from pipeline.run import Run, execute
-from pipeline.tables import read_metrics
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.tables import read_metrics
 from tests.dask_processes import until
 
 CONFIG = """
@@ -26,7 +26,7 @@ variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    from pipeline.synthesis import write_scenes
+    from flexroad.pipeline.synthesis import write_scenes
 
     folder = tmp_path_factory.mktemp("kill")
     (folder / "slow.yaml").write_text(CONFIG)
@@ -44,7 +44,7 @@ def undisturbed(place) -> pd.DataFrame:
 
 def command(place, out) -> list[str]:
     words = ["--config", place / "slow.yaml", "--catalog", place / "survey" / "catalog.parquet"]
-    call = "from pipeline.cli import main; main()"
+    call = "from flexroad.pipeline.cli import main; main()"
     return [sys.executable, "-c", call, "run", *map(str, words), "--out", str(out), "--workers", "2"]
 
 

@@ -10,23 +10,23 @@ import yaml
 from PIL import Image
 from shapely import LineString
 
-from catalog import Catalog, Grid, places
-from catalog.places import place
-from pipeline import codec
-from pipeline.cli import main
-from pipeline.config import compose
-from pipeline.dataset import open_tile
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.query import Ground
-from pipeline.report import write_report
-from pipeline.run import Run, execute
-from pipeline.summary import read_summary, summary
-from pipeline.tables import read_metrics
-from tasks import TaskError
-from tasks.photo import read_photo
-from tasks.types import Source
-from tasks.vector_files import Asked, near
+from flexroad.catalog import Catalog, Grid, places
+from flexroad.catalog.places import place
+from flexroad.pipeline import codec
+from flexroad.pipeline.cli import main
+from flexroad.pipeline.config import compose
+from flexroad.pipeline.dataset import open_tile
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.query import Ground
+from flexroad.pipeline.report import write_report
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.summary import read_summary, summary
+from flexroad.pipeline.tables import read_metrics
+from flexroad.tasks import TaskError
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.types import Source
+from flexroad.tasks.vector_files import Asked, near
 from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
 from tests.s3_server import Fault

@@ -5,14 +5,14 @@ import pytest
 import rasterio
 from PIL import Image
 
-from catalog import Catalog, Grid
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
-from tasks.acquire.mesh import tops
-from tasks.acquire.mesh_files import read_mesh
-from tasks.errors import TaskError
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+from flexroad.tasks.acquire.mesh import tops
+from flexroad.tasks.acquire.mesh_files import read_mesh
+from flexroad.tasks.errors import TaskError
 
 CRS = "EPSG:32617"
 ZERO = (552_208.0, 4_114_742.0, 0.0)
@@ -98,8 +98,8 @@ def test_rasters_are_those_of_the_mesh(box, tmp_path, executor):
 
 def test_blocks_change_nothing(box, tmp_path, monkeypatch):
     one = prepare(box, tmp_path / "one").catalog.parent
-    monkeypatch.setattr("pipeline.prepare.spool.POINTS_PER_BLOCK", 1)
-    monkeypatch.setattr("pipeline.prepare.spool.SHORTEST_EDGE_M", 17)
+    monkeypatch.setattr("flexroad.pipeline.prepare.spool.POINTS_PER_BLOCK", 1)
+    monkeypatch.setattr("flexroad.pipeline.prepare.spool.SHORTEST_EDGE_M", 17)
     many = prepare(box, tmp_path / "many").catalog.parent
     for name in ("dsm.tif", "dtm.tif", "dop.tif"):
         np.testing.assert_allclose(read(one / name), read(many / name), atol=1e-4)

@@ -7,13 +7,13 @@ import rasterio
 from affine import Affine
 from PIL import Image
 
-from catalog import Catalog, CatalogError
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.prepare import odm
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.mesh import POINTS, MeshAsked
-from pipeline.prepare.odm import prepare_odm
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare import odm
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked
+from flexroad.pipeline.prepare.odm import prepare_odm
 
 CRS = "EPSG:32615"
 WEST, NORTH, SIDE = 576_000.0, 5_188_040.0, 40

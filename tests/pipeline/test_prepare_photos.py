@@ -6,13 +6,13 @@ import pytest
 import rasterio
 from PIL import Image
 
-from catalog import Catalog
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.photos import PhotosAsked, _resolved, prepare_photos
-from tasks import TaskError
-from tasks.acquire import dense, photogrammetry, points
+from flexroad.catalog import Catalog
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.photos import PhotosAsked, _resolved, prepare_photos
+from flexroad.tasks import TaskError
+from flexroad.tasks.acquire import dense, photogrammetry, points
 from tests import make_photos
 
 ASKED = PhotosAsked(

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import rasterio
 
-from catalog import Catalog, CatalogError
-from pipeline.errors import ConfigError
-from pipeline.execute import SerialExecutor
-from pipeline.prepare import points, spool
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.points import prepare_points
-from tasks.acquire.points import Options
-from tasks.load import Options as LoadOptions
-from tasks.load import load
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare import points, spool
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.points import prepare_points
+from flexroad.tasks.acquire.points import Options
+from flexroad.tasks.load import Options as LoadOptions
+from flexroad.tasks.load import load
 from tests.make_clouds import write_cloud
 
 SIZE = np.array([130.0, 90.0])

@@ -6,11 +6,11 @@ import pytest
 import rasterio
 from shapely import LineString, Point, Polygon, box
 
-from catalog import Catalog, Grid
-from pipeline.errors import ConfigError
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.roads import add_roads, burn
-from pipeline.prepare.sheet import Sheet
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.roads import add_roads, burn
+from flexroad.pipeline.prepare.sheet import Sheet
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
 

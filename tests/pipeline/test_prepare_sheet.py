@@ -5,10 +5,10 @@ import pytest
 import rasterio
 from rio_cogeo.cogeo import cog_validate
 
-from catalog import Catalog, Grid
-from pipeline.errors import ConfigError
-from pipeline.prepare.sheet import Sheet
-from tasks.acquire.types import Photo
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.prepare.sheet import Sheet
+from flexroad.tasks.acquire.types import Photo
 
 CRS = "EPSG:25832"
 FACTS = {"SOURCE": "made", "DTM": "a slope"}

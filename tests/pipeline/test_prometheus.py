@@ -3,11 +3,11 @@
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from pipeline.entry import Entry
-from pipeline.meter import Span
-from pipeline.prometheus import Textfile
-from pipeline.summary import Summary
-from pipeline.work import TileResult
+from flexroad.pipeline.entry import Entry
+from flexroad.pipeline.meter import Span
+from flexroad.pipeline.prometheus import Textfile
+from flexroad.pipeline.summary import Summary
+from flexroad.pipeline.work import TileResult
 
 
 def result(status, **spans) -> TileResult:

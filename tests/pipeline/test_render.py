@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from catalog import Grid
-from pipeline.report import render
-from tasks.types import Mesh
+from flexroad.catalog import Grid
+from flexroad.pipeline.report import render
+from flexroad.tasks.types import Mesh
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 ROW, COL = np.indices(GRID.shape)

@@ -9,17 +9,17 @@ import pandas as pd
 import pytest
 import rasterio
 
-from catalog import Catalog
-from pipeline.config import compose, load_config
-from pipeline.errors import ConfigError
-from pipeline.execute import DaskExecutor, SerialExecutor
-from pipeline.graph import Pattern
-from pipeline.report.steps import edge_steps
-from pipeline.run import Run, execute, select
-from pipeline.store import Store
-from pipeline.summary import Summary, summary
-from pipeline.tables import read_metrics
-from pipeline.work import TileResult
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.graph import Pattern
+from flexroad.pipeline.report.steps import edge_steps
+from flexroad.pipeline.run import Run, execute, select
+from flexroad.pipeline.store import Store
+from flexroad.pipeline.summary import Summary, summary
+from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.work import TileResult
 
 FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
@@ -291,7 +291,7 @@ def test_a_resume_makes_each_graph_once_and_reads_no_marker(run, monkeypatch):
         return graph(self, tile, *how)
 
     monkeypatch.setattr(Pattern, "graph", counted)
-    monkeypatch.setattr("pipeline.look._from_marker", lambda *_: pytest.fail("a marker was read"))
+    monkeypatch.setattr("flexroad.pipeline.look._from_marker", lambda *_: pytest.fail("a marker was read"))
     nothing_to_do(Run.open(run.path))
     assert made == {tile.id: 1 for tile in run.catalog.tiles}
 

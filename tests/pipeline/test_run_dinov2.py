@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import yaml
 
-from catalog import Catalog
-from catalog.sources import prepared
-from pipeline.config import load_config
-from pipeline.execute import SerialExecutor
-from pipeline.run import Run, execute
-from pipeline.synthesis import write_scenes
-from pipeline.tables import read_metrics
-from tasks import load
-from tasks.dinov2_head import Head, read_head
-from tasks.training import dinov2 as training
-from tasks.training.types import Sample
+from flexroad.catalog import Catalog
+from flexroad.catalog.sources import prepared
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.tables import read_metrics
+from flexroad.tasks import load
+from flexroad.tasks.dinov2_head import Head, read_head
+from flexroad.tasks.training import dinov2 as training
+from flexroad.tasks.training.types import Sample
 from tests.conftest import QUICK
 from tests.make_backbone import save_backbone
 

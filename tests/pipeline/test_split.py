@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catalog import Grid, Tile
-from pipeline.errors import ConfigError
-from pipeline.split import Piece, halves, inside, split
+from flexroad.catalog import Grid, Tile
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.split import Piece, halves, inside, split
 
 
 def piece(col, row, road=10, ground=10, size=100):

@@ -7,12 +7,12 @@ import pyogrio
 import pytest
 from pyproj import Transformer
 
-from catalog import Catalog
-from pipeline.config import load_config
-from pipeline.entry import Entry, Failure
-from pipeline.ledger import NAME, Ledger
-from pipeline.run import Run
-from pipeline.states import corners, write_states
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.entry import Entry, Failure
+from flexroad.pipeline.ledger import NAME, Ledger
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.states import corners, write_states
 
 
 @pytest.fixture

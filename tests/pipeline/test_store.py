@@ -5,13 +5,13 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from catalog import Catalog, places
-from catalog.places import write
-from pipeline import codec
-from pipeline.config import compose
-from pipeline.graph import tile_graph
-from pipeline.pull import Pull
-from pipeline.store import DAMAGED, Store, TileFolder, file_entry
+from flexroad.catalog import Catalog, places
+from flexroad.catalog.places import write
+from flexroad.pipeline import codec
+from flexroad.pipeline.config import compose
+from flexroad.pipeline.graph import tile_graph
+from flexroad.pipeline.pull import Pull
+from flexroad.pipeline.store import DAMAGED, Store, TileFolder, file_entry
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import rasterio
 
-from catalog import Catalog
-from catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
-from pipeline.errors import ConfigError
-from pipeline.synthesis import write_scenes
-from tasks.load import Options, load
-from tasks.segment import vector
-from tasks.synthetic import make_scene
-from tasks.synthetic.dsc3d import survey as survey_of_scenes
-from tasks.synthetic.gerod import survey
+from flexroad.catalog import Catalog
+from flexroad.catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.tasks.load import Options, load
+from flexroad.tasks.segment import vector
+from flexroad.tasks.synthetic import make_scene
+from flexroad.tasks.synthetic.dsc3d import survey as survey_of_scenes
+from flexroad.tasks.synthetic.gerod import survey
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +108,9 @@ def test_both_references_are_what_they_are_called(scene):
 
 
 def test_a_scene_s_mesh_can_be_prepared_by_hand(scene, tmp_path):
-    from pipeline.execute import SerialExecutor
-    from pipeline.prepare.asked import Asked
-    from pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+    from flexroad.pipeline.execute import SerialExecutor
+    from flexroad.pipeline.prepare.asked import Asked
+    from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
 
     circular, _ = scene
     mesh = Path(circular.root) / circular.id / "mesh.glb"

@@ -12,19 +12,29 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from catalog import LAYERS, Catalog, Grid, Layer, Tile
-from catalog.places import write
-from pipeline.config import load_config
-from pipeline.errors import ConfigError
-from pipeline.report.bootstrap import bootstrap
-from pipeline.report.claims import HELD, NOT_HELD, NOT_TESTED, STRONGER, WEAKER, Change, Order, check, percent
-from pipeline.report.comparison import compare
-from pipeline.report.content import FIGURES
-from pipeline.report.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
-from pipeline.report.published import TABLE_I_DSC3D, TABLE_II, published
-from pipeline.report.tables import pages, write_comparison
-from pipeline.run import Run
-from pipeline.tables import metrics_frame
+from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
+from flexroad.catalog.places import write
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.bootstrap import bootstrap
+from flexroad.pipeline.report.claims import (
+    HELD,
+    NOT_HELD,
+    NOT_TESTED,
+    STRONGER,
+    WEAKER,
+    Change,
+    Order,
+    check,
+    percent,
+)
+from flexroad.pipeline.report.comparison import compare
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.report.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
+from flexroad.pipeline.report.published import TABLE_I_DSC3D, TABLE_II, published
+from flexroad.pipeline.report.tables import pages, write_comparison
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.tables import metrics_frame
 
 VARIANTS = list(load_config("ablation").chains)
 

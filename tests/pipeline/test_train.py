@@ -8,16 +8,16 @@ import pytest
 import yaml
 from scipy import ndimage
 
-from catalog import Catalog, Layer
-from pipeline.config import load_config
-from pipeline.errors import ConfigError
-from pipeline.run import Run, check_models
-from pipeline.split import inside, split
-from pipeline.synthesis import write_scenes
-from pipeline.train import Asked, Ground, Samples, train
-from tasks import load, road_vectors
-from tasks.hygiene import NOTHING
-from tasks.segment import pixels
+from flexroad.catalog import Catalog, Layer
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run import Run, check_models
+from flexroad.pipeline.split import inside, split
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.train import Asked, Ground, Samples, train
+from flexroad.tasks import load, road_vectors
+from flexroad.tasks.hygiene import NOTHING
+from flexroad.tasks.segment import pixels
 from tests.pipeline.test_cli import flexroad
 
 QUICK = ("--set", "rounds=15", "--set", "cells=2000")

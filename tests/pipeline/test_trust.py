@@ -5,14 +5,14 @@ import pandas as pd
 import pytest
 import rasterio
 
-from catalog import Catalog
-from pipeline.config import load_config
-from pipeline.execute import SerialExecutor
-from pipeline.report.content import gather
-from pipeline.report.trust import most_doubtful, over_tiles
-from pipeline.run import Run, execute
-from pipeline.tables import COLUMNS, metrics_frame, read_metrics
-from tasks.support import Support
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.report.content import gather
+from flexroad.pipeline.report.trust import most_doubtful, over_tiles
+from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.tables import COLUMNS, metrics_frame, read_metrics
+from flexroad.tasks.support import Support
 
 
 def rows(doubts, flags=()) -> pd.DataFrame:

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from catalog.grid import Grid
-from pipeline.execute import SerialExecutor
-from pipeline.prepare.asked import Asked
-from pipeline.prepare.photos import PhotosAsked, prepare_photos
-from tasks.acquire import dense, photogrammetry, points
+from flexroad.catalog.grid import Grid
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.photos import PhotosAsked, prepare_photos
+from flexroad.tasks.acquire import dense, photogrammetry, points
 
 pytestmark = pytest.mark.real
 

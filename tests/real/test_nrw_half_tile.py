@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from catalog.sources.nrw import index
-from tasks import TaskError
-from tasks.load import Options, load
+from flexroad.catalog.sources.nrw import index
+from flexroad.tasks import TaskError
+from flexroad.tasks.load import Options, load
 
 pytestmark = pytest.mark.real
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from catalog import Grid
-from tasks.road_vectors import Options, burn
-from tasks.segment import vector
-from tasks.types import Source, TileData
+from flexroad.catalog import Grid
+from flexroad.tasks.road_vectors import Options, burn
+from flexroad.tasks.segment import vector
+from flexroad.tasks.types import Source, TileData
 
 pytestmark = pytest.mark.real
 

@@ -5,10 +5,10 @@ import zipfile
 import numpy as np
 import pytest
 
-from catalog.sources.rasters import index
-from tasks import TaskError
-from tasks.load import Options, load
-from tasks.segment import mask
+from flexroad.catalog.sources.rasters import index
+from flexroad.tasks import TaskError
+from flexroad.tasks.load import Options, load
+from flexroad.tasks.segment import mask
 
 pytestmark = pytest.mark.real
 

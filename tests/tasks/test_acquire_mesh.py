@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from catalog.grid import Grid
-from tasks.acquire import mesh as acquire
-from tasks.acquire.mesh import TexturedMesh, cover, orthophoto, sample, tops
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire import mesh as acquire
+from flexroad.tasks.acquire.mesh import TexturedMesh, cover, orthophoto, sample, tops
 
 CRS = "EPSG:25832"
 EAST, NORTH = 552_208.0, 4_114_742.0

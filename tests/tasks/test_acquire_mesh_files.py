@@ -7,12 +7,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from catalog.grid import Grid
-from tasks.acquire.mesh import orthophoto
-from tasks.acquire.mesh_files import read_mesh
-from tasks.errors import TaskError
-from tasks.export import glb
-from tasks.types import Mesh
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.mesh import orthophoto
+from flexroad.tasks.acquire.mesh_files import read_mesh
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.export import glb
+from flexroad.tasks.types import Mesh
 
 CRS = "EPSG:32617"
 ZERO = (552_208.0, 4_114_742.0, 0.0)

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks.acquire import ground as slope_filter
-from tasks.acquire.points import Options, facts, rasterise, reach_m
-from tasks.acquire.types import Points, Rasters
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire import ground as slope_filter
+from flexroad.tasks.acquire.points import Options, facts, rasterise, reach_m
+from flexroad.tasks.acquire.types import Points, Rasters
 
 NO_CLASS, GROUND, TREE, HOUSE, DECK = 0, 2, 5, 6, 17
 SMALL = Options(fill_m=2, void_m=6, dop_fill_m=1, despike_m=2)

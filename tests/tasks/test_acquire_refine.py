@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from catalog.grid import Grid
-from tasks.acquire.refine import reference, refine
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.refine import reference, refine
 
 CRS = "EPSG:25832"
 N = 60

@@ -3,8 +3,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks.acquire.tin import tin
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.tin import tin
 
 CELL = 0.5
 

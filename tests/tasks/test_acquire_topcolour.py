@@ -2,9 +2,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catalog.grid import Grid
-from tasks.acquire.topcolour import photo
-from tasks.acquire.types import Points
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.topcolour import photo
+from flexroad.tasks.acquire.types import Points
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 6, 5)
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 0, 1)]

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.acquire.voids import fill, reach_m
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.voids import fill, reach_m
 
 CELL = 0.2
 

@@ -5,12 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks.assess import NO_ROAD, Options, assess
-from tasks.fit import nurbs, plane
-from tasks.nurbs import NurbsSurface
-from tasks.support import Support
-from tasks.types import Quality, RoadClusters, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.assess import NO_ROAD, Options, assess
+from flexroad.tasks.fit import nurbs, plane
+from flexroad.tasks.nurbs import NurbsSurface
+from flexroad.tasks.support import Support
+from flexroad.tasks.types import Quality, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 120, 100)
 ROW, COL = np.indices(GRID.shape)

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from catalog import Catalog, Grid
-from tasks import TaskError, load, registration
-from tasks.dinov2 import MEAN, STD, load_backbone, normalised
-from tasks.dinov2_head import Head, check, predictor, read_head
-from tasks.hygiene import NOTHING
-from tasks.segment.dinov2 import Options, files, segment
-from tasks.token_regression import THRESHOLDS, Labels, Line, Windows, at_cells, best_threshold
-from tasks.training import dinov2 as training
-from tasks.training.types import Sample
-from tasks.types import TileData
+from flexroad.catalog import Catalog, Grid
+from flexroad.tasks import TaskError, load, registration
+from flexroad.tasks.dinov2 import MEAN, STD, load_backbone, normalised
+from flexroad.tasks.dinov2_head import Head, check, predictor, read_head
+from flexroad.tasks.hygiene import NOTHING
+from flexroad.tasks.segment.dinov2 import Options, files, segment
+from flexroad.tasks.token_regression import THRESHOLDS, Labels, Line, Windows, at_cells, best_threshold
+from flexroad.tasks.training import dinov2 as training
+from flexroad.tasks.training.types import Sample
+from flexroad.tasks.types import TileData
 from tests.make_backbone import save_backbone
 
 WINDOW, GSD = 112, 0.1
@@ -34,7 +34,7 @@ def backbones(tmp_path_factory) -> dict[int, Path]:
 @pytest.fixture(scope="session")
 def sample(tmp_path_factory) -> Sample:
     """A made tile of 60 m with an orthophoto; a fifth of it is road."""
-    from pipeline.synthesis import write_scenes
+    from flexroad.pipeline.synthesis import write_scenes
 
     found = Catalog.read(write_scenes(tmp_path_factory.mktemp("scene"), 2, seed=3, size_m=60, dop=True))
     data = load.load(found.tiles[1], load.Options())
@@ -94,7 +94,7 @@ def test_half_precision_is_close_and_no_more(backbones, heads, sample):
 
 
 def test_a_photo_is_normalised_and_the_unknown_is_grey(sample):
-    from tasks.photo import read_photo
+    from flexroad.tasks.photo import read_photo
 
     photo = read_photo(sample.data.dop, sample.data.grid.buffered(10))
     seen = normalised(photo)
@@ -395,7 +395,7 @@ def test_no_gpu_is_one_line(backbones, monkeypatch):
 
 def test_naming_the_method_imports_nothing_heavy():
     heavy = ["torch", "transformers", "safetensors", "huggingface_hub"]
-    code = "import sys, tasks.segment.dinov2, tasks.training.dinov2;"
+    code = "import sys, flexroad.tasks.segment.dinov2, flexroad.tasks.training.dinov2;"
     code += f"print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

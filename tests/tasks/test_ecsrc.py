@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.ndimage import gaussian_filter
 
-from catalog.grid import Grid
-from tasks.ecsrc import Options, ecsrc
-from tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.ecsrc import Options, ecsrc
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 
 def _oracle():

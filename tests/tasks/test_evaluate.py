@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from catalog.grid import Grid
-from tasks.drape import drape
-from tasks.evaluate import Options, evaluate
-from tasks.mad import mean_angles
-from tasks.nearest import nearest
-from tasks.types import Mesh, Metrics, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.drape import drape
+from flexroad.tasks.evaluate import Options, evaluate
+from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.nearest import nearest
+from flexroad.tasks.types import Mesh, Metrics, RoadMask, TileData
 
 
 def ground(width=40, height=30, cell=1.0, west=295500.0, north=5629500.0) -> Grid:

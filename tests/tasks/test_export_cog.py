@@ -3,9 +3,9 @@ import pytest
 from pyproj import CRS
 from rasterio.io import MemoryFile
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.export import cog
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.export import cog
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 600, 250)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tasks.export import glb
-from tasks.types import Mesh
+from flexroad.tasks.export import glb
+from flexroad.tasks.types import Mesh
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
 RUN_ORIGIN = (295000.0, 5629000.0, 100.0)

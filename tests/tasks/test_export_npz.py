@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import bisplev
 
-from tasks.errors import TaskError
-from tasks.export import npz
-from tasks.nurbs import NurbsSurface, clamped_knots
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.export import npz
+from flexroad.tasks.nurbs import NurbsSurface, clamped_knots
 
 WEST, SOUTH = 295500.5, 5629250.5
 

@@ -5,8 +5,8 @@ import pytest
 import pyvista
 import trimesh
 
-from tasks.export import ply
-from tasks.types import Mesh
+from flexroad.tasks.export import ply
+from flexroad.tasks.types import Mesh
 
 
 def roof(crs: str = "EPSG:25832") -> Mesh:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks.fit import nurbs, plane, raster
-from tasks.types import RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.fit import nurbs, plane, raster
+from flexroad.tasks.types import RoadClusters, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 48, 40)
 GOLDEN = {

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from catalog.grid import Grid
-from tasks import adam, autograd
-from tasks.errors import TaskError
-from tasks.fit import nurbs
-from tasks.nurbs import clamped_knots
-from tasks.objective import objective
-from tasks.types import RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import adam, autograd
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.nurbs import clamped_knots
+from flexroad.tasks.objective import objective
+from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.fit import plane
-from tasks.types import RoadClusters, Surface, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.fit import plane
+from flexroad.tasks.types import RoadClusters, Surface, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 60, 40)
 E, N = np.meshgrid(GRID.eastings, GRID.northings)

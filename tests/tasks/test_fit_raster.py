@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
-from catalog.grid import Grid
-from tasks.fit import raster
-from tasks.types import RoadClusters, Surface, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.fit import raster
+from flexroad.tasks.types import RoadClusters, Surface, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 13, 9)
 RNG = np.random.default_rng(0)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks import TaskError
-from tasks.acquire.ground import Options, ground, ground_cells
+from flexroad.tasks import TaskError
+from flexroad.tasks.acquire.ground import Options, ground, ground_cells
 
 
 def _oracle():

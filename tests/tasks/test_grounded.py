@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catalog.grid import Grid
-from tasks.flat_patches import flat_patches
-from tasks.grounded import VERSION, Options, ecsrc
-from tasks.local_plane import OFF, ON, against_known
-from tasks.synthetic import gerod, make_scene
-from tasks.synthetic.spoilers import BARE, Kind
-from tasks.types import RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.flat_patches import flat_patches
+from flexroad.tasks.grounded import VERSION, Options, ecsrc
+from flexroad.tasks.local_plane import OFF, ON, against_known
+from flexroad.tasks.synthetic import gerod, make_scene
+from flexroad.tasks.synthetic.spoilers import BARE, Kind
+from flexroad.tasks.types import RoadMask, TileData
 
 NOISE_M = 0.05
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.hygiene import NOTHING, Hygiene, clean, close, drop, fill, within
-from tasks.types import Source, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.hygiene import NOTHING, Hygiene, clean, close, drop, fill, within
+from flexroad.tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
 cells = st.sampled_from([1.0, 0.5, 0.2])

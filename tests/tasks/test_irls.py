@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.optimize import linprog
 
-from catalog.grid import Grid
-from tasks import adam, irls
-from tasks.bending import plate
-from tasks.errors import TaskError
-from tasks.fit import nurbs
-from tasks.normal import band, factor, gram, pairs, solve
-from tasks.nurbs import basis_matrix, clamped_knots
-from tasks.objective import NEIGHBOURS, objective, range_term
-from tasks.soft_range import add_soft_range
-from tasks.types import RoadClusters, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import adam, irls
+from flexroad.tasks.bending import plate
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.fit import nurbs
+from flexroad.tasks.normal import band, factor, gram, pairs, solve
+from flexroad.tasks.nurbs import basis_matrix, clamped_knots
+from flexroad.tasks.objective import NEIGHBOURS, objective, range_term
+from flexroad.tasks.soft_range import add_soft_range
+from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0
 PLATE = {"weights": "unit", "solver": "irls", "smoothness": "bending"}

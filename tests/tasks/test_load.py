@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from catalog import Grid, Layer, Tile
-from tasks import TaskError
-from tasks.load import Options, load
+from flexroad.catalog import Grid, Layer, Tile
+from flexroad.tasks import TaskError
+from flexroad.tasks.load import Options, load
 from tests.make_rasters import UTM, write, write_xyz
 
 GRID = Grid(UTM, 295500.0, 5629480.0, 1.0, 20, 20)

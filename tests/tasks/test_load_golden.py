@@ -4,9 +4,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from catalog import Grid, Layer, Tile
-from tasks import load
-from tasks.segment import mask
+from flexroad.catalog import Grid, Layer, Tile
+from flexroad.tasks import load
+from flexroad.tasks.segment import mask
 from tests.make_rasters import UTM, write
 
 PINNED = {

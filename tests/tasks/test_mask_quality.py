@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from sklearn.metrics import f1_score, jaccard_score, precision_score, recall_score
 
-from catalog import Grid
-from tasks.mask_quality import edges, judge, together
+from flexroad.catalog import Grid
+from flexroad.tasks.mask_quality import edges, judge, together
 
 shapes = st.tuples(st.integers(1, 12), st.integers(1, 12))
 

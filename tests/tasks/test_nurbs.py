@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from tasks.nurbs import NurbsSurface, basis, basis_matrix, clamped_knots, exact, greville
-from tasks.types import Surface
+from flexroad.tasks.nurbs import NurbsSurface, basis, basis_matrix, clamped_knots, exact, greville
+from flexroad.tasks.types import Surface
 
 BOUNDS = (295500.5, 5629250.5, 295749.5, 5629399.5)
 DEGREES = range(1, 11)

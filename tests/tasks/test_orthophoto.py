@@ -5,11 +5,18 @@ import pytest
 import rasterio
 from scipy import ndimage
 
-from catalog import Catalog, Grid
-from pipeline.synthesis import write_scenes
-from tasks import TaskError
-from tasks.synthetic import Kind, SceneOptions, block, make_scene
-from tasks.synthetic.orthophoto import MARGIN_M, PLAIN, SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, _shadow, orthophoto
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.synthesis import write_scenes
+from flexroad.tasks import TaskError
+from flexroad.tasks.synthetic import Kind, SceneOptions, block, make_scene
+from flexroad.tasks.synthetic.orthophoto import (
+    MARGIN_M,
+    PLAIN,
+    SUN_AZIMUTH_DEG,
+    SUN_HEIGHT_DEG,
+    _shadow,
+    orthophoto,
+)
 
 SIZE_M = 120
 GSD = 0.5

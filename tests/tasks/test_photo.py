@@ -5,10 +5,10 @@ from affine import Affine
 from rasterio.enums import ColorInterp
 from rasterio.warp import transform_bounds
 
-from catalog import Grid
-from tasks import TaskError
-from tasks.photo import read_photo
-from tasks.types import Source
+from flexroad.catalog import Grid
+from flexroad.tasks import TaskError
+from flexroad.tasks.photo import read_photo
+from flexroad.tasks.types import Source
 
 UTM = "EPSG:25832"
 GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, 20, 12)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 from pyproj import Transformer
 
-from tasks import TaskError
-from tasks.acquire.photo_positions import place, read_control, read_shot
+from flexroad.tasks import TaskError
+from flexroad.tasks.acquire.photo_positions import place, read_control, read_shot
 from tests import make_photos
 
 XMP = (

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tasks import TaskError
-from tasks.acquire import dense, patchmatch
-from tasks.acquire.photo_positions import Control, place, read_shot
-from tasks.acquire.photogrammetry import Options, reconstruct
-from tasks.acquire.poisson import poisson, write_ply
+from flexroad.tasks import TaskError
+from flexroad.tasks.acquire import dense, patchmatch
+from flexroad.tasks.acquire.photo_positions import Control, place, read_shot
+from flexroad.tasks.acquire.photogrammetry import Options, reconstruct
+from flexroad.tasks.acquire.poisson import poisson, write_ply
 from tests import make_photos
 
 QUICK = Options(image_size=640, features=2500, threads=2)

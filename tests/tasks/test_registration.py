@@ -4,12 +4,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from catalog import Grid
-from tasks.acquire.types import Photo
-from tasks.registration import note, pair, shift
-from tasks.synthetic import block, make_scene
-from tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
-from tasks.types import TileData
+from flexroad.catalog import Grid
+from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.registration import note, pair, shift
+from flexroad.tasks.synthetic import block, make_scene
+from flexroad.tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
+from flexroad.tasks.types import TileData
 
 GSD = 0.5
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import GeometryCollection, LineString, MultiLineString, Point, box
 
-from catalog import Grid
-from catalog.crs import transformer
-from tasks import TaskError, vector_files
-from tasks.road_vectors import Options, burn, cells, roads
+from flexroad.catalog import Grid
+from flexroad.catalog.crs import transformer
+from flexroad.tasks import TaskError, vector_files
+from flexroad.tasks.road_vectors import Options, burn, cells, roads
 from tests.make_roads import GRID, on_grid, tile, write, write_osm
 
 WEST_EAST = LineString(on_grid((10, 50), (90, 50)))

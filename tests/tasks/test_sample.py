@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from catalog.grid import Grid
-from tasks.errors import TaskError
-from tasks.sample import Options, sample
-from tasks.types import Mesh, RoadClusters, RoadMask
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.sample import Options, sample
+from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@ import pytest
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
-from catalog import Grid
-from tasks import TaskError
-from tasks.segment.mask import Options, segment
-from tasks.survey import outside
-from tasks.types import TileData
+from flexroad.catalog import Grid
+from flexroad.tasks import TaskError
+from flexroad.tasks.segment.mask import Options, segment
+from flexroad.tasks.survey import outside
+from flexroad.tasks.types import TileData
 
 CORE = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 8, 6)
 

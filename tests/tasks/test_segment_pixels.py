@@ -8,16 +8,16 @@ import rasterio
 from rasterio.transform import from_origin
 from skops.io import dumps, loads
 
-from tasks import TaskError
-from tasks.hygiene import NOTHING
-from tasks.pixel_model import TRUSTED, read_model
-from tasks.segment.pixels import Options, files, segment
-from tasks.synthetic import block, make_scene
-from tasks.synthetic.orthophoto import orthophoto
-from tasks.training import pixels as training
-from tasks.training.pixels import even_threshold
-from tasks.training.types import Sample
-from tasks.types import Source, TileData
+from flexroad.tasks import TaskError
+from flexroad.tasks.hygiene import NOTHING
+from flexroad.tasks.pixel_model import TRUSTED, read_model
+from flexroad.tasks.segment.pixels import Options, files, segment
+from flexroad.tasks.synthetic import block, make_scene
+from flexroad.tasks.synthetic.orthophoto import orthophoto
+from flexroad.tasks.training import pixels as training
+from flexroad.tasks.training.pixels import even_threshold
+from flexroad.tasks.training.types import Sample
+from flexroad.tasks.types import Source, TileData
 
 SEED, SIZE_M = 3, 120
 QUICK = training.Options(cells=2000, rounds=25, learning_rate=0.2, leaf_cells=30, folds=2)

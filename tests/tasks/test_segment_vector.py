@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from shapely import LineString, box
 
-from tasks import TaskError
-from tasks.hygiene import Hygiene
-from tasks.segment.vector import VERSION, Options, segment
+from flexroad.tasks import TaskError
+from flexroad.tasks.hygiene import Hygiene
+from flexroad.tasks.segment.vector import VERSION, Options, segment
 from tests.make_roads import GRID, on_grid, tile, write
 
 LINE = LineString(on_grid((0, 50), (100, 50)))

@@ -10,9 +10,9 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from catalog.grid import Grid
-from tasks import ecsrc, evaluate, sample
-from tasks.types import RoadClusters, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import ecsrc, evaluate, sample
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catalog.grid import Grid
-from tasks.support import REACH_M, Support, continuation, of_faces, support, unsound, without_unsound
-from tasks.types import Mesh, RoadClusters, RoadMask, TileData
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.support import REACH_M, Support, continuation, of_faces, support, unsound, without_unsound
+from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 ROW, COL = np.indices(GRID.shape)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catalog import CatalogError, Grid
-from tasks import TaskError
-from tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
-from tasks.synthetic.network import Plan
-from tasks.synthetic.strata import STRATA, stratum_at
+from flexroad.catalog import CatalogError, Grid
+from flexroad.tasks import TaskError
+from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
+from flexroad.tasks.synthetic.network import Plan
+from flexroad.tasks.synthetic.strata import STRATA, stratum_at
 
 CLEAN = SceneOptions(density=0, mask_errors=0, dsm_noise_m=(0, 0), dtm_noise_m=0)
 SILENT = SceneOptions(dsm_noise_m=(0, 0))

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import shapely
 
-from catalog import Grid
-from tasks.road_vectors import cells
-from tasks.synthetic import SceneOptions, make_scene
-from tasks.synthetic.centrelines import centre_lines
+from flexroad.catalog import Grid
+from flexroad.tasks.road_vectors import cells
+from flexroad.tasks.synthetic import SceneOptions, make_scene
+from flexroad.tasks.synthetic.centrelines import centre_lines
 
 GRID = Grid("EPSG:25832", 295500, 5629500, 1.0, 200, 200)
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.synthetic import make_scene
-from tasks.synthetic.gerod import APART_M, PRESET, STRATA, survey
+from flexroad.tasks.synthetic import make_scene
+from flexroad.tasks.synthetic.gerod import APART_M, PRESET, STRATA, survey
 
 
 def test_the_whole_survey_has_the_paper_s_strata():

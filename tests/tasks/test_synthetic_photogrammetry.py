@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from catalog.grid import Grid
-from tasks.acquire.mesh import orthophoto as seen_from_above
-from tasks.acquire.mesh import tops
-from tasks.synthetic import Kind
-from tasks.synthetic.dsc3d import SITES, SIZE_M, survey
-from tasks.synthetic.orthophoto import orthophoto
-from tasks.synthetic.photogrammetry import GSD_M, photogrammetry
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.mesh import orthophoto as seen_from_above
+from flexroad.tasks.acquire.mesh import tops
+from flexroad.tasks.synthetic import Kind
+from flexroad.tasks.synthetic.dsc3d import SITES, SIZE_M, survey
+from flexroad.tasks.synthetic.orthophoto import orthophoto
+from flexroad.tasks.synthetic.photogrammetry import GSD_M, photogrammetry
 
 SEED = 3
 
@@ -39,7 +39,7 @@ def test_the_sites_span_what_the_paper_tells():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scenes_rise_as_their_site_says(seed):
-    from tasks.synthetic import make_scene
+    from flexroad.tasks.synthetic import make_scene
 
     places = survey(seed=seed)
     for place in places:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt, maximum_filter, minimum_filter
 
-from catalog import Grid
-from tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
-from tasks.synthetic.gerod import PRESET
-from tasks.synthetic.network import Plan
-from tasks.synthetic.noise import generator
-from tasks.synthetic.spoilers import BARE
-from tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M
+from flexroad.catalog import Grid
+from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
+from flexroad.tasks.synthetic.gerod import PRESET
+from flexroad.tasks.synthetic.network import Plan
+from flexroad.tasks.synthetic.noise import generator
+from flexroad.tasks.synthetic.spoilers import BARE
+from flexroad.tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M
 
 GRID = block(1)[0][1]
 QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0}
@@ -191,7 +191,7 @@ def test_towers_overhang_and_storeys_change_the_roofs():
 
 
 def test_traces_of_nothing_are_nothing():
-    from tasks.synthetic.linework import rails, wires
+    from flexroad.tasks.synthetic.linework import rails, wires
 
     def nowhere(x, y):
         raise AssertionError("no ground is asked for")

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catalog import Grid
-from tasks.windows import blend, corners, cover, taper
+from flexroad.catalog import Grid
+from flexroad.tasks.windows import blend, corners, cover, taper
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 30, 20)
 SIZES = st.integers(4, 40).flatmap(lambda size: st.tuples(st.just(size), st.integers(0, size // 2)))

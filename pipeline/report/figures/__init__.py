@@ -6,14 +6,14 @@ from pathlib import Path
 
 from matplotlib import rc_context
 
-from catalog.places import write
-from pipeline.report.evidence import collect
-from pipeline.report.figures import dataset, maps, profile, renders, trade_off
-from pipeline.report.figures.cast import Cast, cast_of
-from pipeline.report.figures.plate import STYLE, Plate, save
-from pipeline.report.figures.view import TileView, typical_tile, view_tile
-from pipeline.run import Run
-from pipeline.tables import read_metrics
+from flexroad.catalog.places import write
+from flexroad.pipeline.report.evidence import collect
+from flexroad.pipeline.report.figures import dataset, maps, profile, renders, trade_off
+from flexroad.pipeline.report.figures.cast import Cast, cast_of
+from flexroad.pipeline.report.figures.plate import STYLE, Plate, save
+from flexroad.pipeline.report.figures.view import TileView, typical_tile, view_tile
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.tables import read_metrics
 
 
 def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast | None = None) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.config import Chain, Config
+from flexroad.pipeline.config import Chain, Config
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.errors import ConfigError
-from pipeline.look import look_at
-from pipeline.pull import Pull, StageError
-from pipeline.report.figures.plate import PATH, STRATA, Plate, new_figure
-from pipeline.run import Run
-from pipeline.store import Store
-from tasks.types import TileData
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.report.figures.plate import PATH, STRATA, Plate, new_figure
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
+from flexroad.tasks.types import TileData
 
 NAME = "dataset"
 BINS = 12

@@ -8,17 +8,17 @@ from matplotlib.collections import Collection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from catalog import Grid
-from pipeline.report.figures.cast import Cast
-from pipeline.report.figures.plate import Plate, new_figure
-from pipeline.report.figures.scales import (
+from flexroad.catalog import Grid
+from flexroad.pipeline.report.figures.cast import Cast
+from flexroad.pipeline.report.figures.plate import Plate, new_figure
+from flexroad.pipeline.report.figures.scales import (
     ANGLE_COLOURS,
     ANGLE_NORM,
     ERROR_COLOURS,
     ERROR_NORM,
     drawable,
 )
-from pipeline.report.figures.view import Result, TileView, absent
+from flexroad.pipeline.report.figures.view import Result, TileView, absent
 
 NAME = "error_and_smoothness"
 

@@ -10,11 +10,11 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from pipeline.report.figures.cast import Cast
-from pipeline.report.figures.plate import FLEXROAD, PATH, PLANE, RAW, TRUTH, Plate, new_figure
-from pipeline.report.figures.route import longest_route
-from pipeline.report.figures.view import TileView, absent
-from tasks.types import Floats
+from flexroad.pipeline.report.figures.cast import Cast
+from flexroad.pipeline.report.figures.plate import FLEXROAD, PATH, PLANE, RAW, TRUTH, Plate, new_figure
+from flexroad.pipeline.report.figures.route import longest_route
+from flexroad.pipeline.report.figures.view import TileView, absent
+from flexroad.tasks.types import Floats
 
 NAME = "road_profile"
 CLOSE_M = 0.5

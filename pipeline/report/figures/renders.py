@@ -11,15 +11,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from catalog import Grid
-from catalog.grid import Bounds
-from pipeline.report.figures.cast import Cast
-from pipeline.report.figures.plate import Plate, new_figure
-from pipeline.report.figures.scales import ERROR_COLOURS, ERROR_NORM, drawable
-from pipeline.report.figures.view import TileView, absent
-from pipeline.report.pictures import NO_MESH
-from pipeline.report.render import render_meshes
-from tasks.types import Bools
+from flexroad.catalog import Grid
+from flexroad.catalog.grid import Bounds
+from flexroad.pipeline.report.figures.cast import Cast
+from flexroad.pipeline.report.figures.plate import Plate, new_figure
+from flexroad.pipeline.report.figures.scales import ERROR_COLOURS, ERROR_NORM, drawable
+from flexroad.pipeline.report.figures.view import TileView, absent
+from flexroad.pipeline.report.pictures import NO_MESH
+from flexroad.pipeline.report.render import render_meshes
+from flexroad.tasks.types import Bools
 
 NAME = "ablation_renders"
 SIZE_PX = (760, 540)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import dijkstra
 
-from tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats
 
 EIGHT = np.ones((3, 3), dtype=bool)
 EDGE_COST = 8.0

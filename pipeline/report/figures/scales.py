@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from tasks.types import Floats
+from flexroad.tasks.types import Floats
 
 ERROR_COLOURS, ERROR_NORM = "magma_r", LogNorm(0.01, 10)
 """Metres; logarithmic, as on one tile errors go from a centimetre to a house."""

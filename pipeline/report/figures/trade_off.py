@@ -9,9 +9,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.config import Chain, Config
-from pipeline.report.figures.cast import changes
-from pipeline.report.figures.plate import FLEXROAD, PATH, TRUTH, Plate, new_figure
+from flexroad.pipeline.config import Chain, Config
+from flexroad.pipeline.report.figures.cast import changes
+from flexroad.pipeline.report.figures.plate import FLEXROAD, PATH, TRUTH, Plate, new_figure
 
 NAME = "trade_off"
 SWEEPS: dict[str, tuple[str, ...]] = {

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from catalog import Grid
-from pipeline.errors import ConfigError
-from pipeline.graph import TileGraph
-from pipeline.look import look_at
-from pipeline.pull import Pull, StageError
-from pipeline.report.figures.cast import Cast
-from pipeline.run import Run
-from pipeline.store import Store
-from tasks.drape import drape
-from tasks.mad import mean_angles
-from tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
+from flexroad.catalog import Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph import TileGraph
+from flexroad.pipeline.look import look_at
+from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.report.figures.cast import Cast
+from flexroad.pipeline.run import Run
+from flexroad.pipeline.store import Store
+from flexroad.tasks.drape import drape
+from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,1 @@
+"""Smooth, light, georeferenced 3D road surfaces from aerial geodata."""

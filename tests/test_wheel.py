@@ -1,0 +1,19 @@
+"""What `pip install flexroad` puts into site-packages."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_wheel_holds_one_import_package(tmp_path):
+    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    top = {name.split("/")[0] for name in names}
+    assert top == {"flexroad", f"{wheel.name.removesuffix('-py3-none-any.whl')}.dist-info"}
+    for file in ("catalog/grid.py", "tasks/load.py", "pipeline/graph.py", "configs/paper.yaml", "py.typed"):
+        assert f"flexroad/{file}" in names
