@@ -14,8 +14,8 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 
-from flexroad.catalog.clouds import chunks
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.point_clouds import chunks
 
 Floats = NDArray[np.float64]
 

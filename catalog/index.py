@@ -21,10 +21,10 @@ import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from flexroad.catalog import places
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.places import Place, absolute, joined, normal, place
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import Place, absolute, joined, normal, place
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 Item = dict[str, Any]
@@ -57,7 +57,7 @@ class Catalog:
         """
         path = _at(path)
         try:
-            data = places.read(path)
+            data = paths.read(path)
         except FileNotFoundError as error:
             raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`") from error
         except IsADirectoryError as error:
@@ -97,7 +97,7 @@ class Catalog:
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
-            places.write(path, make(items))
+            paths.write(path, make(items))
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.places import Place, joined, place
+from flexroad.catalog.storage.paths import Place, joined, place
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and

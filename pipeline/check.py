@@ -9,7 +9,7 @@ from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.crs import short
-from flexroad.catalog.places import Place, Sightings
+from flexroad.catalog.storage.paths import Place, Sightings
 from flexroad.tasks import load, registration
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.photo import read_photo

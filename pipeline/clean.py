@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.places import Place, absolute, exists, listing, remove
+from flexroad.catalog.storage.paths import Place, absolute, exists, listing, remove
 from flexroad.pipeline.entry import DONE, FAILED
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph import STAGE_NAMES

@@ -21,7 +21,7 @@ from flexroad.pipeline.ending import unread
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from flexroad.catalog.cut import Indexed
+    from flexroad.catalog.tiling import Indexed
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -288,7 +288,7 @@ def report(
     form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
 ) -> None:
     """Write RUN/report.<format>: the paper's main table over the run, worst tiles, steps, failures."""
-    from flexroad.catalog.places import read
+    from flexroad.catalog.storage.paths import read
     from flexroad.pipeline.report import FORMATS, write_report
     from flexroad.pipeline.run import Run
 

@@ -20,7 +20,7 @@ def clean(
     ] = None,
 ) -> None:
     """Drop what no run needs: artefacts, tiles and products that are gone, leftovers of killed writers."""
-    from flexroad.catalog.places import absolute, place
+    from flexroad.catalog.storage.paths import absolute, place
     from flexroad.pipeline.clean import MEANING, alone, drop, waste
     from flexroad.pipeline.lock import held
     from flexroad.pipeline.registry import forget as strike

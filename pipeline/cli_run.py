@@ -17,7 +17,7 @@ from flexroad.pipeline.unheard import patient
 
 if TYPE_CHECKING:
     from flexroad.catalog import Catalog, Tile
-    from flexroad.catalog.places import Place
+    from flexroad.catalog.storage.paths import Place
     from flexroad.pipeline.cluster import Cluster
     from flexroad.pipeline.config import Config
     from flexroad.pipeline.execute import Executor
@@ -72,8 +72,8 @@ def run(
 ) -> None:
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
     from flexroad.catalog import Catalog
-    from flexroad.catalog.places import absolute, normal, place
-    from flexroad.catalog.trust import refuse_outside
+    from flexroad.catalog.allowlist import refuse_outside
+    from flexroad.catalog.storage.paths import absolute, normal, place
     from flexroad.pipeline.config import load_config
     from flexroad.pipeline.graph import layers_read
     from flexroad.pipeline.run import Run, asked, select
@@ -129,8 +129,8 @@ def rerun(
     prometheus: Prometheus = None,
 ) -> None:
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
-    from flexroad.catalog.places import place
-    from flexroad.catalog.trust import refuse_outside
+    from flexroad.catalog.allowlist import refuse_outside
+    from flexroad.catalog.storage.paths import place
     from flexroad.pipeline.graph import STAGE_NAMES, layers_read
     from flexroad.pipeline.run import Run, select
 
@@ -253,7 +253,7 @@ def _warn(line: str, kind: str = "warning") -> None:
 def next_run(catalog: Path) -> str:
     """Return the command that runs a catalog, with leave for all that it reads."""
     from flexroad.catalog import Catalog
-    from flexroad.catalog.trust import needed
+    from flexroad.catalog.allowlist import needed
     from flexroad.pipeline.config import load_config
     from flexroad.pipeline.graph import layers_read
 
@@ -273,7 +273,7 @@ def status(
     every: Annotated[float, typer.Option(min=0.1, help="With --watch: how often to look (s).")] = 2,
 ) -> None:
     """Tell how a run stands, and what failed why."""
-    from flexroad.catalog.places import exists, place
+    from flexroad.catalog.storage.paths import exists, place
     from flexroad.pipeline.run import Run
 
     where = place(path)

@@ -185,7 +185,7 @@ def template() -> str:
             if others:
                 lines.append(f"  # other methods: {', '.join(others)}")
         else:
-            lines += _option_lines(importlib.import_module(f"tasks.{stage}").Options)
+            lines += _option_lines(importlib.import_module(f"flexroad.tasks.{stage}").Options)
     lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
     lines += ["variants:", "  flexroad: {}"]
     return "\n".join(lines) + "\n"

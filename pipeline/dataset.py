@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flexroad.catalog.places import Place, place
+from flexroad.catalog.storage.paths import Place, place
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.look import look_at
 from flexroad.pipeline.pull import Pull, StageError

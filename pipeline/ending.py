@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:

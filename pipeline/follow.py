@@ -14,7 +14,7 @@ from rich.padding import Padding
 from rich.progress_bar import ProgressBar
 from rich.text import Text
 
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
 from flexroad.pipeline.ledger import NAME as LEDGER
 from flexroad.pipeline.ledger import Ledger
 from flexroad.pipeline.lock import Holder, at_work, holder

@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from flexroad.catalog import Catalog, Layer, Tile
-from flexroad.catalog.places import Place, Seen, read, stat
+from flexroad.catalog.storage.paths import Place, Seen, read, stat
 from flexroad.pipeline.config import Config, Export
 from flexroad.tasks.options import Options
 

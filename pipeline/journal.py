@@ -16,9 +16,9 @@ import json
 from dataclasses import asdict
 from typing import IO, Any
 
-from flexroad.catalog.places import Place, is_remote
+from flexroad.catalog.storage.paths import Place, is_remote
+from flexroad.catalog.storage.staging import Mirror
 from flexroad.pipeline.meter import now
-from flexroad.pipeline.mirror import Mirror
 from flexroad.pipeline.work import TileResult
 
 

@@ -23,9 +23,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.staging import Mirror
 from flexroad.pipeline.entry import Entry, Failure, Row
-from flexroad.pipeline.mirror import Mirror
 
 NAME = "ledger.sqlite"
 VERSION = 1

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexroad.catalog.places import Place, read
+from flexroad.catalog.storage.paths import Place, read
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.lock_file import LockFile, OnDisk, Sight
 

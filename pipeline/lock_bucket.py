@@ -9,7 +9,7 @@ from typing import Any
 
 from upath import UPath
 
-from flexroad.catalog.places import named, read, remove
+from flexroad.catalog.storage.paths import named, read, remove
 from flexroad.pipeline.lock_file import Sight
 
 REFUSED = (409, 412)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 
 
 @dataclass(frozen=True)

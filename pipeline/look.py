@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from flexroad.catalog import Tile
-from flexroad.catalog.places import Place, Seen, is_remote, listing, read
+from flexroad.catalog.storage.paths import Place, Seen, is_remote, listing, read
 from flexroad.pipeline.entry import DONE, FAILED, Entry, Marker, from_failed, from_item
 from flexroad.pipeline.graph import Look, TileGraph, any_gone
 from flexroad.pipeline.ledger import NAME, Ledger

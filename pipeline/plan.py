@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
 from flexroad.pipeline.graph import STAGE_NAMES, TileGraph
 from flexroad.pipeline.store import Store, TileFolder
 

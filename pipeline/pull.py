@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.places import stat
+from flexroad.catalog.storage.paths import stat
 from flexroad.pipeline.entry import Failure
 from flexroad.pipeline.graph import Node, TileGraph, files_read
 from flexroad.pipeline.meter import Span

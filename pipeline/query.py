@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
-from flexroad.catalog.places import Place, place
+from flexroad.catalog.storage.paths import Place, place
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph import TileGraph
 from flexroad.pipeline.look import look_at

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from flexroad.catalog.places import Place, absolute, exists, listing, place, read, remove, write
+from flexroad.catalog.storage.paths import Place, absolute, exists, listing, place, read, remove, write
 
 if TYPE_CHECKING:
     from flexroad.pipeline.run import Run

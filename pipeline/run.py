@@ -29,7 +29,17 @@ from typing import Any
 import yaml
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.catalog.places import Place, Sightings, absolute, exists, is_remote, place, read, stat, write
+from flexroad.catalog.storage.paths import (
+    Place,
+    Sightings,
+    absolute,
+    exists,
+    is_remote,
+    place,
+    read,
+    stat,
+    write,
+)
 from flexroad.pipeline.config import Config, compose, load_config
 from flexroad.pipeline.entry import FAILED, Failure
 from flexroad.pipeline.errors import ConfigError

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flexroad.catalog import Catalog, Layer, Tile
-from flexroad.catalog.places import write
 from flexroad.catalog.sources import prepared
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor
 from flexroad.tasks.synthetic import dsc3d, glb

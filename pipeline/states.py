@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import transformer
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.staging import whole
 from flexroad.pipeline.entry import Entry
 from flexroad.pipeline.ledger import NAME as LEDGER
 from flexroad.pipeline.ledger import Ledger, Standing
-from flexroad.pipeline.mirror import whole
 from flexroad.pipeline.run import Run
 
 NAME = "tiles.geojson"

@@ -21,8 +21,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flexroad.catalog import places
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import Place
 from flexroad.pipeline import codec
 from flexroad.pipeline.graph import Node, TileGraph
 
@@ -38,7 +38,7 @@ class Store:
     def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
         """Return a result and what each stage up to it took, or None if it is not there or damaged."""
         try:
-            return codec.decode(places.read(self._path(node)))
+            return codec.decode(paths.read(self._path(node)))
         except DAMAGED:
             # What cannot be read is as good as absent: it is computed and written anew.
             return None
@@ -46,12 +46,12 @@ class Store:
     def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
         """Keep a result and what each stage up to it took; return how many bytes that is."""
         data = codec.encode(value, seconds)
-        places.write(self._path(node), data)
+        paths.write(self._path(node), data)
         return len(data)
 
     def has(self, node: Node) -> bool:
         """Tell whether a result is there, unread."""
-        return places.exists(self._path(node))
+        return paths.exists(self._path(node))
 
     def _path(self, node: Node) -> Place:
         return self.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
@@ -76,7 +76,7 @@ class TileFolder:
                 return None
             # A marker without its rows is damaged, whatever else it holds.
             iter(item["properties"]["flexroad:rows"])
-            files = places.listing(self.path)
+            files = paths.listing(self.path)
             whole = all(files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values())
         except (OSError, KeyError, TypeError, AttributeError):
             return None
@@ -87,7 +87,7 @@ class TileFolder:
         item = self._read("item.json") or {}
         try:
             return all(
-                _checksum(places.read(self.path / asset["href"])) == asset["file:checksum"]
+                _checksum(paths.read(self.path / asset["href"])) == asset["file:checksum"]
                 for asset in item["assets"].values()
             )
         except (OSError, KeyError, TypeError, AttributeError):
@@ -98,20 +98,20 @@ class TileFolder:
 
         An item of before goes first: until the new one is there, nothing vouches for a mixture of files.
         """
-        places.remove(self.path / "item.json")
+        paths.remove(self.path / "item.json")
         for name, data in products.items():
-            places.write(self.path / name, data)
-        places.write(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
-        places.remove(self.path / "failed.json")
+            paths.write(self.path / name, data)
+        paths.write(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
+        paths.remove(self.path / "failed.json")
 
     def fail(self, failure: dict[str, Any]) -> None:
         """Write down a failure; the tile no longer counts as done."""
-        places.remove(self.path / "item.json")
-        places.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
+        paths.remove(self.path / "item.json")
+        paths.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
-            found = json.loads(places.read(self.path / name))
+            found = json.loads(paths.read(self.path / name))
         except (OSError, ValueError):
             return None
         return found if isinstance(found, dict) else None
@@ -151,5 +151,5 @@ def check_writable(folder: Place) -> None:
         With the reason and the path.
     """
     probe = folder / f".probe-{uuid.uuid4().hex}"
-    places.write(probe, b"")
-    places.remove(probe)
+    paths.write(probe, b"")
+    paths.remove(probe)

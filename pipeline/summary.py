@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from flexroad.catalog.places import Place, read, write
+from flexroad.catalog.storage.paths import Place, read, write
 from flexroad.pipeline.entry import Failure
 from flexroad.pipeline.ledger import NAME as LEDGER
 from flexroad.pipeline.ledger import Ledger

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flexroad.catalog import Catalog, Grid, Tile
-from flexroad.catalog.roads import opened, with_roads
+from flexroad.catalog.headers.vectors import opened, with_roads
 from flexroad.catalog.sources import prepared
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor

@@ -9,10 +9,10 @@ from itertools import islice
 
 import pandas as pd
 
-from flexroad.catalog.places import Place, exists, read
+from flexroad.catalog.storage.paths import Place, exists, read
+from flexroad.catalog.storage.staging import whole
 from flexroad.pipeline.entry import Failure, Row
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.mirror import whole
 
 PIECE = 10_000
 """Rows held at a time; also the table's row groups."""

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from flexroad.catalog.index import item
-from flexroad.catalog.places import place, stat
+from flexroad.catalog.storage.paths import place, stat
 from flexroad.pipeline.entry import MARKERS, Entry, Failure, Marker, Row, State, from_item, to_failed
 from flexroad.pipeline.graph import STAGE_NAMES, Node, TileGraph, stage_version
 from flexroad.pipeline.meter import Span, now

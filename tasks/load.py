@@ -16,7 +16,7 @@ from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import Unit, height_unit
-from flexroad.catalog.raster_files import quiet
+from flexroad.catalog.headers.rasters import quiet
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.patch import Patch, Unreadable, misfit, onto, read

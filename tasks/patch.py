@@ -19,7 +19,7 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.places import Place, gdal_name, is_remote, namesakes, stat
+from flexroad.catalog.storage.paths import Place, gdal_name, is_remote, namesakes, stat
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 

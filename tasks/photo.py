@@ -16,8 +16,8 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.vrt import WarpedVRT
 
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
-from flexroad.catalog.places import Place
-from flexroad.catalog.raster_files import quiet
+from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.storage.paths import Place
 from flexroad.tasks.acquire.types import Photo
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.patch import Lattice, Unreadable, opened, place

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.places import Place
+from flexroad.catalog.storage.paths import Place
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -26,7 +26,7 @@ from upath import UPath
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.places import Place, Seen, fetch, stat
+from flexroad.catalog.storage.paths import Place, Seen, fetch, stat
 from flexroad.tasks.errors import TaskError
 
 SQUARE_M = 4000.0

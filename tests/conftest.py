@@ -138,7 +138,7 @@ def storage(storage_server, monkeypatch):
 @pytest.fixture
 def bucket(storage, request):
     """A folder in a bucket of one's own."""
-    from flexroad.catalog.places import place
+    from flexroad.catalog.storage.paths import place
 
     made = place(f"s3://{abs(hash(request.node.nodeid)):x}/area")
     made.fs.mkdir(made.parent.path)

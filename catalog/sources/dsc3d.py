@@ -13,9 +13,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.cut import Indexed
-from flexroad.catalog.layout import Layout, read
-from flexroad.catalog.raster_files import some
+from flexroad.catalog.headers.rasters import some
+from flexroad.catalog.path_templates import Layout, read
+from flexroad.catalog.tiling import Indexed
 
 DATASET = "DSC3D"
 

@@ -14,10 +14,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.cut import Indexed
-from flexroad.catalog.layout import Layout, read
-from flexroad.catalog.raster_files import some
+from flexroad.catalog.headers.rasters import some
+from flexroad.catalog.path_templates import Layout, read
 from flexroad.catalog.tile import Tile
+from flexroad.catalog.tiling import Indexed
 
 DATASET = "GeRoD"
 TILES = 240

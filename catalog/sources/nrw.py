@@ -16,12 +16,12 @@ from pathlib import Path
 
 from flexroad.catalog.bridges import deck_raster
 from flexroad.catalog.crs import short
-from flexroad.catalog.cut import Indexed, cut
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.raster_files import RasterFile, opened, scan, some
-from flexroad.catalog.roads import find, with_roads
+from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
+from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import Tile
+from flexroad.catalog.tiling import Indexed, cut
 
 CRS = "EPSG:25832"
 """The state's own, which its XYZ files do not carry."""

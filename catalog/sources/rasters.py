@@ -7,11 +7,11 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from flexroad.catalog.cut import Indexed, cut
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.raster_files import scan
-from flexroad.catalog.roads import find, with_roads
+from flexroad.catalog.headers.rasters import scan
+from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import LAYERS
+from flexroad.catalog.tiling import Indexed, cut
 
 
 def index(

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
-from flexroad.catalog.frame import Frame
+from flexroad.catalog.to_metres import Frame
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.blocks import fill, sheet_grid

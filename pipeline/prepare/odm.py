@@ -18,7 +18,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
-from flexroad.catalog.frame import Frame
+from flexroad.catalog.to_metres import Frame
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexroad.catalog.raster_files import some
+from flexroad.catalog.headers.rasters import some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked

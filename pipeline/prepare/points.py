@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.clouds import Cloud, find, inspect
 from flexroad.catalog.crs import short
-from flexroad.catalog.frame import Frame, agreed
-from flexroad.catalog.raster_files import some
+from flexroad.catalog.headers.point_clouds import Cloud, find, inspect
+from flexroad.catalog.headers.rasters import some
+from flexroad.catalog.to_metres import Frame, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.blocks import fill, sheet_grid

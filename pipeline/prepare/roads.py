@@ -17,8 +17,8 @@ from rasterio.warp import Resampling, reproject
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
-from flexroad.catalog.frame import Frame
-from flexroad.catalog.roads import VectorFile, opened
+from flexroad.catalog.headers.vectors import VectorFile, opened
+from flexroad.catalog.to_metres import Frame
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.sheet import Sheet

@@ -25,9 +25,9 @@ from rasterio.errors import CRSError, RasterioError
 from rasterio.windows import Window
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
-from flexroad.catalog.cut import assumed, cut
-from flexroad.catalog.raster_files import opened, some, zoned
-from flexroad.catalog.roads import VectorFile, with_roads
+from flexroad.catalog.headers.rasters import opened, some, zoned
+from flexroad.catalog.headers.vectors import VectorFile, with_roads
+from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.acquire.types import Photo
 

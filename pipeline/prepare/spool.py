@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError, Grid
-from flexroad.catalog.clouds import CHUNK, Chunk, Cloud, chunks
-from flexroad.catalog.frame import Frame
+from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks
+from flexroad.catalog.to_metres import Frame
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.acquire.types import Points
 

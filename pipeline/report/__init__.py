@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flexroad.catalog.places import Place, write
+from flexroad.catalog.storage.paths import Place, write
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
 from flexroad.pipeline.run import Run

@@ -9,7 +9,7 @@ from typing import Final
 
 import pandas as pd
 
-from flexroad.catalog.places import Place, write
+from flexroad.catalog.storage.paths import Place, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.run import Run

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.comparison import Comparison, compare
 from flexroad.pipeline.report.evidence import Evidence, collect, write_evidence

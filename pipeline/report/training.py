@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.report.pages import template
 from flexroad.pipeline.report.render import curves, found_map
 from flexroad.pipeline.run import versions

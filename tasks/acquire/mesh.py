@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from flexroad.catalog.frame import Frame
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.to_metres import Frame
 from flexroad.tasks.acquire.types import Photo, Points
 from flexroad.tasks.types import Bools, Floats
 

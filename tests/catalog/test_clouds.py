@@ -4,8 +4,8 @@ import pytest
 from laspy.vlrs.known import GeoKeyDirectoryVlr
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.clouds import chunks, find, inspect
 from flexroad.catalog.crs import in_plan
+from flexroad.catalog.headers.point_clouds import chunks, find, inspect
 from tests.make_clouds import write_cloud
 
 N = 120_000

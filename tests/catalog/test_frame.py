@@ -3,9 +3,9 @@ import pytest
 from pyproj import CRS, Transformer
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.clouds import inspect
 from flexroad.catalog.crs import in_plan, metric_twin, plan_unit
-from flexroad.catalog.frame import Frame, agreed
+from flexroad.catalog.headers.point_clouds import inspect
+from flexroad.catalog.to_metres import Frame, agreed
 
 OREGON = (637000.0, 852000.0)
 COLOGNE = (6.95, 50.94)

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.layout import Layout, read
+from flexroad.catalog.path_templates import Layout, read
 from flexroad.catalog.sources import dsc3d, gerod
 from tests.make_rasters import UTM, write
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from flexroad.catalog import places
-from flexroad.catalog.places import Sightings, place
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import Sightings, place
 from tests.s3_server import Fault
 
 
@@ -16,51 +16,51 @@ def folder(request, tmp_path):
 
 
 def test_what_is_written_is_seen_listed_and_read(folder):
-    assert places.listing(folder) == {}
+    assert paths.listing(folder) == {}
     for name in ("a.bin", "b/c.bin", "b/d/e.bin"):
-        places.write(folder / name, name.encode())
-    found = places.listing(folder)
+        paths.write(folder / name, name.encode())
+    found = paths.listing(folder)
     assert {name: seen.size for name, seen in found.items()} == {"a.bin": 5, "b/c.bin": 7, "b/d/e.bin": 9}
     look = Sightings()
     for name, seen in found.items():
-        assert places.read(folder / name) == name.encode()
-        assert places.stat(folder / name) == look(folder / name) == seen
-    assert places.listing(folder / "b").keys() == {"c.bin", "d/e.bin"}
+        assert paths.read(folder / name) == name.encode()
+        assert paths.stat(folder / name) == look(folder / name) == seen
+    assert paths.listing(folder / "b").keys() == {"c.bin", "d/e.bin"}
     for name in ("no.bin", "b/no.bin", "no/no.bin"):
-        assert look(folder / name) is places.stat(folder / name) is None
-        assert not places.exists(folder / name)
-    assert places.exists(folder / "a.bin")
+        assert look(folder / name) is paths.stat(folder / name) is None
+        assert not paths.exists(folder / name)
+    assert paths.exists(folder / "a.bin")
 
 
 def test_other_bytes_are_another_version(folder):
-    places.write(folder / "a", b"one")
-    before = places.stat(folder / "a")
-    places.write(folder / "a", b"two")
-    after = places.stat(folder / "a")
+    paths.write(folder / "a", b"one")
+    before = paths.stat(folder / "a")
+    paths.write(folder / "a", b"two")
+    after = paths.stat(folder / "a")
     assert before.size == after.size
     assert before.version != after.version
 
 
 def test_what_is_missing_is_named(folder):
     with pytest.raises(FileNotFoundError) as caught:
-        places.read(folder / "no")
+        paths.read(folder / "no")
     assert caught.value.filename in (str(folder / "no"), folder / "no")
-    places.write(folder / "there", b"")
-    places.remove(folder / "there")
-    places.remove(folder / "there")
-    assert places.listing(folder) == {}
+    paths.write(folder / "there", b"")
+    paths.remove(folder / "there")
+    paths.remove(folder / "there")
+    assert paths.listing(folder) == {}
 
 
 def test_a_place_says_what_it_was_called(tmp_path, bucket):
     assert place(str(tmp_path)) == tmp_path
     assert type(place(str(tmp_path))) is type(tmp_path)
-    assert not places.is_remote(place("a/s3:/b"))
+    assert not paths.is_remote(place("a/s3:/b"))
     address = f"{bucket}/a/b.tif"
     # A path has lost a slash on its way through a command line.
     for told in (address, Path(address), bucket / "a" / "b.tif"):
         assert str(place(told)) == address
-        assert places.is_remote(place(told))
-    assert places.gdal_name(place(address)) == address.replace("s3://", "/vsis3/")
+        assert paths.is_remote(place(told))
+    assert paths.gdal_name(place(address)) == address.replace("s3://", "/vsis3/")
 
 
 def test_without_s3fs_the_remedy_is_named(monkeypatch):
@@ -72,15 +72,15 @@ def test_without_s3fs_the_remedy_is_named(monkeypatch):
 
 def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):
     (tmp_path / "link").symlink_to("/")
-    assert places.normal(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
-    assert places.normal("s3://one/a/../b/c") == "s3://one/b/c"
+    assert paths.normal(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
+    assert paths.normal("s3://one/a/../b/c") == "s3://one/b/c"
     # Out of the bucket is another bucket, and no longer below the folder.
-    assert places.normal("s3://one/a/../../../two/c") == "s3://two/c"
+    assert paths.normal("s3://one/a/../../../two/c") == "s3://two/c"
 
 
 def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
     for i in range(20):
-        places.write(bucket / "data" / f"{i}.tif", b"x")
+        paths.write(bucket / "data" / f"{i}.tif", b"x")
     storage.requests()
     look = Sightings()
     assert all(look(bucket / "data" / f"{i}.tif") for i in range(20))
@@ -89,36 +89,36 @@ def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
 
 def test_a_write_is_one_request(bucket, storage):
     storage.requests()
-    places.write(bucket / "a", b"x" * 1_000_000)
+    paths.write(bucket / "a", b"x" * 1_000_000)
     assert [method for method, _ in storage.requests()] == ["PUT"]
-    places.read(bucket / "a")
+    paths.read(bucket / "a")
     assert [method for method, _ in storage.requests()] == ["GET"]
 
 
 @pytest.mark.parametrize("answer", ["slow", "error", "cut"])
 def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
     storage.fail(Fault(answer, first=2))
-    places.write(bucket / "a" / "b", b"whole")
-    assert places.read(bucket / "a" / "b") == b"whole"
-    assert places.stat(bucket / "a" / "b").size == 5
-    assert list(places.listing(bucket)) == ["a/b"]
+    paths.write(bucket / "a" / "b", b"whole")
+    assert paths.read(bucket / "a" / "b") == b"whole"
+    assert paths.stat(bucket / "a" / "b").size == 5
+    assert list(paths.listing(bucket)) == ["a/b"]
 
 
 def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
     data = bytes(range(256)) * 1000
-    places.write(bucket / "a", data)
+    paths.write(bucket / "a", data)
     storage.fail(Fault("half", method="GET", first=1))
-    assert places.read(bucket / "a") == data
+    assert paths.read(bucket / "a") == data
 
 
 @pytest.mark.parametrize("answer", ["slow", "denied"])
 def test_storage_that_never_answers_is_named(bucket, storage, answer):
     storage.fail(Fault(answer))
     for attempt in (
-        lambda: places.write(bucket / "a", b""),
-        lambda: places.read(bucket / "a"),
-        lambda: places.stat(bucket / "a"),
-        lambda: places.listing(bucket),
+        lambda: paths.write(bucket / "a", b""),
+        lambda: paths.read(bucket / "a"),
+        lambda: paths.stat(bucket / "a"),
+        lambda: paths.listing(bucket),
         lambda: Sightings()(bucket / "a"),
     ):
         with pytest.raises(OSError, match=str(bucket)) as caught:

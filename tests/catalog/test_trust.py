@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
+from flexroad.catalog.allowlist import needed, refuse_outside
 from flexroad.catalog.tile import LAYERS
-from flexroad.catalog.trust import needed, refuse_outside
 
 
 def catalog(*files, root) -> Catalog:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.places import listing
+from flexroad.catalog.storage.paths import listing
 from flexroad.pipeline.clean import alone, drop, waste
 from flexroad.pipeline.config import load_config
 from flexroad.pipeline.errors import ConfigError

@@ -25,7 +25,8 @@ import pytest
 import rasterio
 import yaml
 
-from flexroad.catalog import Catalog, places
+from flexroad.catalog import Catalog
+from flexroad.catalog.storage import paths
 from flexroad.pipeline.config import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.journal import Journal
@@ -440,13 +441,13 @@ def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
 
 def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbed, out):
     """What is written later has earlier times; the next night finds nothing to do all the same."""
-    write, now = places.write, time.time
+    write, now = paths.write, time.time
 
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
         for module in ("meter", "work", "journal", "run"):
-            monkeypatch.setattr(f"pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
-        monkeypatch.setattr(places, "write", write_then)
+            monkeypatch.setattr(f"flexroad.pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
+        monkeypatch.setattr(paths, "write", write_then)
 
     def write_then(where, data) -> None:
         write(where, data)
@@ -488,7 +489,7 @@ def test_a_clock_set_back_between_nights(survey, night, undisturbed, out):
 def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, undisturbed):
     me = Holder.me()
     with held(finished):
-        before = places.listing(finished)
+        before = paths.listing(finished)
         for said in (
             night("--verify"),
             flexroad("rerun", finished, "--from", "load"),
@@ -497,7 +498,7 @@ def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, u
             assert said.code == 2
             (line,) = said.errors
             assert f"{finished} is in use by pid {me.pid} on {me.host} since" in line
-        assert places.listing(finished) == before
+        assert paths.listing(finished) == before
     assert "4 cached" in night().out
     assert_whole(finished, undisturbed)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from flexroad.catalog.places import place, read, write
+from flexroad.catalog.storage.paths import place, read, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.lock import Holder, Pace, held, holder
 

@@ -10,8 +10,9 @@ import yaml
 from PIL import Image
 from shapely import LineString
 
-from flexroad.catalog import Catalog, Grid, places
-from flexroad.catalog.places import place
+from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import place
 from flexroad.pipeline import codec
 from flexroad.pipeline.cli import main
 from flexroad.pipeline.config import compose
@@ -53,7 +54,7 @@ def survey(made_survey, bucket):
     home = bucket / "survey"
     for file in made_survey.rglob("*"):
         if file.is_file():
-            places.write(home / file.relative_to(made_survey).as_posix(), file.read_bytes())
+            paths.write(home / file.relative_to(made_survey).as_posix(), file.read_bytes())
     return home / "catalog.parquet"
 
 
@@ -86,20 +87,20 @@ def assert_same(run, local):
     pd.testing.assert_frame_equal(ours, theirs)
     for tile in run.catalog.tiles:
         one, other = (each.folder(tile.id).path for each in (run, local))
-        names = places.listing(one).keys()
-        assert names == places.listing(other).keys()
+        names = paths.listing(one).keys()
+        assert names == paths.listing(other).keys()
         for name in names - {"item.json"}:
-            assert places.read(one / name) == places.read(other / name), name
+            assert paths.read(one / name) == paths.read(other / name), name
 
 
 def assert_nothing_half(run):
     """Every artefact is whole, and so are the products of every tile that counts as done."""
-    for name in places.listing(run.store):
+    for name in paths.listing(run.store):
         if name.endswith(".npz"):
-            assert codec.decode(places.read(run.store / name))
+            assert codec.decode(paths.read(run.store / name))
     for tile in run.catalog.tiles:
         folder = run.folder(tile.id)
-        assert folder.verified() == places.exists(folder.path / "item.json")
+        assert folder.verified() == paths.exists(folder.path / "item.json")
 
 
 def test_a_run_in_a_bucket_is_the_one_on_disk(survey, made_survey, bucket, tmp_path):
@@ -118,7 +119,7 @@ def test_what_was_made_can_be_asked_for(run, local):
     execute(run, SerialExecutor())
     opened = Run.open(run.path)
     assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
-    assert places.read(write_report(opened, "html"))
+    assert paths.read(write_report(opened, "html"))
     tile = opened.catalog.tiles[0]
     assert open_tile(str(run.path), tile.id).identical(open_tile(local.path, tile.id))
     east, north = tile.grid.west + 10.3, tile.grid.north - 20.7
@@ -131,10 +132,10 @@ def test_a_source_with_other_bytes_is_noticed(run):
     execute(run, SerialExecutor())
     tile = run.catalog.tiles[1]
     file = tile.paths(tile.layer("dsm"))[0]
-    before = places.stat(file)
-    places.write(file, places.read(file) + b"\0")
-    places.write(file, places.read(file)[:-1] + b"\1")
-    assert places.stat(file).size == before.size + 1
+    before = paths.stat(file)
+    paths.write(file, paths.read(file) + b"\0")
+    paths.write(file, paths.read(file)[:-1] + b"\1")
+    assert paths.stat(file).size == before.size + 1
     how, results = bring_up_to_date(Run.open(run.path))
     assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
     assert how.exit_code == 0
@@ -223,7 +224,7 @@ def test_a_run_that_cannot_be_asked_for_is_not_called_none(run, storage):
 def test_a_missing_source_is_named_by_its_address(run):
     tile = run.catalog.tiles[0]
     file = tile.paths(tile.layer("dtm"))[0]
-    places.remove(file)
+    paths.remove(file)
     how, results = bring_up_to_date(run)
     (failure,) = results[tile.id].failures
     assert failure.file == str(file)
@@ -238,7 +239,7 @@ def test_a_photo_with_a_world_file_is_placed_as_on_disk(bucket, tmp_path):
     Image.fromarray(grey).save(photo)
     photo.with_suffix(".tfw").write_text("0.5\n0\n0\n-0.5\n295500.25\n5629499.75\n")
     for file in (photo, photo.with_suffix(".tfw")):
-        places.write(bucket / file.name, file.read_bytes())
+        paths.write(bucket / file.name, file.read_bytes())
     theirs, ours = (
         read_photo(Source("dop", (home / "dop.tif",), grid.crs), grid) for home in (tmp_path, bucket)
     )
@@ -256,26 +257,26 @@ def test_roads_in_a_bucket_are_those_on_disk(made_survey, survey, storage, tmp_p
     assert ours.equals(theirs)
     # Another version is another file; one that cannot be had is a fault of one line.
     write_roads(tmp_path / "one.gpkg", [LineString([(500000, 5600000), (500050, 5600000)])], width=[6])
-    places.write(asked[1].path, (tmp_path / "one.gpkg").read_bytes())
+    paths.write(asked[1].path, (tmp_path / "one.gpkg").read_bytes())
     assert len(near(asked[1], bounds)) == 1
     for answer in ("error", "half"):
-        places.write(asked[1].path, answer.encode())
+        paths.write(asked[1].path, answer.encode())
         storage.fail(Fault(answer, "GET", "gpkg"))
         with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be read: .*; run again"):
             near(asked[1], bounds)
     storage.fail()
-    places.remove(asked[1].path)
+    paths.remove(asked[1].path)
     with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be opened .no such file.; put it back"):
         near(asked[1], bounds)
 
 
 def test_a_damaged_artefact_is_made_anew(run, local):
     execute(run, SerialExecutor())
-    name = next(name for name in places.listing(run.store) if name.startswith("evaluate/"))
-    whole = places.read(run.store / name)
-    places.write(run.store / name, whole[:-1])
+    name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
+    whole = paths.read(run.store / name)
+    paths.write(run.store / name, whole[:-1])
     for tile in run.catalog.tiles:
-        places.remove(run.folder(tile.id).path / "item.json")
+        paths.remove(run.folder(tile.id).path / "item.json")
     _, results = bring_up_to_date(Run.open(run.path))
     assert sum(result.computed.get("evaluate", 0) for result in results.values()) == 1
     assert_same(run, local)
@@ -303,7 +304,7 @@ def test_commands_take_addresses(survey, bucket, tmp_path, local, flexroad):
     assert_same(Run.open(bucket / "run"), local)
     assert "4 done" in flexroad("status", home)
     flexroad("report", home)
-    assert places.read(bucket / "run" / "report.md")
+    assert paths.read(bucket / "run" / "report.md")
     tile = local.catalog.tiles[0]
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{tile.grid.west + 10},{tile.grid.north - 10}\n")

@@ -5,8 +5,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from flexroad.catalog import Catalog, places
-from flexroad.catalog.places import write
+from flexroad.catalog import Catalog
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline import codec
 from flexroad.pipeline.config import compose
 from flexroad.pipeline.graph import tile_graph
@@ -109,7 +109,7 @@ def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeyp
             raise PermissionError(13, "denied", str(path))
         path.write_bytes(data)
 
-    monkeypatch.setattr(places, "write", denied)
+    monkeypatch.setattr(paths, "write", denied)
     with pytest.raises(PermissionError):
         folder.finish({"is": 1}, {"a": b"new", "b": b"new"})
     assert sorted(path.name for path in folder.path.iterdir()) == ["a", "b"]

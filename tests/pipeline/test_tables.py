@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.config import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.bootstrap import bootstrap

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib import rc_context
 
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.report.evidence import collect
 from flexroad.pipeline.report.figures import dataset, maps, profile, renders, trade_off
 from flexroad.pipeline.report.figures.cast import Cast, cast_of

@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
-from flexroad.catalog.places import write
+from flexroad.catalog.storage.paths import write
 
 WIDTH_IN = 7.0
 """Width of a page's text."""

@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.index import Catalog
-from flexroad.catalog.places import Place, absolute, joined, normal, place
+from flexroad.catalog.storage.paths import Place, absolute, joined, normal, place
 from flexroad.catalog.tile import LAYERS
 
 MOST = 4

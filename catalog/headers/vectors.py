@@ -11,11 +11,11 @@ import shapely
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog.crs import transformer
-from flexroad.catalog.cut import REACH_M
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.raster_files import matching
+from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.tile import Layer, Tile
+from flexroad.catalog.tiling import REACH_M
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from rasterio.warp import transform_bounds
 from flexroad.catalog.crs import same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.raster_files import RasterFile, require_metric, some, zoned
+from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 REACH_M = 100.0

@@ -14,11 +14,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.cut import MASKS, Indexed, assumed, taken
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.raster_files import RasterFile, opened, require_metric, some
+from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.tiling import MASKS, Indexed, assumed, taken
 
 NEEDED = ("dsm", "dtm")
 PLACEHOLDER = re.compile(r"\{(.*?)\}")

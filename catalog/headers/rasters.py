@@ -18,7 +18,7 @@ from rasterio.warp import transform_bounds
 from flexroad.catalog.crs import in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.places import gdal_options
+from flexroad.catalog.storage.paths import gdal_options
 
 GDAL = {
     # A folder of 10,000 files is not listed anew for each of them; side-car files are still found.

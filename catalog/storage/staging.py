@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flexroad.catalog.places import Place, aside, read, write
+from flexroad.catalog.storage.paths import Place, aside, read, write
 
 PUT_S = 60.0
 """How often a mirror is put back."""

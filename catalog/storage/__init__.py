@@ -1,0 +1,1 @@
+"""Where files are: paths on disk and in object storage, and atomic writes."""
