@@ -10,9 +10,10 @@ from statistics import median
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.crs import short
 from flexroad.catalog.storage.paths import Place, Sightings
-from flexroad.tasks import load, registration
+from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.photo import read_photo
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.roads import coregistration
 
 MOST = 12
 """Tiles whose photo is compared with the heights: spread evenly over the catalog."""
@@ -58,11 +59,11 @@ def _missing(tiles: Sequence[Tile]) -> Iterator[Remark]:
 
 def _photos(tiles: Sequence[Tile]) -> Iterator[Remark]:
     """Compare photo and heights on some tiles, first by cell: only like lattices can be taken together."""
-    tiles = [tile for tile in tiles if registration.large_enough(tile.grid)]
+    tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
     cells = Counter(tile.grid.cell for tile in tiles)
     tiles = [tile for tile in tiles if tile.grid.cell == cells.most_common(1)[0][0]]
     some = [tiles[i * len(tiles) // min(MOST, len(tiles))] for i in range(min(MOST, len(tiles)))]
-    pairs: list[registration.Pair] = []
+    pairs: list[coregistration.Pair] = []
     for tile in some:
         try:
             pairs.append(_pair(tile))
@@ -72,15 +73,15 @@ def _photos(tiles: Sequence[Tile]) -> Iterator[Remark]:
         yield _shift(pairs, some[0].grid.cell)
 
 
-def _pair(tile: Tile) -> registration.Pair:
+def _pair(tile: Tile) -> coregistration.Pair:
     data = load.load(tile, load.Options(min_valid=0.0))
     assert data.dop is not None  # only tiles with a photo are asked
-    return registration.pair(data, read_photo(data.dop, data.grid))
+    return coregistration.pair(data, read_photo(data.dop, data.grid))
 
 
-def _shift(pairs: Sequence[registration.Pair], cell: float) -> Remark:
-    found = registration.shift(pairs)
-    each = [registration.shift([pair], found.sun) for pair in pairs]
+def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Remark:
+    found = coregistration.shift(pairs)
+    each = [coregistration.shift([pair], found.sun) for pair in pairs]
     scatter = median(
         ((one.east_m - found.east_m) ** 2 + (one.north_m - found.north_m) ** 2) ** 0.5 for one in each
     )
@@ -89,7 +90,7 @@ def _shift(pairs: Sequence[registration.Pair], cell: float) -> Remark:
         f"{scatter:.1f} m of that; sun at {found.sun[0]:.0f}°, {found.sun[1]:.0f}° high; "
         f"confidence {found.confidence:.2f})"
     )
-    if not registration.matters(found, cell, scatter):
+    if not coregistration.matters(found, cell, scatter):
         return Remark(f"dop: {measured}: not clearly off")
     return Remark(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",

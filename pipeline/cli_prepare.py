@@ -18,7 +18,7 @@ from flexroad.pipeline.prepare.asked import Asked
 if TYPE_CHECKING:
     from flexroad.pipeline.execute import Executor
     from flexroad.pipeline.prepare.sheet import Published
-    from flexroad.tasks.acquire.points import Options
+    from flexroad.tasks.acquire.points.to_rasters import Options
 
 prepare = typer.Typer(
     no_args_is_help=True, help="Make DSM, DTM, orthophoto and a catalog where there are none yet."
@@ -98,8 +98,8 @@ def _points_options(
     slope: float | None, radius: float | None, fill: float | None, void: float | None, **more: Any
 ) -> Options:
     """Return how points become rasters: the defaults but for what was asked."""
-    from flexroad.tasks.acquire.ground import Options as Filter
-    from flexroad.tasks.acquire.points import Options
+    from flexroad.tasks.acquire.points.ground_filter import Options as Filter
+    from flexroad.tasks.acquire.points.to_rasters import Options
 
     ground_filter = Filter(**_told(slope=slope, radius_m=radius))
     return Options(filter=ground_filter, **_told(fill_m=fill, void_m=void, **more))
@@ -272,14 +272,14 @@ def prepare_photos(
 ) -> None:
     """Reconstruct a place from photographs: cameras, dense stereo, Poisson mesh, and that as `mesh` does."""
     from flexroad.pipeline.prepare import photos
-    from flexroad.tasks.acquire import dense, patchmatch, photogrammetry
+    from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
 
     of_photos = photos.PhotosAsked(
         control,
         control_crs,
-        photogrammetry.Options(**_told(image_size=image_size, seed=seed)),
-        dense.Options(**_told(size=stereo_size)),
-        patchmatch.Options(**_told(size=stereo_size)),
+        sfm.Options(**_told(image_size=image_size, seed=seed)),
+        mvs_cpu.Options(**_told(size=stereo_size)),
+        mvs_gpu.Options(**_told(size=stereo_size)),
         refine=not no_refine,
     )
     options = _points_options(slope, radius, fill, void, ground="filter")

@@ -13,18 +13,24 @@ import pkgutil
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal, Union, get_args
 
 import yaml
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from flexroad.pipeline.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.tasks import assess, ecsrc, evaluate, grounded, load, sample
+from flexroad.tasks import load, sample
+from flexroad.tasks.filter import ecsrc, planar
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.options import Options
+from flexroad.tasks.quality import assess
 
-TAG = {"segment": "method", "ecsrc": "variant", "fit": "method", "sample": "method", "cluster": "kind"}
+TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "method", "cluster": "kind"}
 """The option that a bare word stands for, by stage or section."""
+
+NO_METHODS = ("kit", "training_types")
+"""What lies in a package of methods beside them."""
 
 Chain = Mapping[str, Options]
 """The options of one variant, by stage, in the paper's order."""
@@ -64,10 +70,15 @@ class Config(BaseModel):
 
 @cache
 def methods(package: str) -> dict[str, Any]:
-    """Return the modules of a package that holds one file per method, by method."""
+    """Return the stage files of a package by method: NAME.py, or NAME/segment.py of one that learns."""
     home = importlib.import_module(package)
-    names = sorted(m.name for m in pkgutil.iter_modules(home.__path__) if not m.name.startswith("_"))
-    return {name: importlib.import_module(f"{package}.{name}") for name in names}
+    stage = package.rpartition(".")[2]
+    found = {}
+    for file in sorted(pkgutil.iter_modules(home.__path__), key=lambda file: file.name):
+        if file.name not in NO_METHODS:
+            module = importlib.import_module(f"{package}.{file.name}{f'.{stage}' if file.ispkg else ''}")
+            found |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
+    return found
 
 
 @cache
@@ -75,7 +86,7 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
     """Return what validates the options of each stage, in the paper's order."""
 
     def one_of(package: str) -> TypeAdapter[Options]:
-        models: Any = tuple(module.Options for module in methods(package).values())
+        models: Any = tuple(dict.fromkeys(module.Options for module in methods(package).values()))
         if len(models) == 1:
             return TypeAdapter(models[0])
         union: Any = Union[models]  # noqa: UP007 (which models there are is known only now)
@@ -85,7 +96,7 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
     return {
         "load": TypeAdapter(load.Options),
         "segment": one_of("flexroad.tasks.segment"),
-        "ecsrc": TypeAdapter(Annotated[ecsrc.Options | grounded.Options, Field(discriminator="variant")]),
+        "ecsrc": one_of("flexroad.tasks.filter"),
         "fit": one_of("flexroad.tasks.fit"),
         "sample": TypeAdapter(sample.Options),
         "evaluate": TypeAdapter(evaluate.Options),
@@ -95,7 +106,7 @@ def stage_models() -> dict[str, TypeAdapter[Options]]:
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "segment": {"method": "mask"},
-    "ecsrc": {"variant": "paper"},
+    "ecsrc": {"method": "paper"},
     "fit": {"method": "nurbs"},
 }
 """Methods of stages that have several, where a file names none."""
@@ -175,17 +186,22 @@ def schema() -> dict[str, Any]:
 def template() -> str:
     """Return a configuration file with every option at its default and its meaning beside it."""
     lines = ["# Every option with its default. Delete what you do not change."]
-    packages = {"segment": "flexroad.tasks.segment", "fit": "flexroad.tasks.fit"}
+    packages = {
+        "segment": "flexroad.tasks.segment",
+        "ecsrc": "flexroad.tasks.filter",
+        "fit": "flexroad.tasks.fit",
+    }
+    singles = {"load": load, "sample": sample, "evaluate": evaluate, "assess": assess}
     for stage in stage_models():
         lines.append(f"{stage}:")
         if stage in packages:
-            default = DEFAULTS[stage]["method"]
+            default = DEFAULTS[stage][TAG[stage]]
             lines += _option_lines(methods(packages[stage])[default].Options)
             others = [name for name in methods(packages[stage]) if name != default]
             if others:
                 lines.append(f"  # other methods: {', '.join(others)}")
         else:
-            lines += _option_lines(importlib.import_module(f"flexroad.tasks.{stage}").Options)
+            lines += _option_lines(singles[stage].Options)
     lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
     lines += ["variants:", "  flexroad: {}"]
     return "\n".join(lines) + "\n"

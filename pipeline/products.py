@@ -8,8 +8,8 @@ from typing import Any
 from flexroad.pipeline.graph import TileGraph
 from flexroad.pipeline.store import plain_name
 from flexroad.tasks.export import cog, glb, npz, ply
-from flexroad.tasks.nurbs import NurbsSurface
-from flexroad.tasks.support import of_faces
+from flexroad.tasks.quality.support import of_faces
+from flexroad.tasks.spline.surface import NurbsSurface
 
 Product = tuple[bytes, str]
 """Bytes and media type."""

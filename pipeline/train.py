@@ -6,11 +6,11 @@ shows what was learnt, not what tidying makes of it.
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,14 +22,15 @@ from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.pipeline.config import Config, methods
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.split import Piece, Split, halves, inside, split
-from flexroad.tasks import load, road_vectors
+from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.hygiene import NOTHING, within
-from flexroad.tasks.mask_quality import Quality, judge, together
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.options import Options
-from flexroad.tasks.photo import read_photo
-from flexroad.tasks.survey import outside
-from flexroad.tasks.training.types import Round, Sample, Trained
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.mask_cleanup import NOTHING, within
+from flexroad.tasks.roads.mask_metrics import Quality, judge, together
+from flexroad.tasks.segment.training_types import Round, Sample, Trained
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
 Labels = Literal["mask", "vector"]
@@ -83,7 +84,7 @@ class Ground:
 
     asked: Asked
     load: load.Options
-    vectors: road_vectors.Options
+    vectors: rasterise.Options
 
     def labelled(self, tile: Tile) -> tuple[TileData, Bools] | None:
         """Return a tile and its labels, or None if it has none.
@@ -95,7 +96,7 @@ class Ground:
         """
         data = load.load(tile, self.load)
         if self.asked.labels == "vector":
-            return None if data.roads is None else (data, road_vectors.burn(data, self.vectors))
+            return None if data.roads is None else (data, rasterise.burn(data, self.vectors))
         road = data.road_mask if data.reference_road is None else data.reference_road
         return None if road is None else (data, road)
 
@@ -302,10 +303,11 @@ def _check_labels(pieces: Sequence[Piece], asked: Asked) -> None:
 
 
 def _method(asked: Asked) -> Any:
-    known = [name for name in methods("flexroad.tasks.training") if name != "types"]
+    home = Path(importlib.import_module("flexroad.tasks.segment").__path__[0])
+    known = sorted(path.parent.name for path in home.glob("*/train.py"))
     if asked.method not in known:
         raise ConfigError(f"--method {asked.method}: there are {', '.join(known)}")
-    return import_module(f"flexroad.tasks.training.{asked.method}")
+    return importlib.import_module(f"flexroad.tasks.segment.{asked.method}.train")
 
 
 def _settings(method: Any, asked: Asked) -> Options:
@@ -324,10 +326,10 @@ def _settings(method: Any, asked: Asked) -> Options:
     return options
 
 
-def _vector_options(config: Config) -> road_vectors.Options:
+def _vector_options(config: Config) -> rasterise.Options:
     """Return how wide lines are: as the configuration's segmenter by vectors has it, else by default."""
     segment = _chain(config)["segment"]
-    return segment if isinstance(segment, road_vectors.Options) else road_vectors.DEFAULTS
+    return segment if isinstance(segment, rasterise.Options) else rasterise.DEFAULTS
 
 
 def _chain(config: Config) -> dict[str, Any]:

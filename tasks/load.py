@@ -19,7 +19,7 @@ from flexroad.catalog.crs import Unit, height_unit
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.patch import Patch, Unreadable, misfit, onto, read
+from flexroad.tasks.io.raster import Patch, Unreadable, misfit, onto, read
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 VERSION = 1

@@ -191,6 +191,18 @@ class Quality:
     doubted_m2: float
     """Largest patch of road farther from its witness than two heights of one ground may be (m2), or 0."""
     flags: tuple[str, ...]
-    """What stands out, by `tasks.assess.FLAGS`."""
+    """What stands out, by `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]
-    """The core's cells by `tasks.support.Support`, ``(H, W)``."""
+    """The core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An orthophoto of a piece of ground."""
+
+    grid: Grid
+    """Its pixels."""
+    colour: NDArray[np.uint8]
+    """Red, green, blue, ``(3, h, w)``."""
+    known: Bools
+    """Pixels with a colour, ``(h, w)``."""

@@ -19,8 +19,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.sheet import GROUND, Sheet
 from flexroad.pipeline.prepare.spool import Blocks, Place, Spooled, room
-from flexroad.tasks.acquire.points import Options, rasterise, reach_m
-from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m
+from flexroad.tasks.types import Photo
 
 
 @dataclass(frozen=True)

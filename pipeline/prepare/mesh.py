@@ -18,14 +18,15 @@ from flexroad.pipeline.prepare.blocks import fill, sheet_grid
 from flexroad.pipeline.prepare.roads import add_roads
 from flexroad.pipeline.prepare.sheet import GROUND, Published, Sheet
 from flexroad.pipeline.prepare.spool import PER_METRE, RECORD, Blocks, Place, Spooled, edge_for, room
-from flexroad.tasks.acquire import points, refine
-from flexroad.tasks.acquire.mesh import TexturedMesh, in_metres, orthophoto, sample
-from flexroad.tasks.acquire.mesh_files import read_mesh
-from flexroad.tasks.acquire.placement import Offset
+from flexroad.tasks.acquire.mesh import reference
+from flexroad.tasks.acquire.mesh.georeference import Offset
+from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tasks.acquire.mesh.sample import TexturedMesh, in_metres, orthophoto, sample
+from flexroad.tasks.acquire.points import to_rasters
 
 BAND = 1024
 """Rows of the orthophoto drawn at a time: memory does not grow with the area."""
-POINTS = points.Options(ground="filter")
+POINTS = to_rasters.Options(ground="filter")
 """A mesh has no classes."""
 
 
@@ -52,7 +53,7 @@ def prepare_mesh(
     out: Path,
     asked: Asked,
     mesh_asked: MeshAsked,
-    options: points.Options,
+    options: to_rasters.Options,
     executor: Executor,
     say: Callable[[str], None],
 ) -> Published:
@@ -61,12 +62,12 @@ def prepare_mesh(
     Parameters
     ----------
     path : Path
-        OBJ, PLY or glTF; see `tasks.acquire.mesh_files.read_mesh` for colours and place.
+        OBJ, PLY or glTF; see `tasks.acquire.mesh.read.read_mesh` for colours and place.
     out : Path
         Folder to publish in.
     asked, mesh_asked : Asked, MeshAsked
         What the user wants.
-    options : points.Options
+    options : to_rasters.Options
         How points become rasters.
     executor : Executor
         Where blocks are worked on.
@@ -89,7 +90,7 @@ def publish_mesh(
     out: Path,
     asked: Asked,
     mesh_asked: MeshAsked,
-    options: points.Options,
+    options: to_rasters.Options,
     executor: Executor,
     say: Callable[[str], None],
 ) -> Published:
@@ -103,13 +104,13 @@ def publish_mesh(
         masked = add_roads(sheet, asked)
         if masked:
             sheet.facts["REFERENCE"] = (
-                f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {refine.CIRCULAR}"
+                f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {reference.CIRCULAR}"
             )
         fill(sheet, _spooled(sheet, mesh, mesh_asked, options, asked.step_m), options, executor, say)
         if mesh_asked.refine:
             say("refining the terrain")
             dtm, ground = sheet.read("dtm", grid), sheet.read(GROUND, grid)
-            dtm = refine.refine(dtm, ground, grid, options.void_m)
+            dtm = reference.refine(dtm, ground, grid, options.void_m)
             sheet.write("dtm", grid, dtm)
         if mesh_asked.dop:
             say("drawing the orthophoto")
@@ -117,13 +118,13 @@ def publish_mesh(
         dataset = asked.dataset or name
         if masked:
             _refer(sheet)
-            dataset = f"{dataset}; {refine.CIRCULAR}"
+            dataset = f"{dataset}; {reference.CIRCULAR}"
         published = sheet.publish(asked.tile_size_m, asked.date, dataset)
     return published.noting(*mesh.notes, *frame.notes)
 
 
-def _facts(name: str, mesh_asked: MeshAsked, options: points.Options) -> dict[str, str]:
-    made = points.facts(options)
+def _facts(name: str, mesh_asked: MeshAsked, options: to_rasters.Options) -> dict[str, str]:
+    made = to_rasters.facts(options)
     facts = {
         "SOURCE": f"{name}; {mesh_asked.density:g} points per m2 of surface, seed {mesh_asked.seed}",
         "DSM": made["DSM"],
@@ -135,11 +136,11 @@ def _facts(name: str, mesh_asked: MeshAsked, options: points.Options) -> dict[st
 
 
 def _spooled(
-    sheet: Sheet, mesh: TexturedMesh, mesh_asked: MeshAsked, options: points.Options, step: float
+    sheet: Sheet, mesh: TexturedMesh, mesh_asked: MeshAsked, options: to_rasters.Options, step: float
 ) -> Spooled:
     """Put points of the mesh into blocks on disk."""
     area = sheet.grid.width * sheet.grid.height * sheet.grid.cell**2
-    reach = points.reach_m(options, sheet.grid.cell)
+    reach = to_rasters.reach_m(options, sheet.grid.cell)
     edge = edge_for(mesh_asked.density * mesh.area, area, reach, step)
     blocks, places = Blocks(sheet.scratch / "points", edge), set[Place]()
     with room(sheet.out):
@@ -166,6 +167,6 @@ def _draw(sheet: Sheet, mesh: TexturedMesh) -> None:
 
 def _refer(sheet: Sheet) -> None:
     dsm, dtm, road = (sheet.read(layer, sheet.grid) for layer in ("dsm", "dtm", "road_mask"))
-    heights, kept = refine.reference(dsm, dtm, road, sheet.grid)
+    heights, kept = reference.reference(dsm, dtm, road, sheet.grid)
     sheet.write("reference", sheet.grid, heights)
     sheet.write("reference_road", sheet.grid, kept)

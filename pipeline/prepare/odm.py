@@ -27,9 +27,8 @@ from flexroad.pipeline.prepare.mesh import MeshAsked, prepare_mesh
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.roads import add_roads
 from flexroad.pipeline.prepare.sheet import Published, Sheet
-from flexroad.tasks.acquire import ground, points, voids
-from flexroad.tasks.acquire.types import Photo
-from flexroad.tasks.types import Floats
+from flexroad.tasks.acquire.points import fill_voids, ground_filter, to_rasters
+from flexroad.tasks.types import Floats, Photo
 
 DSM, DTM, PHOTO = "odm_dem/dsm.tif", "odm_dem/dtm.tif", "odm_orthophoto/odm_orthophoto.tif"
 MESHES = tuple(
@@ -46,7 +45,7 @@ def prepare_odm(
     out: Path,
     asked: Asked,
     mesh_asked: MeshAsked,
-    options: points.Options,
+    options: to_rasters.Options,
     executor: Executor,
     say: Callable[[str], None],
 ) -> Published:
@@ -60,7 +59,7 @@ def prepare_odm(
         Folder to publish in.
     asked, mesh_asked : Asked, MeshAsked
         What the user wants; the latter where there is but a mesh.
-    options : points.Options
+    options : to_rasters.Options
         Ground filter and voids where there is no ``dtm.tif``; all of it for mesh and points.
     executor : Executor
         Where blocks of points are worked on.
@@ -88,7 +87,7 @@ def prepare_odm(
 
 
 def _rasters(
-    folder: Path, out: Path, asked: Asked, options: points.Options, say: Callable[[str], None]
+    folder: Path, out: Path, asked: Asked, options: to_rasters.Options, say: Callable[[str], None]
 ) -> Published:
     frame, grid = _frame(folder / DSM, asked)
     has_dtm, photo = (folder / DTM).is_file(), folder / PHOTO
@@ -147,16 +146,16 @@ def _photo(sheet: Sheet, path: Path, frame: Frame) -> None:
                 sheet.write_photo(Photo(where, warped.read((1, 2, 3), window=window), known))
 
 
-def _filter(sheet: Sheet, options: points.Options) -> None:
+def _filter(sheet: Sheet, options: to_rasters.Options) -> None:
     """Make the terrain of the surface: its ground cells, and what lies between them."""
     slope = options.filter
     reach = slope.radius_m + (slope.low_radius_m if slope.low_m is not None else 0)
-    reach += voids.reach_m(options.void_m, sheet.grid.cell)
+    reach += fill_voids.reach_m(options.void_m, sheet.grid.cell)
     for where, _ in _windows(sheet.grid):
         rim = _clipped(where.buffered(reach), sheet.grid)
         dsm: Floats = sheet.read("dsm", rim)
-        cells = ground.ground_cells(dsm, rim.cell, slope)
-        dtm = voids.fill(np.where(cells, dsm, np.nan), rim, options.void_m)
+        cells = ground_filter.ground_cells(dsm, rim.cell, slope)
+        dtm = fill_voids.fill(np.where(cells, dsm, np.nan), rim, options.void_m)
         sheet.write("dtm", where, dtm[rim.window(where)])
 
 

@@ -22,11 +22,12 @@ from flexroad.pipeline.prepare.mesh import MeshAsked, publish_mesh
 from flexroad.pipeline.prepare.sheet import Published
 from flexroad.pipeline.prepare.spool import room, scratch
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire import dense, patchmatch, photogrammetry, points
-from flexroad.tasks.acquire.dense import Cloud
-from flexroad.tasks.acquire.photo_positions import Placed, place, read_control, read_shot
-from flexroad.tasks.acquire.photogrammetry import Reconstruction, View
-from flexroad.tasks.acquire.poisson import poisson
+from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
+from flexroad.tasks.acquire.photos.exif import Placed, place, read_control, read_shot
+from flexroad.tasks.acquire.photos.mvs_cpu import Cloud
+from flexroad.tasks.acquire.photos.poisson import poisson
+from flexroad.tasks.acquire.photos.sfm import Reconstruction, View
+from flexroad.tasks.acquire.points import to_rasters
 from flexroad.tasks.types import Floats
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
@@ -47,10 +48,10 @@ class PhotosAsked:
     """Ground control points, CSV: image, x_px, y_px, easting, northing, height and perhaps name."""
     control_crs: str | None = None
     """CRS of the control points; that of the rasters by default."""
-    sfm: photogrammetry.Options = field(default_factory=photogrammetry.Options)
-    stereo: dense.Options = field(default_factory=dense.Options)
+    sfm: sfm.Options = field(default_factory=sfm.Options)
+    stereo: mvs_cpu.Options = field(default_factory=mvs_cpu.Options)
     """On the CPU."""
-    patchmatch: patchmatch.Options = field(default_factory=patchmatch.Options)
+    patchmatch: mvs_gpu.Options = field(default_factory=mvs_gpu.Options)
     """On a GPU."""
     refine: bool = True
     """Whether the DTM is refined by ECSRC, as in the paper."""
@@ -63,7 +64,7 @@ class DepthJob:
     view: View
     others: tuple[View, ...]
     points: Floats
-    options: dense.Options
+    options: mvs_cpu.Options
     spacing_m: float
     target: Path
     """Where the cloud goes, ``.npz``."""
@@ -74,7 +75,7 @@ def prepare_photos(
     out: Path,
     asked: Asked,
     photos_asked: PhotosAsked,
-    options: points.Options,
+    options: to_rasters.Options,
     executor: Executor,
     say: Callable[[str], None],
 ) -> Published:
@@ -88,7 +89,7 @@ def prepare_photos(
         Folder to publish in.
     asked, photos_asked : Asked, PhotosAsked
         What the user wants. Cells finer than the stereo resolves are made coarser, which is said.
-    options : points.Options
+    options : to_rasters.Options
         How points become rasters.
     executor : Executor
         Where photographs and blocks are worked on.
@@ -100,15 +101,17 @@ def prepare_photos(
     TaskError, CatalogError, ConfigError
         If pycolmap is missing, a photograph has no position, or they do not match; nothing is left behind.
     """
-    photogrammetry.colmap()
+    sfm.colmap()
     placed = place([read_shot(path) for path in _files(images)], asked.to_crs)
     control = photos_asked.control and read_control(photos_asked.control, placed, photos_asked.control_crs)
     with scratch(out) as work:
         say(f"matching {len(placed.shots)} photographs ({_cameras(placed)})")
-        found = photogrammetry.reconstruct(placed, work, photos_asked.sfm, control or None)
+        found = sfm.reconstruct(placed, work, photos_asked.sfm, control or None)
         notes = _notes(found, placed, control is not None)
-        gpu = patchmatch.available()
-        pixel = dense.ground_pixel_m(found, photos_asked.patchmatch.size if gpu else photos_asked.stereo.size)
+        gpu = mvs_gpu.available()
+        pixel = mvs_cpu.ground_pixel_m(
+            found, photos_asked.patchmatch.size if gpu else photos_asked.stereo.size
+        )
         how = f"dense stereo: {ON_GPU if gpu else ON_CPU}, {pixel:.3f} m per pixel"
         asked, coarser = _resolved(asked, pixel)
         notes += (how, *coarser)
@@ -116,7 +119,7 @@ def prepare_photos(
             say(note)
         spacing = max(2 * pixel, min(asked.cell_m, asked.dop_cell_m) / 3)
         if gpu:
-            cloud = dense.merge([patchmatch.patchmatch(found, work, photos_asked.patchmatch)], spacing)
+            cloud = mvs_cpu.merge([mvs_gpu.patchmatch(found, work, photos_asked.patchmatch)], spacing)
         else:
             cloud = _stereo(found, work, photos_asked.stereo, spacing, executor, say)
         say(f"Poisson surface of {len(cloud):,} points")
@@ -206,7 +209,7 @@ def _notes(found: Reconstruction, placed: Placed, wanted_control: bool) -> tuple
 def _stereo(
     found: Reconstruction,
     work: Path,
-    options: dense.Options,
+    options: mvs_cpu.Options,
     spacing: float,
     executor: Executor,
     say: Callable[[str], None],
@@ -223,17 +226,19 @@ def _stereo(
         with np.load(job.target) as made:
             merged.append(Cloud(made["points"], made["normals"], made["colours"]))
         if sum(map(len, merged[1:])) > MERGED_AT_ONCE:
-            merged = [dense.merge(merged, spacing)]
+            merged = [mvs_cpu.merge(merged, spacing)]
     if not sum(map(len, merged)):
         raise TaskError(
             "dense stereo found nothing that three photographs share; take some that overlap by 60 % and more"
         )
-    return dense.merge(merged, spacing)
+    return mvs_cpu.merge(merged, spacing)
 
 
-def _jobs(found: Reconstruction, folder: Path, options: dense.Options, spacing: float) -> Iterator[DepthJob]:
+def _jobs(
+    found: Reconstruction, folder: Path, options: mvs_cpu.Options, spacing: float
+) -> Iterator[DepthJob]:
     for number, view in enumerate(found.views):
-        others = tuple(found.views[other] for other in dense.partners(found, number, options))
+        others = tuple(found.views[other] for other in mvs_cpu.partners(found, number, options))
         if len(others) >= 2:
             sparse = found.points[view.seen]
             yield DepthJob(view, others, sparse, options, spacing, folder / f"{number}.npz")
@@ -244,9 +249,9 @@ def _match(job: DepthJob) -> Path:
 
     # Photographs run side by side, one thread each; OpenCV does not read the environment.
     cv2.setNumThreads(1)
-    cloud = dense.photo_cloud(job.view, job.others, job.points, job.options)
+    cloud = mvs_cpu.photo_cloud(job.view, job.others, job.points, job.options)
     if len(cloud):
-        cloud = dense.merge([cloud], job.spacing_m)
+        cloud = mvs_cpu.merge([cloud], job.spacing_m)
     with room(job.target.parent.parent.parent):
         np.savez(job.target, points=cloud.points, normals=cloud.normals, colours=cloud.colours)
     return job.target

@@ -17,7 +17,7 @@ from flexroad.pipeline.prepare.blocks import fill, sheet_grid
 from flexroad.pipeline.prepare.roads import add_roads
 from flexroad.pipeline.prepare.sheet import Published, Sheet
 from flexroad.pipeline.prepare.spool import Spooled, edge_m, scratch, spool
-from flexroad.tasks.acquire.points import Options, facts, reach_m
+from flexroad.tasks.acquire.points.to_rasters import Options, facts, reach_m
 
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01

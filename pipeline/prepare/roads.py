@@ -22,7 +22,7 @@ from flexroad.catalog.to_metres import Frame
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.sheet import Sheet
-from flexroad.tasks.road_vectors import cells
+from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 
 MESHES = (".obj", ".ply", ".glb", ".gltf")
@@ -111,8 +111,8 @@ def _elsewhere(path: Path, grid: Grid) -> ConfigError:
 
 
 def _mesh(path: Path, grid: Grid) -> Bools:
-    from flexroad.tasks.acquire.mesh import cover, in_metres
-    from flexroad.tasks.acquire.mesh_files import read_mesh
+    from flexroad.tasks.acquire.mesh.read import read_mesh
+    from flexroad.tasks.acquire.mesh.sample import cover, in_metres
 
     mesh = read_mesh(path, colours=False)
     return cover(in_metres(mesh, Frame.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)

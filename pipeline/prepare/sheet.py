@@ -29,7 +29,7 @@ from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
-from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.types import Photo
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"

@@ -16,7 +16,7 @@ from flexroad.pipeline.report.render import (
 )
 from flexroad.pipeline.run import Run
 from flexroad.pipeline.store import Store
-from flexroad.tasks.drape import drape
+from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 MOST = 24

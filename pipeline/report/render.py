@@ -28,7 +28,7 @@ from PIL import Image
 
 from flexroad.catalog import Grid
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.support import Support
+from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats, Mesh
 
 log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ def support_picture(
     height : Floats
         The DSM (m), ``(H, W)``.
     support : ndarray
-        The cells by `tasks.support.Support`, ``(H, W)``.
+        The cells by `tasks.quality.support.Support`, ``(H, W)``.
     road : Bools
         Road before the filter, ``(H, W)``.
     grid : Grid

@@ -20,7 +20,7 @@ from flexroad.pipeline.report.render import curves, found_map
 from flexroad.pipeline.run import versions
 from flexroad.pipeline.store import no_nan
 from flexroad.pipeline.train import Judged, Outcome
-from flexroad.tasks.mask_quality import Quality
+from flexroad.tasks.roads.mask_metrics import Quality
 
 SHOWN = 3
 """Best tiles shown, and as many of the worst."""

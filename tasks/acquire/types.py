@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.types import Bools, Floats
+from flexroad.tasks.types import Bools, Floats, Photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +34,6 @@ class Points:
         """Return some of the points: by a slice, a mask or indices."""
         colour = None if self.colour is None else self.colour[which]
         return Points(self.easting[which], self.northing[which], self.height[which], self.kind[which], colour)
-
-
-@dataclass(frozen=True, eq=False)
-class Photo:
-    """An orthophoto of a piece of ground."""
-
-    grid: Grid
-    """Its pixels."""
-    colour: NDArray[np.uint8]
-    """Red, green, blue, ``(3, h, w)``."""
-    known: Bools
-    """Pixels with a colour, ``(h, w)``."""
 
 
 @dataclass(frozen=True, eq=False)

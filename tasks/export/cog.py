@@ -50,7 +50,7 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
 
 
 def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
-    """Return what each cell rests on, ``(H, W)``, as GeoTIFF: uint8 by `tasks.support.Support`, 0 is nodata.
+    """Return what each cell rests on, ``(H, W)``, as GeoTIFF: uint8 by `Support`; 0 is nodata.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """The fitted surface itself (the paper's parameters Theta) as NumPy archive, for use without the run.
 
-Any NumPy reads it; `decode` gives the `NurbsSurface` back, and `tasks.nurbs.exact` from it what CAD programs
-read.
+Any NumPy reads it; `decode` gives the `NurbsSurface` back, and `tasks.spline.surface.exact` from it what CAD
+programs read.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.nurbs import NurbsSurface
+from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 1
 NAME = "_surface.npz"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.support import Support
+from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Mesh
 
 VERSION = 2
@@ -41,7 +41,7 @@ end_header
 
 
 def encode(mesh: Mesh, support: NDArray[np.uint8]) -> bytes:
-    """Return a mesh as PLY, with what each face rests on (`tasks.support.Support`, ``(F,)``).
+    """Return a mesh as PLY, with what each face rests on (`tasks.quality.support.Support`, ``(F,)``).
 
     Vertices are (easting, northing, height) in metres in the CRS that a comment of the header names;
     ``origin`` there is the tile's whole-metre origin, a good shift for programs that compute in float32.

@@ -1,8 +1,8 @@
 """Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
 
 The heights and weights of a fixed grid of control points, from the DTM. The paper's way is Adam on
-`tasks.objective`; with unit weights the problem is convex and `tasks.irls` solves it. The surface is
-`tasks.nurbs`. docs/fit.md compares the choices.
+`tasks.spline.objective`; with unit weights the problem is convex and `tasks.spline.irls` solves it. The
+surface is `tasks.spline.surface`. docs/fit.md compares the choices.
 """
 
 from __future__ import annotations
@@ -16,21 +16,18 @@ from pydantic import Field, model_validator
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import adam, autograd, irls
-from flexroad.tasks.bending import plate
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.nurbs import NurbsSurface, clamped_knots, greville
-from flexroad.tasks.objective import Objective, objective
+from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
 from flexroad.tasks.options import Options as BaseOptions
-from flexroad.tasks.planes import least_squares_plane
-from flexroad.tasks.stiffness import stiffest
-from flexroad.tasks.support import without_unsound
+from flexroad.tasks.roads.dtm_validity import without_unsound
+from flexroad.tasks.spline import adam, irls, torch_engine
+from flexroad.tasks.spline.cross_validation import stiffest
+from flexroad.tasks.spline.objective import Objective, objective
+from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface, clamped_knots, greville
+from flexroad.tasks.spline.thin_plate import plate
 from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
 
 VERSION = 1
-
-MAX_LOG_WEIGHT = math.log(10)
-"""Bound on abs(ln w): without it Adam reaches negative weights, that is poles, on real streets."""
 
 Space = tuple[Floats, Floats, tuple[int, int]]
 """Knots along easting and northing, degrees along both."""
@@ -147,7 +144,7 @@ def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Flo
         options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
     )
     if options.engine == "torch":
-        (z, rho), _ = autograd.minimise(loss, variables, limit, schedule, options.device)
+        (z, rho), _ = torch_engine.minimise(loss, variables, limit, schedule, options.device)
     else:
         (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
     return z, np.exp(rho)

@@ -9,8 +9,8 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
 from flexroad.tasks.options import Options as BaseOptions
-from flexroad.tasks.planes import least_squares_plane
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1

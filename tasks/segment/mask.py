@@ -6,7 +6,7 @@ from typing import Literal
 
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.survey import outside
+from flexroad.tasks.roads.extent import outside
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1

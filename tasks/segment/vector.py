@@ -6,17 +6,17 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexroad.tasks import road_vectors
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.hygiene import NOTHING, Hygiene, clean
-from flexroad.tasks.survey import outside
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene, clean
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
 READS = ("roads",)
 
 
-class Options(road_vectors.Options):
+class Options(rasterise.Options):
     """Which features are roads, how wide they are, and how the mask is tidied."""
 
     method: Literal["vector"] = "vector"
@@ -31,8 +31,8 @@ def segment(data: TileData, options: Options) -> RoadMask:
     TaskError
         If the tile has no vectors, they cannot be used, or none of its cells is road.
     """
-    found = road_vectors.roads(data.roads, data.grid, options)
-    burnt = road_vectors.cells(found.areas, data.grid)
+    found = rasterise.roads(data.roads, data.grid, options)
+    burnt = rasterise.cells(found.areas, data.grid)
     mask = clean(burnt, data, options.hygiene)
     if not mask[data.grid.window(data.core)].any():
         files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
@@ -46,6 +46,6 @@ def segment(data: TileData, options: Options) -> RoadMask:
         core=data.core,
         mask=mask,
         outside=outside(data),
-        bridge=road_vectors.cells(found.areas[found.bridge], data.grid) & mask,
+        bridge=rasterise.cells(found.areas[found.bridge], data.grid) & mask,
         notes=found.notes,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexroad.tasks.acquire.mesh import TexturedMesh
+from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 
 
 def encode(mesh: TexturedMesh) -> bytes:

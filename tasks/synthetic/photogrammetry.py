@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.mesh import TexturedMesh
+from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 from flexroad.tasks.synthetic.dsc3d import Place
 from flexroad.tasks.synthetic.noise import generator
 from flexroad.tasks.synthetic.orthophoto import orthophoto

@@ -20,9 +20,12 @@ from flexroad.pipeline.graph import tile_graph
 from flexroad.pipeline.pull import Pull
 from flexroad.pipeline.store import Store
 from flexroad.pipeline.synthesis import write_scenes
-from flexroad.tasks import adam, ecsrc, evaluate, sample
+from flexroad.tasks import sample
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs as fit
-from flexroad.tasks.nurbs import NurbsSurface, basis_matrix
+from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.spline import adam
+from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
 TILES, SEED = 24, 1
@@ -81,7 +84,7 @@ def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) ->
     space = fit.spline_space(data.grid, options)
     heights, datum = fit.start_heights(data, clusters.mask, space, options.terrain)
     loss = fit.objective_of(data, clusters.mask, space, datum, options)
-    limit = np.array([np.inf, fit.MAX_LOG_WEIGHT])[:, None, None]
+    limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]
     schedule = adam.Schedule(
         options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
     )

@@ -15,8 +15,10 @@ import numpy as np
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.standin import write_stand_in
-from flexroad.tasks import ecsrc, evaluate, load, sample
+from flexroad.tasks import load, sample
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import plane, raster
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.segment import mask
 from flexroad.tasks.synthetic.dsc3d import SITES
 

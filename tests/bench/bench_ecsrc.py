@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.ecsrc import Options, ecsrc
+from flexroad.tasks.filter.ecsrc import Options, ecsrc
 from flexroad.tasks.types import RoadMask, TileData
 
 SIZE, SHARE = 250, 0.2

@@ -2,8 +2,8 @@
 
 ``PYTHONPATH=. python tests/bench/bench_filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
 number; with a second word, the file of that page's figure is drawn instead. The default options of
-`tasks.grounded` were chosen on seeds 5 to 7; here is seed 1. With FLEXROAD_REAL_DATA two real towns follow,
-with their canopies laid over the surface model.
+`tasks.filter.planar` were chosen on seeds 5 to 7; here is seed 1. With FLEXROAD_REAL_DATA two real towns
+follow, with their canopies laid over the surface model.
 
 A cell is sound if the surface model shows the ground, with noise, or is within `SOUND_M` of it.
 """
@@ -26,8 +26,10 @@ from scipy.interpolate import griddata
 from scipy.ndimage import binary_dilation, label
 
 from flexroad.catalog import Grid
-from flexroad.tasks import ecsrc, evaluate, grounded, sample
+from flexroad.tasks import sample
+from flexroad.tasks.filter import ecsrc, planar
 from flexroad.tasks.fit import nurbs
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.synthetic import Scene, gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
@@ -82,10 +84,10 @@ def of(module, options) -> Filter:
 
 
 FILTERS: dict[str, Filter] = {
-    "off": of(ecsrc, ecsrc.Options(variant="off")),
+    "off": of(ecsrc, ecsrc.Options(method="off")),
     "paper": of(ecsrc, ecsrc.Options(keep_largest=None)),
     "two lines": two_lines,
-    "grounded": of(grounded, grounded.Options()),
+    "planar": of(planar, planar.Options()),
 }
 
 
@@ -188,7 +190,7 @@ def picture(cases: Sequence[Case], path: Path) -> None:
     axes[0].set_title("DSM over DTM (m)")
     axes[0].contour(mask, levels=[0.5], colors="white", linewidths=0.6)
     figure.colorbar(up, ax=axes[0], shrink=0.8)
-    for axis, name in zip(axes[1:], ("paper", "two lines", "grounded"), strict=True):
+    for axis, name in zip(axes[1:], ("paper", "two lines", "planar"), strict=True):
         keeps = FILTERS[name](data, case.road).mask[window]
         shown = np.select([~mask, keeps & sound[window], keeps, sound[window]], [0, 2, 4, 1], 3)
         axis.imshow(shown, cmap=ListedColormap(colours), vmin=0, vmax=4, interpolation="nearest")

@@ -15,10 +15,10 @@ from collections.abc import Callable
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import adam
 from flexroad.tasks.fit import nurbs
-from flexroad.tasks.nurbs import basis_matrix
-from flexroad.tasks.objective import NEIGHBOURS, Objective
+from flexroad.tasks.spline import adam
+from flexroad.tasks.spline.objective import NEIGHBOURS, Objective
+from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
 SIZE, ITERATIONS, SAMPLED = 250, 200, 2
@@ -152,7 +152,7 @@ def main() -> None:
     heights, datum = nurbs.start_heights(data, clusters.mask, space, True)
     objective = nurbs.objective_of(data, clusters.mask, space, datum, OPTIONS)
     start = np.stack([heights - datum, np.zeros_like(heights)])
-    limit = np.array([np.inf, nurbs.MAX_LOG_WEIGHT])[:, None, None]
+    limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]
     dense, by_point = Dense(objective, space), PointByPoint(objective, space)
     # Off the start, where the heights of neighbours are all different.
     somewhere = start + np.random.default_rng(1).normal(0, 0.2, start.shape)

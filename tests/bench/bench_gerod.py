@@ -13,8 +13,10 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import ecsrc, evaluate, sample
+from flexroad.tasks import sample
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import plane, raster
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 from flexroad.tasks.synthetic.gerod import survey
 from flexroad.tasks.types import RoadMask, TileData

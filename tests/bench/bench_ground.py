@@ -21,7 +21,7 @@ import laspy
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from flexroad.tasks.acquire.ground import Options, ground, ground_cells
+from flexroad.tasks.acquire.points.ground_filter import Options, ground, ground_cells
 from flexroad.tasks.synthetic import Scene, gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import Bools, Floats

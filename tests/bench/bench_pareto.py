@@ -27,8 +27,10 @@ from scipy.ndimage import label
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.synthesis import write_scenes
-from flexroad.tasks import ecsrc, evaluate, load, sample
+from flexroad.tasks import load, sample
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.segment import mask
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, TileData
 

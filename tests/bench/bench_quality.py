@@ -13,11 +13,11 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter, label
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import ecsrc
-from flexroad.tasks.assess import Options, assess
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs
-from flexroad.tasks.nurbs import NurbsSurface
-from flexroad.tasks.support import unsound, without_unsound
+from flexroad.tasks.quality.assess import Options, assess
+from flexroad.tasks.roads.dtm_validity import unsound, without_unsound
+from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.synthetic.gerod import survey
 from flexroad.tasks.synthetic.spoilers import Kind

@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points import Options, rasterise, reach_m
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m
 from flexroad.tasks.acquire.types import Points
 
 POINTS = 4_000_000

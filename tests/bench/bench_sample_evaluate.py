@@ -9,10 +9,12 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 from scipy.spatial import Delaunay
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import ecsrc, evaluate, sample
-from flexroad.tasks.drape import drape
+from flexroad.tasks import sample
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs, raster
-from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.metrics.dihedral import mean_angles
+from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.synthetic.scene import make_scene
 from flexroad.tasks.types import Mesh, RoadMask, TileData
 

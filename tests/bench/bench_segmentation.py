@@ -23,17 +23,19 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.points import prepare_points
-from flexroad.tasks import load, road_vectors
-from flexroad.tasks.acquire import points
+from flexroad.tasks import load
+from flexroad.tasks.acquire.points import to_rasters
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.hygiene import NOTHING, Hygiene
-from flexroad.tasks.photo import read_photo
-from flexroad.tasks.pixel_features import features, look
-from flexroad.tasks.pixel_model import read_model
-from flexroad.tasks.segment import pixels, vector
-from flexroad.tasks.survey import outside
-from flexroad.tasks.training import pixels as training
-from flexroad.tasks.training.types import Sample
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene
+from flexroad.tasks.segment import vector
+from flexroad.tasks.segment.pixels import segment
+from flexroad.tasks.segment.pixels import train as training
+from flexroad.tasks.segment.pixels.features import features, look
+from flexroad.tasks.segment.pixels.model import read_model
+from flexroad.tasks.segment.training_types import Sample
 from flexroad.tasks.types import Bools, Source, TileData
 
 HALO_M = 60.0
@@ -94,7 +96,7 @@ def autzen(home: Path, scratch: Path) -> Iterator[Case]:
         [home / "autzen_north.laz"],
         scratch,
         Asked(crs="EPSG:2994"),
-        points.Options(),
+        to_rasters.Options(),
         SerialExecutor(),
         lambda _: None,
     )
@@ -106,10 +108,10 @@ def autzen(home: Path, scratch: Path) -> Iterator[Case]:
 
 def case(data: TileData) -> Case:
     def areas(where: str) -> Bools:
-        asked = road_vectors.Options(
+        asked = rasterise.Options(
             layer="road_polygons", where=f"({where}) AND visible_in <> 'rgb'", left_out=()
         )
-        return road_vectors.burn(data, asked)
+        return rasterise.burn(data, asked)
 
     road, unsure = areas(SURE), areas("certainty = 'low'")
     scored = np.zeros(data.grid.shape, bool)
@@ -158,7 +160,7 @@ def plain(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
 def lines(cases: Sequence[Case], width: float | None = None) -> Maps:
     one = {} if width is None else {"width_columns": (), "class_columns": (), "default_width_m": width}
     options = vector.Options(layer="road_centerlines", where=SURE, **one)
-    return [road_vectors.burn(case.data, options) for case in cases]
+    return [rasterise.burn(case.data, options) for case in cases]
 
 
 def one_width(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
@@ -180,7 +182,7 @@ def learnt(
     model = scratch / f"model{made.suffix}"
     model.write_bytes(made.model)
     about = read_model(model).about
-    found = [mask(case.data, pixels.Options(model=model, hygiene=hygiene)) for case in score]
+    found = [mask(case.data, segment.Options(model=model, hygiene=hygiene)) for case in score]
     ended = time.perf_counter()
     print(
         f"  {len(made.history)} rounds, {len(made.model) / 1e6:.1f} MB, threshold {about.threshold:.2f}, "
@@ -190,9 +192,9 @@ def learnt(
     return found
 
 
-def mask(data: TileData, options: pixels.Options) -> Bools:
+def mask(data: TileData, options: segment.Options) -> Bools:
     try:
-        return pixels.segment(data, options).mask
+        return segment.segment(data, options).mask
     except TaskError:
         return np.zeros(data.grid.shape, bool)
 

@@ -17,10 +17,10 @@ from collections.abc import Callable
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import adam, irls
-from flexroad.tasks.bending import Plate, plate
 from flexroad.tasks.fit import nurbs
-from flexroad.tasks.objective import Objective
+from flexroad.tasks.spline import adam, irls
+from flexroad.tasks.spline.objective import Objective
+from flexroad.tasks.spline.thin_plate import Plate, plate
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 SIZE, ITERATIONS, ROUNDS = 250, 200, 5

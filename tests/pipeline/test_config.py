@@ -5,7 +5,7 @@ import yaml
 
 from flexroad.pipeline.config import compose, load_config, schema, shipped, template
 from flexroad.pipeline.errors import ConfigError
-from flexroad.tasks import grounded
+from flexroad.tasks.filter import planar
 
 
 def test_every_shipped_configuration_is_valid():
@@ -50,9 +50,9 @@ def test_extends(tmp_path):
 
 def test_another_filter_starts_from_its_own_defaults(tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text("extends: paper\necsrc: grounded\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
+    path.write_text("extends: paper\necsrc: planar\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
     chains = load_config(path).chains
-    assert chains["flexroad"]["ecsrc"] == grounded.Options()
+    assert chains["flexroad"]["ecsrc"] == planar.Options()
     assert chains["bare"]["ecsrc"] == load_config("ablation").chains["wo_ecsrc"]["ecsrc"]
 
 
@@ -64,7 +64,7 @@ def test_another_filter_starts_from_its_own_defaults(tmp_path):
         ({"segment": {"method": "vector", "wher": ""}}, "x: segment.wher: unknown key; did you mean where?"),
         ({"fit": {"degre": 2}}, "x: fit.degre: unknown key; did you mean degree?"),
         ({"ecsrc": {"theta_z_m": -1}}, "x: ecsrc.theta_z_m: input should be greater than"),
-        ({"ecsrc": {"variant": "grounded", "bend": 0}}, "x: ecsrc.bend: input should be greater than"),
+        ({"ecsrc": {"method": "planar", "bend": 0}}, "x: ecsrc.bend: input should be greater than"),
         ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),
         ({"fit": "nurb"}, "x: fit: "),
         ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),

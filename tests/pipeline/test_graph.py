@@ -12,7 +12,7 @@ import pytest
 from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.config import compose, load_config
 from flexroad.pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, stage_version, tile_graph
-from flexroad.tasks import ecsrc
+from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.segment import mask
 
 PAPER = {

@@ -25,9 +25,9 @@ from flexroad.pipeline.run import Run, execute
 from flexroad.pipeline.summary import read_summary, summary
 from flexroad.pipeline.tables import read_metrics
 from flexroad.tasks import TaskError
-from flexroad.tasks.photo import read_photo
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.io.vectors import Asked, near
 from flexroad.tasks.types import Source
-from flexroad.tasks.vector_files import Asked, near
 from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
 from tests.s3_server import Fault

@@ -10,8 +10,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
-from flexroad.tasks.acquire.mesh import tops
-from flexroad.tasks.acquire.mesh_files import read_mesh
+from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tasks.acquire.mesh.sample import tops
 from flexroad.tasks.errors import TaskError
 
 CRS = "EPSG:32617"

@@ -12,17 +12,20 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.photos import PhotosAsked, _resolved, prepare_photos
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire import dense, photogrammetry, points
+from flexroad.tasks.acquire.photos import mvs_cpu, sfm
+from flexroad.tasks.acquire.points import to_rasters
 from tests import make_photos
 
 ASKED = PhotosAsked(
-    sfm=photogrammetry.Options(image_size=640, features=1500, threads=2, calibrate="held"),
-    stereo=dense.Options(size=480, partners=3),
+    sfm=sfm.Options(image_size=640, features=1500, threads=2, calibrate="held"),
+    stereo=mvs_cpu.Options(size=480, partners=3),
 )
 
 
 def prepare(images, out, asked, say=lambda line: None):
-    return prepare_photos(images, out, asked, ASKED, points.Options(ground="filter"), SerialExecutor(), say)
+    return prepare_photos(
+        images, out, asked, ASKED, to_rasters.Options(ground="filter"), SerialExecutor(), say
+    )
 
 
 def test_photographs_become_the_rasters_of_the_hill(tmp_path):

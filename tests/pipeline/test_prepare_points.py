@@ -13,7 +13,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare import points, spool
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.points import prepare_points
-from flexroad.tasks.acquire.points import Options
+from flexroad.tasks.acquire.points.to_rasters import Options
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.load import load
 from tests.make_clouds import write_cloud

@@ -8,7 +8,7 @@ from rio_cogeo.cogeo import cog_validate
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.sheet import Sheet
-from flexroad.tasks.acquire.types import Photo
+from flexroad.tasks.types import Photo
 
 CRS = "EPSG:25832"
 FACTS = {"SOURCE": "made", "DTM": "a slope"}

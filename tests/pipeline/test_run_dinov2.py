@@ -14,9 +14,9 @@ from flexroad.pipeline.run import Run, execute
 from flexroad.pipeline.synthesis import write_scenes
 from flexroad.pipeline.tables import read_metrics
 from flexroad.tasks import load
-from flexroad.tasks.dinov2_head import Head, read_head
-from flexroad.tasks.training import dinov2 as training
-from flexroad.tasks.training.types import Sample
+from flexroad.tasks.segment.dinov2 import train as training
+from flexroad.tasks.segment.dinov2.head import Head, read_head
+from flexroad.tasks.segment.training_types import Sample
 from tests.conftest import QUICK
 from tests.make_backbone import save_backbone
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog
+from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline import codec
 from flexroad.pipeline.config import compose

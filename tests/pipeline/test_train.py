@@ -15,9 +15,10 @@ from flexroad.pipeline.run import Run, check_models
 from flexroad.pipeline.split import inside, split
 from flexroad.pipeline.synthesis import write_scenes
 from flexroad.pipeline.train import Asked, Ground, Samples, train
-from flexroad.tasks import load, road_vectors
-from flexroad.tasks.hygiene import NOTHING
-from flexroad.tasks.segment import pixels
+from flexroad.tasks import load
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.segment.pixels import segment
 from tests.pipeline.test_cli import flexroad
 
 QUICK = ("--set", "rounds=15", "--set", "cells=2000")
@@ -54,10 +55,10 @@ def spoilt(catalog, **layers):
 def test_the_report_tells_what_the_segmenter_does_on_the_judged_tiles(land, trained):
     model, told = trained
     right = wrong = missed = 0
-    options = pixels.Options(model=model, hygiene=NOTHING)
+    options = segment.Options(model=model, hygiene=NOTHING)
     for tile in Catalog.read(land).select(told["asked"]["judged by"]).tiles:
         data = load.load(tile, load.Options())
-        found = pixels.segment(data, options).mask
+        found = segment.segment(data, options).mask
         right += (found & data.reference_road).sum()
         wrong += (found & ~data.reference_road).sum()
         missed += (~found & data.reference_road).sum()
@@ -87,14 +88,14 @@ def test_the_page_stands_alone_and_shows_tiles(trained):
 def test_the_model_runs_by_one_line_of_the_configuration(land, trained, quick_config, tmp_path):
     model, _ = trained
     quick = yaml.safe_load(quick_config.read_text()) | {"segment": {"method": "pixels", "model": str(model)}}
-    config = tmp_path / "pixels.yaml"
+    config = tmp_path / "segment.yaml"
     config.write_text(yaml.safe_dump(quick))
     words = ("--config", config, "--catalog", land, "--out", tmp_path / "run", "--executor", "serial")
     assert "4 done" in flexroad("run", *words)
 
 
 def test_cells_to_learn_from_keep_off_edges_and_off_the_judged_tiles(land):
-    ground = Ground(Asked("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), road_vectors.DEFAULTS)
+    ground = Ground(Asked("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS)
     catalog = Catalog.read(land)
     pieces = [piece for tile in catalog.tiles for piece in ground.pieces(tile, [tile.grid.bounds])]
     sides = split(pieces, 0.3, 30.0, 0)
@@ -129,7 +130,7 @@ def test_labels_may_be_vectors(land, tmp_path):
     )
     bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
     drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))))
-    ground = Ground(Asked("pixels", "vector"), load.Options(), road_vectors.DEFAULTS)
+    ground = Ground(Asked("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
     _, road = ground.labelled(drawn)
     assert road[-30:-20].all()
     assert road.sum() == 10 * tile.grid.width
@@ -156,7 +157,7 @@ def test_a_missing_model_stops_a_run_before_it_begins(land, tmp_path, quick_conf
     quick = yaml.safe_load(quick_config.read_text()) | {
         "segment": {"method": "pixels", "model": "gone.skops"}
     }
-    config = tmp_path / "pixels.yaml"
+    config = tmp_path / "segment.yaml"
     config.write_text(yaml.safe_dump(quick))
     with pytest.raises(ConfigError, match=r"gone.skops does not exist; make it with `flexroad train CATALOG"):
         check_models(load_config(config))

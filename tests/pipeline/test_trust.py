@@ -12,7 +12,7 @@ from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.trust import most_doubtful, over_tiles
 from flexroad.pipeline.run import Run, execute
 from flexroad.pipeline.tables import COLUMNS, metrics_frame, read_metrics
-from flexroad.tasks.support import Support
+from flexroad.tasks.quality.support import Support
 
 
 def rows(doubts, flags=()) -> pd.DataFrame:

@@ -9,7 +9,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.photos import PhotosAsked, prepare_photos
-from flexroad.tasks.acquire import dense, photogrammetry, points
+from flexroad.tasks.acquire.photos import mvs_cpu, sfm
+from flexroad.tasks.acquire.points import to_rasters
 
 pytestmark = pytest.mark.real
 
@@ -23,11 +24,11 @@ def published(real_data, tmp_path_factory):
         tmp_path_factory.mktemp("brighton"),
         Asked(cell_m=0.5),
         PhotosAsked(
-            sfm=photogrammetry.Options(image_size=1400, features=4096, threads=2, calibrate="held"),
-            stereo=dense.Options(size=800, partners=3),
+            sfm=sfm.Options(image_size=1400, features=4096, threads=2, calibrate="held"),
+            stereo=mvs_cpu.Options(size=800, partners=3),
             refine=False,
         ),
-        points.Options(ground="filter", fill_m=0),
+        to_rasters.Options(ground="filter", fill_m=0),
         SerialExecutor(),
         lambda line: None,
     )

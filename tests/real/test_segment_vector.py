@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.tasks.road_vectors import Options, burn
+from flexroad.tasks.roads.rasterise import Options, burn
 from flexroad.tasks.segment import vector
 from flexroad.tasks.types import Source, TileData
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper, line by line, with Python's sets: what `tasks.ecsrc` must agree with."""
+"""Algorithm 1 of the paper, line by line, with Python's sets: what `tasks.filter.ecsrc` must agree with."""
 
 import math
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import chisquare
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire import mesh as acquire
-from flexroad.tasks.acquire.mesh import TexturedMesh, cover, orthophoto, sample, tops
+from flexroad.tasks.acquire.mesh import sample as acquire
+from flexroad.tasks.acquire.mesh.sample import TexturedMesh, cover, orthophoto, sample, tops
 
 CRS = "EPSG:25832"
 EAST, NORTH = 552_208.0, 4_114_742.0

@@ -8,8 +8,8 @@ import trimesh
 from PIL import Image
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.mesh import orthophoto
-from flexroad.tasks.acquire.mesh_files import read_mesh
+from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tasks.acquire.mesh.sample import orthophoto
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import glb
 from flexroad.tasks.types import Mesh

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire import ground as slope_filter
-from flexroad.tasks.acquire.points import Options, facts, rasterise, reach_m
+from flexroad.tasks.acquire.points import ground_filter as slope_filter
+from flexroad.tasks.acquire.points.to_rasters import Options, facts, rasterise, reach_m
 from flexroad.tasks.acquire.types import Points, Rasters
 
 NO_CLASS, GROUND, TREE, HOUSE, DECK = 0, 2, 5, 6, 17

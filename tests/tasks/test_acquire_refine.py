@@ -3,7 +3,7 @@
 import numpy as np
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.refine import reference, refine
+from flexroad.tasks.acquire.mesh.reference import reference, refine
 
 CRS = "EPSG:25832"
 N = 60

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.tin import tin
+from flexroad.tasks.acquire.points.tin import tin
 
 CELL = 0.5
 

@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.topcolour import photo
+from flexroad.tasks.acquire.points.orthophoto import photo
 from flexroad.tasks.acquire.types import Points
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 6, 5)

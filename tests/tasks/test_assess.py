@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.assess import NO_ROAD, Options, assess
 from flexroad.tasks.fit import nurbs, plane
-from flexroad.tasks.nurbs import NurbsSurface
-from flexroad.tasks.support import Support
+from flexroad.tasks.quality.assess import NO_ROAD, Options, assess
+from flexroad.tasks.quality.support import Support
+from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Quality, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 120, 100)

@@ -10,14 +10,22 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog, Grid
-from flexroad.tasks import TaskError, load, registration
-from flexroad.tasks.dinov2 import MEAN, STD, load_backbone, normalised
-from flexroad.tasks.dinov2_head import Head, check, predictor, read_head
-from flexroad.tasks.hygiene import NOTHING
-from flexroad.tasks.segment.dinov2 import Options, files, segment
-from flexroad.tasks.token_regression import THRESHOLDS, Labels, Line, Windows, at_cells, best_threshold
-from flexroad.tasks.training import dinov2 as training
-from flexroad.tasks.training.types import Sample
+from flexroad.tasks import TaskError, load
+from flexroad.tasks.roads import coregistration
+from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.segment.dinov2 import train as training
+from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
+from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
+from flexroad.tasks.segment.dinov2.regression import (
+    THRESHOLDS,
+    Labels,
+    Line,
+    Windows,
+    at_cells,
+    best_threshold,
+)
+from flexroad.tasks.segment.dinov2.segment import Options, files, segment
+from flexroad.tasks.segment.training_types import Sample
 from flexroad.tasks.types import TileData
 from tests.make_backbone import save_backbone
 
@@ -94,7 +102,7 @@ def test_half_precision_is_close_and_no_more(backbones, heads, sample):
 
 
 def test_a_photo_is_normalised_and_the_unknown_is_grey(sample):
-    from flexroad.tasks.photo import read_photo
+    from flexroad.tasks.io.orthophoto import read_photo
 
     photo = read_photo(sample.data.dop, sample.data.grid.buffered(10))
     seen = normalised(photo)
@@ -265,7 +273,7 @@ def test_where_the_photo_ends_there_is_no_road(heads, sample):
 def test_a_photo_off_the_heights_is_told_of(heads, sample, monkeypatch):
     """Whether it is, is for tests/tasks/test_registration.py: tiles this small cannot tell."""
     assert found(sample.data, heads[0]).notes == ()
-    monkeypatch.setattr(registration, "note", lambda data, photo: f"{data.tile_id}: {photo.grid.cell:g} m")
+    monkeypatch.setattr(coregistration, "note", lambda data, photo: f"{data.tile_id}: {photo.grid.cell:g} m")
     (note,) = found(sample.data, heads[0]).notes
     assert note == f"{sample.data.tile_id}: {read_head(heads[0]).about.gsd_m:g} m"
 
@@ -395,7 +403,7 @@ def test_no_gpu_is_one_line(backbones, monkeypatch):
 
 def test_naming_the_method_imports_nothing_heavy():
     heavy = ["torch", "transformers", "safetensors", "huggingface_hub"]
-    code = "import sys, flexroad.tasks.segment.dinov2, flexroad.tasks.training.dinov2;"
+    code = "import sys, flexroad.tasks.segment.dinov2.segment, flexroad.tasks.segment.dinov2.train;"
     code += f"print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

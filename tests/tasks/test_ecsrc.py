@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as arrays
 from scipy.ndimage import gaussian_filter
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.ecsrc import Options, ecsrc
+from flexroad.tasks.filter.ecsrc import Options, ecsrc
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 
@@ -149,7 +149,7 @@ def test_of_equal_clusters_the_first_is_kept():
 def test_off_keeps_every_road_cell_with_a_height():
     mask, dsm = streets(np.random.default_rng(0))
     dsm[::7] = np.nan
-    found = cluster(mask, dsm, Options(variant="off"))
+    found = cluster(mask, dsm, Options(method="off"))
     np.testing.assert_array_equal(found.labels, mask & ~np.isnan(dsm))
     assert found.labels.dtype == np.int32
 

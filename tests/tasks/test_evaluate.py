@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.drape import drape
-from flexroad.tasks.evaluate import Options, evaluate
-from flexroad.tasks.mad import mean_angles
-from flexroad.tasks.nearest import nearest
+from flexroad.tasks.metrics.dihedral import mean_angles
+from flexroad.tasks.metrics.evaluate import Options, evaluate
+from flexroad.tasks.metrics.point_to_mesh import nearest
+from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Mesh, Metrics, RoadMask, TileData
 
 

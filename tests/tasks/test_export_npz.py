@@ -7,7 +7,7 @@ from scipy.interpolate import bisplev
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
-from flexroad.tasks.nurbs import NurbsSurface, clamped_knots
+from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots
 
 WEST, SOUTH = 295500.5, 5629250.5
 

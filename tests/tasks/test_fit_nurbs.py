@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import adam, autograd
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import nurbs
-from flexroad.tasks.nurbs import clamped_knots
-from flexroad.tasks.objective import objective
+from flexroad.tasks.spline import adam, torch_engine
+from flexroad.tasks.spline.objective import objective
+from flexroad.tasks.spline.surface import clamped_knots
 from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0
@@ -89,7 +89,7 @@ def test_loss_is_the_papers():
 def test_gradient_equals_autograd(degree, free):
     written, at = random_objective(degree, free)
     loss, gradient = written(at)
-    torch_objective = autograd.TorchObjective(written, at.shape[1:], "cpu")
+    torch_objective = torch_engine.TorchObjective(written, at.shape[1:], "cpu")
     variables = torch_objective.tensor(at).requires_grad_()
     peer = torch_objective(variables)
     peer.backward()
@@ -147,7 +147,7 @@ def test_the_best_of_the_way_is_returned(engine):
     written, at = random_objective()
     limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20)
     if engine == "torch":
-        best, losses = autograd.minimise(written, at, limit, schedule, "cpu")
+        best, losses = torch_engine.minimise(written, at, limit, schedule, "cpu")
     else:
         best, losses = adam.minimise(written, at, limit, schedule)
     assert len(losses) == 21

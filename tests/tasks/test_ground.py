@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire.ground import Options, ground, ground_cells
+from flexroad.tasks.acquire.points.ground_filter import Options, ground, ground_cells
 
 
 def _oracle():

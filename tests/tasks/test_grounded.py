@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.flat_patches import flat_patches
-from flexroad.tasks.grounded import VERSION, Options, ecsrc
-from flexroad.tasks.local_plane import OFF, ON, against_known
+from flexroad.tasks.filter.kit.ground_consistency import OFF, ON, against_known
+from flexroad.tasks.filter.kit.planar_patches import flat_patches
+from flexroad.tasks.filter.planar import VERSION, Options, ecsrc
 from flexroad.tasks.synthetic import gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import RoadMask, TileData

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.hygiene import NOTHING, Hygiene, clean, close, drop, fill, within
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene, clean, close, drop, fill, within
 from flexroad.tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))

@@ -10,14 +10,14 @@ from pydantic import ValidationError
 from scipy.optimize import linprog
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import adam, irls
-from flexroad.tasks.bending import plate
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import nurbs
-from flexroad.tasks.normal import band, factor, gram, pairs, solve
-from flexroad.tasks.nurbs import basis_matrix, clamped_knots
-from flexroad.tasks.objective import NEIGHBOURS, objective, range_term
-from flexroad.tasks.soft_range import add_soft_range
+from flexroad.tasks.spline import adam, irls
+from flexroad.tasks.spline.normal_equations import band, factor, gram, pairs, solve
+from flexroad.tasks.spline.objective import NEIGHBOURS, objective, range_term
+from flexroad.tasks.spline.smooth_range import add_soft_range
+from flexroad.tasks.spline.surface import basis_matrix, clamped_knots
+from flexroad.tasks.spline.thin_plate import plate
 from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0

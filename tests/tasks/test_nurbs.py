@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from flexroad.tasks.nurbs import NurbsSurface, basis, basis_matrix, clamped_knots, exact, greville
+from flexroad.tasks.spline.surface import NurbsSurface, basis, basis_matrix, clamped_knots, exact, greville
 from flexroad.tasks.types import Surface
 
 BOUNDS = (295500.5, 5629250.5, 295749.5, 5629399.5)

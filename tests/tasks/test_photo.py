@@ -7,7 +7,7 @@ from rasterio.warp import transform_bounds
 
 from flexroad.catalog import Grid
 from flexroad.tasks import TaskError
-from flexroad.tasks.photo import read_photo
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.types import Source
 
 UTM = "EPSG:25832"

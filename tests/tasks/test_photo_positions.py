@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 from pyproj import Transformer
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire.photo_positions import place, read_control, read_shot
+from flexroad.tasks.acquire.photos.exif import place, read_control, read_shot
 from tests import make_photos
 
 XMP = (

@@ -8,14 +8,14 @@ import pytest
 from PIL import Image
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire import dense, patchmatch
-from flexroad.tasks.acquire.photo_positions import Control, place, read_shot
-from flexroad.tasks.acquire.photogrammetry import Options, reconstruct
-from flexroad.tasks.acquire.poisson import poisson, write_ply
+from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu
+from flexroad.tasks.acquire.photos.exif import Control, place, read_shot
+from flexroad.tasks.acquire.photos.poisson import poisson, write_ply
+from flexroad.tasks.acquire.photos.sfm import Options, reconstruct
 from tests import make_photos
 
 QUICK = Options(image_size=640, features=2500, threads=2)
-STEREO = dense.Options(size=480, partners=3)
+STEREO = mvs_cpu.Options(size=480, partners=3)
 SPACING = 0.3
 
 
@@ -38,9 +38,9 @@ def found(placed, tmp_path_factory):
 def cloud(found):
     clouds = []
     for number, view in enumerate(found.views):
-        others = [found.views[other] for other in dense.partners(found, number, STEREO)]
-        clouds.append(dense.photo_cloud(view, others, found.points[view.seen], STEREO))
-    return dense.merge(clouds, SPACING)
+        others = [found.views[other] for other in mvs_cpu.partners(found, number, STEREO)]
+        clouds.append(mvs_cpu.photo_cloud(view, others, found.points[view.seen], STEREO))
+    return mvs_cpu.merge(clouds, SPACING)
 
 
 def centres_off(found, made):
@@ -124,18 +124,18 @@ def test_the_mesh_is_the_hill_and_ends_with_the_points(found, cloud, tmp_path):
 
 def test_a_cloud_that_colmap_writes_is_read_back(cloud, tmp_path):
     write_ply(tmp_path / "cloud.ply", cloud)
-    again = patchmatch.read_ply(tmp_path / "cloud.ply")
+    again = mvs_gpu.read_ply(tmp_path / "cloud.ply")
     np.testing.assert_allclose(again.points, cloud.points, atol=1e-5)
     np.testing.assert_array_equal(again.colours, cloud.colours)
 
 
 def test_merging_is_the_mean_of_each_cube():
-    one = dense.Cloud(
+    one = mvs_cpu.Cloud(
         np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.2, 0, 0]]),
         np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0]]),
         np.array([[10, 0, 0], [20, 0, 0], [0, 0, 9]], np.uint8),
     )
-    merged = dense.merge([one, one], 0.5)
+    merged = mvs_cpu.merge([one, one], 0.5)
     np.testing.assert_allclose(merged.points, [[-0.2, 0, 0], [0.2, 0.1, 0.1]])
     np.testing.assert_allclose(merged.normals, [[1, 0, 0], [0, 0, 1]])
     np.testing.assert_array_equal(merged.colours, [[0, 0, 9], [15, 0, 0]])

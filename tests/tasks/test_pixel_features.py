@@ -3,9 +3,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from flexroad.catalog import Grid
-from flexroad.tasks.acquire.types import Photo
-from flexroad.tasks.pixel_features import CUT, REACH_M, features, mean
-from flexroad.tasks.types import TileData
+from flexroad.tasks.segment.pixels.features import CUT, REACH_M, features, mean
+from flexroad.tasks.types import Photo, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 rng = np.random.default_rng(0)

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.tasks.acquire.types import Photo
-from flexroad.tasks.registration import note, pair, shift
+from flexroad.tasks.roads.coregistration import note, pair, shift
 from flexroad.tasks.synthetic import block, make_scene
 from flexroad.tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
-from flexroad.tasks.types import TileData
+from flexroad.tasks.types import Photo, TileData
 
 GSD = 0.5
 

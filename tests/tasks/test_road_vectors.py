@@ -12,8 +12,9 @@ from shapely import GeometryCollection, LineString, MultiLineString, Point, box
 
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import transformer
-from flexroad.tasks import TaskError, vector_files
-from flexroad.tasks.road_vectors import Options, burn, cells, roads
+from flexroad.tasks import TaskError
+from flexroad.tasks.io import vectors
+from flexroad.tasks.roads.rasterise import Options, burn, cells, roads
 from tests.make_roads import GRID, on_grid, tile, write, write_osm
 
 WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
@@ -201,8 +202,8 @@ def test_nodes_in_any_order_and_pbf():
 def readings(monkeypatch):
     """Counts how often files are read."""
     count = []
-    read = vector_files._read
-    monkeypatch.setattr(vector_files, "_read", lambda *given: count.append(1) or read(*given))
+    read = vectors._read
+    monkeypatch.setattr(vectors, "_read", lambda *given: count.append(1) or read(*given))
     return count
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from flexroad.tasks.road_widths import Options, metres, widths
+from flexroad.tasks.roads.widths import Options, metres, widths
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from hypothesis.extra.numpy import arrays
 
 from flexroad.catalog import Grid
 from flexroad.tasks import TaskError
+from flexroad.tasks.roads.extent import outside
 from flexroad.tasks.segment.mask import Options, segment
-from flexroad.tasks.survey import outside
 from flexroad.tasks.types import TileData
 
 CORE = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 8, 6)

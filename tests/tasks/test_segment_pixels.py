@@ -9,14 +9,14 @@ from rasterio.transform import from_origin
 from skops.io import dumps, loads
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.hygiene import NOTHING
-from flexroad.tasks.pixel_model import TRUSTED, read_model
-from flexroad.tasks.segment.pixels import Options, files, segment
+from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.segment.pixels import train as training
+from flexroad.tasks.segment.pixels.model import TRUSTED, read_model
+from flexroad.tasks.segment.pixels.segment import Options, files, segment
+from flexroad.tasks.segment.pixels.train import even_threshold
+from flexroad.tasks.segment.training_types import Sample
 from flexroad.tasks.synthetic import block, make_scene
 from flexroad.tasks.synthetic.orthophoto import orthophoto
-from flexroad.tasks.training import pixels as training
-from flexroad.tasks.training.pixels import even_threshold
-from flexroad.tasks.training.types import Sample
 from flexroad.tasks.types import Source, TileData
 
 SEED, SIZE_M = 3, 120

@@ -3,7 +3,7 @@ import pytest
 from shapely import LineString, box
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.hygiene import Hygiene
+from flexroad.tasks.roads.mask_cleanup import Hygiene
 from flexroad.tasks.segment.vector import VERSION, Options, segment
 from tests.make_roads import GRID, on_grid, tile, write
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks import ecsrc, evaluate, sample
+from flexroad.tasks import sample
+from flexroad.tasks.filter import ecsrc
+from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)

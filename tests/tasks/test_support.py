@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.support import REACH_M, Support, continuation, of_faces, support, unsound, without_unsound
+from flexroad.tasks.quality.support import Support, of_faces, support
+from flexroad.tasks.roads.dtm_validity import REACH_M, continuation, unsound, without_unsound
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)

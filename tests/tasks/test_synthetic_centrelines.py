@@ -3,7 +3,7 @@ import pytest
 import shapely
 
 from flexroad.catalog import Grid
-from flexroad.tasks.road_vectors import cells
+from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 from flexroad.tasks.synthetic.centrelines import centre_lines
 

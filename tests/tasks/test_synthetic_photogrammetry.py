@@ -5,8 +5,8 @@ import pytest
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.mesh import orthophoto as seen_from_above
-from flexroad.tasks.acquire.mesh import tops
+from flexroad.tasks.acquire.mesh.sample import orthophoto as seen_from_above
+from flexroad.tasks.acquire.mesh.sample import tops
 from flexroad.tasks.synthetic import Kind
 from flexroad.tasks.synthetic.dsc3d import SITES, SIZE_M, survey
 from flexroad.tasks.synthetic.orthophoto import orthophoto

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog import Grid
-from flexroad.tasks.windows import blend, corners, cover, taper
+from flexroad.tasks.segment.dinov2.windows import blend, corners, cover, taper
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 30, 20)
 SIZES = st.integers(4, 40).flatmap(lambda size: st.tuples(st.just(size), st.integers(0, size // 2)))

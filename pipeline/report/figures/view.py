@@ -16,8 +16,8 @@ from flexroad.pipeline.pull import Pull, StageError
 from flexroad.pipeline.report.figures.cast import Cast
 from flexroad.pipeline.run import Run
 from flexroad.pipeline.store import Store
-from flexroad.tasks.drape import drape
-from flexroad.tasks.mad import mean_angles
+from flexroad.tasks.metrics.dihedral import mean_angles
+from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
 
 

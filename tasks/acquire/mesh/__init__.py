@@ -1,0 +1,1 @@
+"""Textured meshes (OBJ, PLY, glTF): read, georeference, sample to points."""

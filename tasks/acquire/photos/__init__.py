@@ -1,0 +1,1 @@
+"""Photographs with GNSS tags: structure from motion, then dense matching."""

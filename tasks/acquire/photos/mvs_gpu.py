@@ -1,0 +1,73 @@
+"""Dense stereo on a GPU: COLMAP's PatchMatch and fusion (Schönberger et al., 2016).
+
+Needs a pycolmap that was built with CUDA; the wheels on PyPI are not.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire.photos.mvs_cpu import Cloud
+from flexroad.tasks.acquire.photos.poisson import RECORD
+from flexroad.tasks.acquire.photos.sfm import Reconstruction, colmap
+from flexroad.tasks.errors import TaskError
+
+
+class Options(base.Options):
+    """How photographs are matched on a GPU."""
+
+    size: int = Field(2000, ge=100, description="photographs are reduced to this width or height (px)")
+
+
+def available() -> bool:
+    """Return whether pycolmap is here and was built with CUDA."""
+    return bool(colmap().has_cuda)
+
+
+def patchmatch(found: Reconstruction, work: Path, options: Options) -> Cloud:
+    """Return the fused cloud of all photographs, relative to the reconstruction's origin.
+
+    Parameters
+    ----------
+    found : Reconstruction
+        Its model and its photographs are read from their files.
+    work : Path
+        Folder for undistorted photographs and depth maps: some 20 bytes per pixel of each photograph.
+    options : Options
+        Size.
+
+    Raises
+    ------
+    TaskError
+        If pycolmap is missing, or no point is left.
+    """
+    pycolmap = colmap()
+    workspace, fused = work / "stereo", work / "fused.ply"
+    undistorting = pycolmap.UndistortCameraOptions(max_image_size=options.size)
+    pycolmap.undistort_images(workspace, found.model, found.root, undistort_options=undistorting)
+    pycolmap.patch_match_stereo(workspace, options=pycolmap.PatchMatchOptions(max_image_size=options.size))
+    pycolmap.stereo_fusion(fused, workspace, output_type="PLY")
+    return read_ply(fused)
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read the points that COLMAP's fusion writes.
+
+    Raises
+    ------
+    TaskError
+        If there are none.
+    """
+    _, _, body = path.read_bytes().partition(b"end_header\n")
+    records = np.frombuffer(body, RECORD)
+    if not len(records):
+        raise TaskError("dense stereo found no point; take photographs that overlap by 60 % and more")
+    points, normals, colours = (
+        np.column_stack([records[name] for name in names])
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+    )
+    return Cloud(points.astype(np.float64), normals.astype(np.float64), colours)

@@ -1,0 +1,1 @@
+"""Point clouds: ground filter, DSM, DTM and orthophoto."""

@@ -1,0 +1,160 @@
+"""Rasters from a point cloud: surface, ground, bridge decks and orthophoto of a piece of ground.
+
+A cell's values depend on the points within `reach_m` of the piece alone, not on how land is cut into pieces,
+nor on the order of the points; heights agree to 1e-8 m, as sums and large coordinates are rounded.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options as base
+from flexroad.tasks.acquire.points import dtm, fill_voids
+from flexroad.tasks.acquire.points import ground_filter as slope_filter
+from flexroad.tasks.acquire.points.binning import Cells, bins, means
+from flexroad.tasks.acquire.points.max_height import highest, spikes
+from flexroad.tasks.acquire.points.orthophoto import photo
+from flexroad.tasks.acquire.types import Points, Rasters
+from flexroad.tasks.types import Bools, Floats, Photo
+
+
+class Options(base.Options):
+    """How points become rasters."""
+
+    despike_m: float | None = Field(
+        None, gt=0, description="drop single points so far above all others around them (m); null keeps all"
+    )
+    fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
+    ground: Literal["classes", "filter"] = Field(
+        "classes",
+        description="classes: ground is what the points' classes say; filter: what the slope filter finds",
+    )
+    ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
+    bridge_classes: tuple[int, ...] = Field((17,), description="classes of bridge decks; never ground")
+    dtm: Literal["tin", "mean"] = Field(
+        "tin", description="tin: linear between the ground of the cells; mean: mean ground height per cell"
+    )
+    void_m: float = Field(50.0, ge=0, le=500, description="DTM voids up to this width are bridged (m)")
+    dop_fill_m: float = Field(
+        2.0, ge=0, le=20, description="pixels up to so far from one with a colour get it (m)"
+    )
+    filter: slope_filter.Options = Field(
+        slope_filter.Options(), description="the slope filter, used with ground: filter"
+    )
+
+
+def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
+    """Make the rasters of a piece of ground.
+
+    Parameters
+    ----------
+    points : Points
+        In the grid's CRS (m), with a rim of `reach_m` around the grid; those farther away change nothing.
+    grid : Grid
+        The cells.
+    options : Options
+        Voids, classes, methods.
+    dop_cell : float, optional
+        Pixel of the orthophoto (m); None makes no orthophoto.
+
+    Returns
+    -------
+    Rasters
+        All NaN where there are no points, or no ground among them; a photo if points have colours.
+    """
+    rim = grid.buffered(reach_m(options, grid.cell))
+    inner = rim.window(grid)
+    if options.despike_m is not None:
+        points = _without_spikes(points, rim, options.despike_m)
+    cells = bins(points.easting, points.northing, rim)
+    dsm = fill_voids.fill(highest(cells, points.height, rim.shape), rim, options.fill_m)
+    decks = np.isin(points.kind, options.bridge_classes)
+    (bridges,) = means(cells[decks], rim.shape, points.height[decks])
+    ground = _is_ground(points, options) & ~decks
+    return Rasters(
+        grid,
+        dsm=dsm[inner],
+        dtm=_dtm(points[ground], rim, options)[inner],
+        ground=_holding(cells[ground], rim.shape)[inner],
+        bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
+        photo=_photo(points, grid, options, dop_cell),
+    )
+
+
+def reach_m(options: Options, cell: float) -> float:
+    """Return how far outside a grid of such cells points can change a value inside (m)."""
+    if options.dtm == "tin":
+        ground = dtm.reach_m(options.void_m, cell)
+    else:
+        ground = fill_voids.reach_m(options.void_m, cell)
+    if options.ground == "filter":
+        ground += options.filter.radius_m
+        if options.filter.low_m is not None:
+            ground += options.filter.low_radius_m
+    farthest = max(ground, fill_voids.reach_m(options.fill_m, cell), options.dop_fill_m)
+    # Whether a point is a spike is known from its own and the next cells.
+    return farthest if options.despike_m is None else farthest + 2 * cell
+
+
+def facts(options: Options) -> dict[str, str]:
+    """Return how the rasters are made, by layer, for the tags of their files."""
+    spikes = (
+        ""
+        if options.despike_m is None
+        else f"; single points {options.despike_m:g} m above all around dropped"
+    )
+    if options.ground == "classes":
+        ground = f"points of {_classes(options.ground_classes)}"
+    else:
+        ground = (
+            f"slope-filtered points (Vosselman 2000: radius {options.filter.radius_m:g} m, "
+            f"slope {options.filter.slope:g}, tolerance {options.filter.tolerance_m:.2f} m)"
+        )
+    kind = "TIN of the cells' centroids" if options.dtm == "tin" else "mean per cell"
+    return {
+        "DSM": f"highest point per cell{spikes}; voids up to {options.fill_m:g} m filled linearly",
+        "DTM": f"{kind} of {ground}; voids up to {options.void_m:g} m bridged linearly",
+        "BRIDGES": f"mean per cell of points of {_classes(options.bridge_classes)}",
+        "DOP": f"colour of the highest point; voids take the nearest within {options.dop_fill_m:g} m",
+    }
+
+
+def _classes(classes: tuple[int, ...]) -> str:
+    return f"class{'es' if len(classes) > 1 else ''} {', '.join(map(str, classes))}"
+
+
+def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
+    cells = bins(points.easting, points.northing, grid)
+    kept = np.ones(len(points), bool)
+    kept[spikes(cells, points.height, grid.shape, despike_m)] = False
+    return points[kept]
+
+
+def _is_ground(points: Points, options: Options) -> Bools:
+    if options.ground == "classes":
+        return np.isin(points.kind, options.ground_classes)
+    return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
+
+
+def _holding(cells: Cells, shape: tuple[int, int]) -> Bools:
+    """Return the cells that hold a point, ``(H, W)``."""
+    holding = np.zeros(shape, bool)
+    holding.flat[cells[cells >= 0]] = True
+    return holding
+
+
+def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:
+    cells = bins(ground.easting, ground.northing, grid)
+    if options.dtm == "mean":
+        return dtm.averaged(cells, ground.height, grid, options.void_m)
+    return dtm.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
+
+
+def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Photo | None:
+    if points.colour is None or dop_cell is None:
+        return None
+    return photo(points, Grid.covering(grid.crs, grid.bounds, dop_cell), options.dop_fill_m)

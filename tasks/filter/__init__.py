@@ -1,0 +1,1 @@
+"""Filters of the road mask, one file per method: ``ecsrc(data, road, options) -> RoadClusters`` (step B)."""

@@ -1,0 +1,91 @@
+"""Filter the road mask: ECSRC, the paper's step B ("Road and Terrain Point Cloud Extraction", Algorithm 1).
+
+Three parts, as in the algorithm: growth over neighbouring cells (Eq. neighbors), `mergeClusters`,
+`cleanClusters`. What holds on streets with trees and cars, where this one does not, is `tasks.filter.planar`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flexroad.tasks import options as base
+from flexroad.tasks.filter.kit.union_find import Roots, clean, flatten, half_disc, least_cells, plant, root
+from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
+
+VERSION = 1
+
+
+class Options(base.Options):
+    """What counts as one road."""
+
+    method: Literal["paper", "off"] = Field(
+        "paper",
+        description="paper: Algorithm 1; off: keep every road cell that has a DSM height; "
+        "planar: for real streets, with options of its own (docs/filter.md)",
+    )
+    theta_xy_m: float = Field(
+        10.0, ge=0, le=100, description="clusters merge across gaps up to this distance in plan (m)"
+    )
+    theta_z_m: float = Field(
+        0.5, gt=0, description="largest height difference of neighbouring points of one road (m)"
+    )
+    min_area_m2: float = Field(50.0, ge=0, description="smaller clusters are dropped (m2)")
+    keep_largest: int | None = Field(
+        10, ge=1, description="of the rest, keep so many of the largest; null keeps all"
+    )
+
+
+def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
+    """Label the road cells that hang together in plan and height; drop the rest (Algorithm 1).
+
+    Parameters
+    ----------
+    data : TileData
+        Its DSM gives the points' heights, ``(H, W)``, m.
+    road : RoadMask
+        The raw mask M^r on the same grid.
+    options : Options
+        Thresholds in metres.
+
+    Returns
+    -------
+    RoadClusters
+        Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
+        no cluster is large enough.
+    """
+    points = road.mask & np.isfinite(data.dsm)
+    if options.method == "off":
+        return RoadClusters(data.grid, points.astype(np.int32))
+    cell, roots = data.grid.cell, plant(points)
+    heights = np.ascontiguousarray(data.dsm)
+    _join(heights, roots, half_disc(1.5), options.theta_z_m)
+    _join(heights, roots, half_disc(options.theta_xy_m / cell), options.theta_z_m)
+    least = least_cells(options.min_area_m2, cell)
+    labels = clean(points, flatten(roots).reshape(points.shape), least, options.keep_largest)
+    return RoadClusters(data.grid, labels)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: float) -> None:
+    """Unite the sets of any two points one of the steps apart and within ``theta_z`` in height."""
+    rows, cols = heights.shape
+    for i in range(roots.size):
+        if roots[i] < 0:
+            continue
+        r, c = i // cols, i % cols
+        a = root(roots, i)
+        for k in range(steps.shape[0]):
+            row, col = r + steps[k, 0], c + steps[k, 1]
+            if row >= rows or col < 0 or col >= cols:
+                continue
+            j = row * cols + col
+            if roots[j] < 0 or roots[j] == a or abs(heights[r, c] - heights[row, col]) > theta_z:
+                continue
+            b = root(roots, j)
+            a, b = min(a, b), max(a, b)
+            roots[b] = a

@@ -1,0 +1,1 @@
+"""Read rasters, orthophotos and vector files of one tile."""

@@ -1,0 +1,164 @@
+"""The orthophoto (DOP) of a tile, read where it is used: a window of its files at the resolution asked for.
+
+Pixels that coincide with the file's are copied, coarser ones are means of the file's, finer ones are
+interpolated. What a file declares as nodata, masks or makes transparent is unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.vrt import WarpedVRT
+
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.storage.paths import Place
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.raster import Lattice, Unreadable, opened, place
+from flexroad.tasks.types import Bools, Photo, Source
+
+BITS = {"uint8": 8, "uint16": 16}
+"""Depth of the colours that are understood, where a file does not say it uses fewer."""
+
+
+def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Photo:
+    """Read the orthophoto over a grid's bounds.
+
+    Grey photos are given as three equal bands, of more than three (near infrared) the first three are
+    taken, and 16 bits become 8 by the depth that the file declares, else by all 16.
+
+    Parameters
+    ----------
+    source : Source
+        The photo's files; of those that overlap, the first with a value wins.
+    grid : Grid
+        The ground: only its bounds and CRS count.
+    gsd_m : float, optional
+        Ground sampling distance of the result (m); by default that of the first file that reaches the grid.
+
+    Returns
+    -------
+    Photo
+        Its pixels start in the grid's north-west corner and cover the grid.
+
+    Raises
+    ------
+    TaskError
+        If a file that the ground needs is missing or broken; if one is rotated, in another CRS, or in
+        colours that are not understood; if none reaches the grid.
+    """
+    photo: Photo | None = None
+    broken: list[Unreadable] = []
+    reached = np.zeros((1, 1), bool)
+    with quiet():
+        for path in source.paths:
+            try:
+                found = _read(path, f"{source.name} {path.name}", grid, gsd_m, source.crs)
+            except Unreadable as error:
+                broken.append(error)
+                continue
+            if found is None:
+                continue
+            piece, lattice = found
+            photo, gsd_m = _under(photo, piece), piece.grid.cell
+            reached = reached | _reached(lattice, piece.grid)
+            if photo.known.all():
+                break
+    # Files are named for the ground around a tile, too: a broken one costs the tiles it lies on.
+    if broken and not reached.all():
+        raise TaskError(str(broken[0]), broken[0].file, source.name)
+    if photo is None:
+        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
+        names = ", ".join(path.name for path in source.paths[:3])
+        raise TaskError(
+            f"no {source.name} file overlaps the tile ({bounds}): {names}; build the catalog anew",
+            str(source.paths[0]),
+            source.name,
+        )
+    return photo
+
+
+def _under(first: Photo | None, second: Photo) -> Photo:
+    """Return the first photo, filled with the second where it knows nothing."""
+    if first is None:
+        return second
+    colour = np.where(first.known, first.colour, second.colour)
+    return replace(first, colour=colour, known=first.known | second.known)
+
+
+def _reached(lattice: Lattice, grid: Grid) -> Bools:
+    """Return the cells whose centres lie on the file, with a value or not, ``(H, W)``."""
+    west, south, east, north = lattice.bounds
+    inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
+        (west < grid.eastings) & (grid.eastings < east)
+    )
+    return inside
+
+
+def _read(
+    path: Place, name: str, grid: Grid, gsd_m: float | None, crs: str | None
+) -> tuple[Photo, Lattice] | None:
+    """Return what one file shows of the ground, and where the file lies; None if it lies elsewhere."""
+    with opened(path, name) as src:
+        lattice = place(src, path, name, grid, grid, crs)
+        if lattice is None or lattice.under(grid) is None:
+            return None
+        depth = _depth(src, path, name)
+        pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or lattice.dx)
+        colour, known = _warped(src, lattice, pixels)
+    if src.count < 3:
+        colour = np.repeat(colour, 3, axis=0)
+    scaled = np.rint(colour * (255 / (2**depth - 1)))
+    return Photo(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
+
+
+def _depth(src: Any, path: Place, name: str) -> int:
+    """Return how many bits the colours have."""
+    kind = src.dtypes[0]
+    if src.colorinterp[0] == ColorInterp.palette:
+        raise TaskError(
+            f"{name} has a palette instead of colours; expand it with gdal_translate -expand rgb", str(path)
+        )
+    if kind not in BITS:
+        raise TaskError(
+            f"{name} has colours in {kind}, not 8 or 16 bits; convert it with gdal_translate -ot Byte -scale",
+            str(path),
+        )
+    return int(src.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", BITS[kind]))
+
+
+def _warped(src: Any, lattice: Lattice, pixels: Grid) -> tuple[NDArray[np.float32], Bools]:
+    """Return the file's colours on the pixels, ``(1 or 3, h, w)`` in its own counts, and which are known."""
+    coarser = pixels.cell > max(lattice.dx, lattice.dy) * (1 + LATTICE_TOLERANCE)
+    bands = (1, 2, 3) if src.count >= 3 else (1,)
+    has_alpha = ColorInterp.alpha in src.colorinterp
+    with WarpedVRT(
+        src,
+        # The two are one CRS by another name: nothing is to be reprojected.
+        src_crs=pixels.crs,
+        crs=pixels.crs,
+        src_transform=_transform(lattice),
+        transform=pixels.transform,
+        width=pixels.width,
+        height=pixels.height,
+        resampling=Resampling.average if coarser else Resampling.bilinear,
+        dtype="float32",
+        add_alpha=not has_alpha,
+        # A pixel is unknown where all bands say so: pure red has two bands at nodata 0.
+        UNIFIED_SRC_NODATA="YES",
+    ) as seen:
+        alpha = src.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else seen.count
+        known: Bools = seen.read(alpha) > 0
+        colour: NDArray[np.float32] = seen.read(bands)
+    return np.where(known, colour, np.float32(0)), known
+
+
+def _transform(lattice: Lattice) -> Affine:
+    if lattice.northward:
+        return Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
+    return Affine(lattice.dx, 0, lattice.west, 0, -lattice.dy, lattice.north)

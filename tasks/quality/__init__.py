@@ -1,0 +1,1 @@
+"""Figures that need no ground truth: support, flags, error estimate."""

@@ -1,0 +1,148 @@
+"""Tidy a mask of roads: join it with a second source, close gaps, fill holes, drop specks.
+
+Widths and areas are metres and m2, whatever the cell. What touches the edge of the grid is cut off there:
+a speck may be the end of a road and a hole the mouth of a square, so both stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.types import Bools, TileData
+
+SLACK = 1e-9
+"""Sizes count as reached within this part of a cell: 0.6 m is three cells of 0.2 m."""
+
+
+class Hygiene(options.Options):
+    """What is done to a mask, in this order; 0 or none leaves it out."""
+
+    fuse: Literal["none", "union", "intersection", "corridor"] = Field(
+        "none",
+        description="joined with a second source: road in either, road in both, or the mask as far as it "
+        "lies within corridor_m of the other",
+    )
+    fuse_with: Literal["roads", "road_mask"] = Field(
+        "roads", description="the second source: the catalog's vectors or its road mask"
+    )
+    roads: rasterise.Options = Field(
+        rasterise.DEFAULTS, description="which of the vectors, and how wide: as with method: vector"
+    )
+    corridor_m: float = Field(5.0, ge=0, le=100, description="reach of the corridor around it (m)")
+    close_m: float = Field(2.0, ge=0, le=50, description="close gaps up to this width (m)")
+    fill_m2: float = Field(10.0, ge=0, description="fill holes up to this area (m2)")
+    drop_m2: float = Field(25.0, ge=0, description="drop pieces smaller than this area (m2)")
+
+
+NOTHING = Hygiene(close_m=0, fill_m2=0, drop_m2=0)
+"""Leaves every mask as it is."""
+
+
+def clean(mask: Bools, data: TileData, options: Hygiene) -> Bools:
+    """Return the tidied mask, ``(H, W)``; cells beyond the survey are never added.
+
+    Gaps are closed before pieces are weighed, so that a road in fragments counts as one.
+
+    Raises
+    ------
+    TaskError
+        If the tile lacks the second source.
+    """
+    cell = data.grid.cell
+    fused = mask if options.fuse == "none" else fuse(mask, _second(data, options), cell, options)
+    filled = fill(close(fused, cell, options.close_m), cell, options.fill_m2)
+    return drop(fused | (filled & ~outside(data)), cell, options.drop_m2)
+
+
+def fuse(mask: Bools, second: Bools, cell: float, options: Hygiene) -> Bools:
+    """Return the mask joined with a second one as ``options.fuse`` says, ``(H, W)``."""
+    match options.fuse:
+        case "union":
+            return mask | second
+        case "intersection":
+            return mask & second
+        case "corridor":
+            return mask & within(second, cell, options.corridor_m)
+        case _:
+            return mask
+
+
+def within(mask: Bools, cell: float, reach_m: float) -> Bools:
+    """Return the cells whose centre lies within ``reach_m`` of that of a cell of the mask, ``(H, W)``."""
+    import cv2
+
+    if not mask.any():
+        return mask
+    distance = cv2.distanceTransform(_bytes(~mask), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    near: Bools = distance <= reach_m / cell + 1e-4  # OpenCV counts in float32
+    return near
+
+
+def close(mask: Bools, cell: float, width_m: float) -> Bools:
+    """Close gaps and notches up to ``width_m`` wide, ``(H, W)``; cells are only added.
+
+    A morphological closing by a disc one cell wider than the gap. Beyond the grid nothing is road.
+    """
+    import cv2
+
+    n = math.floor(width_m / cell + SLACK) + 1
+    if n == 1:
+        return mask
+    centre = np.arange(n) - (n - 1) / 2
+    disc = (centre[:, None] ** 2 + centre**2 <= (n / 2) ** 2).astype(np.uint8)
+    # A disc of an even number of cells has its centre between cells: the way back mirrors the way there.
+    there, back = (n // 2, n // 2), (n - 1 - n // 2, n - 1 - n // 2)
+    wide = cv2.dilate(np.pad(_bytes(mask), n), disc, anchor=there)
+    closed: Bools = cv2.erode(wide, disc, anchor=back)[n:-n, n:-n].astype(bool)
+    return closed
+
+
+def fill(mask: Bools, cell: float, area_m2: float) -> Bools:
+    """Fill holes of at most ``area_m2``, ``(H, W)``; cells of one hole join over their sides."""
+    pieces, areas, inner = _pieces(~mask, cell, connectivity=4)
+    small: Bools = inner & (areas <= area_m2 + SLACK)
+    return np.logical_or(mask, small[pieces])
+
+
+def drop(mask: Bools, cell: float, area_m2: float) -> Bools:
+    """Drop pieces smaller than ``area_m2``, ``(H, W)``; cells of one piece join over sides or corners."""
+    pieces, areas, inner = _pieces(mask, cell, connectivity=8)
+    small: Bools = inner & (areas < area_m2 - SLACK)
+    return np.logical_and(mask, ~small[pieces])
+
+
+def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int32], Any, Bools]:
+    """Return each cell's piece (0: not in the mask), and of each piece its area (m2) and if it is whole."""
+    import cv2
+
+    count, pieces, stats, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=connectivity)
+    inner = np.ones(count, bool)
+    for edge in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):
+        inner[edge] = False
+    inner[0] = False
+    return pieces, stats[:, cv2.CC_STAT_AREA] * cell**2, inner
+
+
+def _second(data: TileData, options: Hygiene) -> Bools:
+    if options.fuse_with == "road_mask" and data.road_mask is not None:
+        return data.road_mask
+    if options.fuse_with == "roads" and data.roads is not None:
+        return rasterise.burn(data, options.roads)
+    raise TaskError(
+        f"hygiene.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
+        f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set hygiene.fuse: none",
+        layer=options.fuse_with,
+    )
+
+
+def _bytes(mask: Bools) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(mask, np.uint8)

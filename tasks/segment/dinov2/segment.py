@@ -1,0 +1,149 @@
+"""Step B of the paper, road extraction: M^r by DINOv2 on the orthophoto.
+
+A frozen backbone, a linear head on its patch tokens, overlapping windows over the photo; the mask comes to
+the cells of the DSM by nearest neighbour, as in the paper, the probability as its mean over the cell.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from rasterio.enums import Resampling
+from rasterio.warp import reproject
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.roads import coregistration
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.mask_cleanup import Hygiene, clean
+from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, Device, load_backbone, normalised
+from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
+from flexroad.tasks.segment.dinov2.windows import blend, cover
+from flexroad.tasks.types import Bools, Photo, RoadMask, TileData
+
+VERSION = 1
+READS = ("dop", "roads")
+"""The roads where the hygiene fuses with them."""
+TIE_M = 1e-6
+"""Of pixels equally near to a cell's centre the one in the south-east is taken, in every tile."""
+
+
+class Options(options.Options):
+    """Which model, on what windows. What is null is as the head was trained."""
+
+    method: Literal["dinov2"] = "dinov2"
+    model: Path = Field(description="file of the head: `flexroad train CATALOG --method dinov2` makes one")
+    backbone: str | None = Field(
+        None, description="hub name or folder of the backbone's weights; null: the head's own"
+    )
+    gsd_m: float | None = Field(
+        None, ge=0.02, le=5, description="ground sampling distance of the windows (m); null: the head's"
+    )
+    window_px: int | None = Field(
+        None, ge=28, le=2044, multiple_of=PATCH, description="side of a window (pixels); null: the head's"
+    )
+    overlap: float = Field(
+        0.25, ge=0, le=0.5, description="part of a window's side that it shares with the next"
+    )
+    batch: int = Field(4, ge=1, le=1024, description="windows at a time: what memory allows")
+    device: Device = Field("auto", description="cpu, cuda, or auto: a GPU where there is one")
+    half: bool = Field(False, description="half precision: float16 on a GPU, bfloat16 on the CPU")
+    threshold: float | None = Field(
+        None, gt=0, lt=1, description="probability from which a pixel is road; null: the head's"
+    )
+    hygiene: Hygiene = Field(Hygiene(), description="how the mask is tidied")
+
+
+def files(options: Options) -> tuple[Path, ...]:
+    """Return the files that the result depends on beside the tile: the head and a local backbone."""
+    folder = Path(options.backbone).expanduser() if options.backbone else None
+    local = (
+        (folder / "config.json", *sorted(folder.glob("*.safetensors"))) if folder and folder.is_dir() else ()
+    )
+    return options.model, *local
+
+
+def segment(data: TileData, options: Options) -> RoadMask:
+    """Return where the head sees road in the orthophoto.
+
+    Windows reach beyond the tile and its halo as far as its photo does, and lie on a lattice fixed to the
+    ground: neighbouring tiles agree along their common edge.
+
+    Raises
+    ------
+    TaskError
+        If the tile has no orthophoto, or no cell is road; if head or backbone are missing, damaged or do
+        not belong together.
+    """
+    if data.dop is None:
+        raise TaskError(
+            "no orthophoto (layer dop) for segment: dinov2 to look at; give --dop to "
+            "`flexroad catalog rasters`, or segment by another method",
+            layer="dop",
+        )
+    head = read_head(options.model)
+    backbone = load_backbone(options.backbone or head.about.backbone, options.device, options.half)
+    check(head, backbone)
+    photo, probability = _seen(data, head, backbone, options)
+    row, col = photo.grid.cells(*_centres(data.grid))
+    threshold = options.threshold or head.about.threshold
+    mask = clean(probability[row, col] >= threshold, data, options.hygiene)
+    if not mask[data.grid.window(data.core)].any():
+        raise TaskError(
+            f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
+            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on tiles like it",
+            layer="dop",
+        )
+    return RoadMask(
+        grid=data.grid,
+        core=data.core,
+        mask=mask,
+        outside=outside(data),
+        probability=_mean(probability, photo.grid, data.grid),
+        notes=_notes(photo.known[row, col], coregistration.note(data, photo)),
+    )
+
+
+def _seen(
+    data: TileData, head: Head, backbone: Backbone, options: Options
+) -> tuple[Photo, NDArray[np.float32]]:
+    """Return the photo around the tile and the probability of road of its pixels, 0 where it has none."""
+    gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
+    overlap = round(size * options.overlap)
+    assert data.dop is not None
+    photo = read_photo(data.dop, cover(data.grid, gsd_m, size, overlap), gsd_m)
+    image = normalised(photo, head.about.mean, head.about.std)
+    found = blend(predictor(head, backbone), image, photo.known, size, overlap, options.batch)
+    return photo, np.where(photo.known, found, np.float32(0))
+
+
+def _centres(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    easting, northing = np.meshgrid(grid.eastings + TIE_M, grid.northings - TIE_M)
+    return easting, northing
+
+
+def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray[np.float32]:
+    """Return the mean over each cell, ``(H, W)``; between pixels where they are coarser than cells."""
+    cells = np.zeros(grid.shape, np.float32)
+    reproject(
+        probability,
+        cells,
+        src_transform=pixels.transform,
+        src_crs=pixels.crs,
+        dst_transform=grid.transform,
+        dst_crs=grid.crs,
+        resampling=Resampling.average if pixels.cell < grid.cell else Resampling.bilinear,
+    )
+    return np.clip(cells, 0, 1)
+
+
+def _notes(known: Bools, shifted: str | None) -> tuple[str, ...]:
+    share = np.count_nonzero(~known) / known.size
+    dark = f"dop: {share:.1%} of the cells have no orthophoto and count as no road" if share else None
+    return tuple(note for note in (dark, shifted) if note)

@@ -1,0 +1,1 @@
+"""Segment roads by gradient-boosted trees over per-pixel features."""

@@ -1,0 +1,89 @@
+"""Step B of the paper, road extraction: M^r by a light model of cells and what lies around them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from flexroad.tasks import options
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.roads import coregistration
+from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.mask_cleanup import Hygiene, clean
+from flexroad.tasks.segment.pixels.features import features, look
+from flexroad.tasks.segment.pixels.model import About, read_model
+from flexroad.tasks.types import Photo, RoadMask, TileData
+
+VERSION = 1
+READS = ("dop", "roads")
+"""The roads where the hygiene fuses with them."""
+SHOWN = 0.99
+"""Share of the tile below which it is said how much the photo shows."""
+
+
+class Options(options.Options):
+    """Which model, and how its mask is made."""
+
+    method: Literal["pixels"] = "pixels"
+    model: Path = Field(description="the model's file: `flexroad train CATALOG --method pixels` makes one")
+    threshold: float | None = Field(
+        None, gt=0, lt=1, description="probability from which a cell is road; null: the model's"
+    )
+    hygiene: Hygiene = Field(Hygiene(), description="how the mask is tidied")
+
+
+def files(options: Options) -> tuple[Path, ...]:
+    """Return the files that the result depends on beside the tile."""
+    return (options.model,)
+
+
+def segment(data: TileData, options: Options) -> RoadMask:
+    """Return where the model sees road.
+
+    Raises
+    ------
+    TaskError
+        If the model is missing or damaged, it needs an orthophoto that the tile lacks, or no cell is road.
+    """
+    model = read_model(options.model)
+    photo = _photo(data, model.about, options.model)
+    beyond = outside(data)
+    probability = model.probability(features(data, photo), ~beyond)
+    threshold = options.threshold or model.about.threshold
+    mask = clean(probability >= threshold, data, options.hygiene)
+    core = data.grid.window(data.core)
+    if not mask[core].any():
+        raise TaskError(
+            f"no road on this tile: probabilities reach {probability[core].max():.2f}, the threshold is "
+            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on tiles like it",
+            layer="dop" if photo else "dsm",
+        )
+    notes = _notes(data, photo, model.about)
+    return RoadMask(data.grid, data.core, mask, beyond, probability=probability, notes=notes)
+
+
+def _photo(data: TileData, about: About, path: Path) -> Photo | None:
+    """Return the tile's photo if the model looks at one."""
+    if not about.photo:
+        return None
+    photo = look(data)
+    if photo is None:
+        raise TaskError(
+            f"the tile has no orthophoto (layer dop), and {path.name} was trained with colours: give --dop "
+            "to `flexroad catalog rasters`, or train a model on heights alone (--set photo=false)",
+            layer="dop",
+        )
+    return photo
+
+
+def _notes(data: TileData, photo: Photo | None, about: About) -> tuple[str, ...]:
+    notes: list[str | None] = []
+    if abs(data.grid.cell / about.cell_m - 1) > 0.01:
+        notes.append(f"segment: the model learnt from cells of {about.cell_m:g} m, not {data.grid.cell:g} m")
+    if photo is not None:
+        shown = photo.known.mean()
+        notes.append(f"dop: shows {shown:.0%} of the tile and its halo" if shown < SHOWN else None)
+        notes.append(coregistration.note(data, photo))
+    return tuple(filter(None, notes))

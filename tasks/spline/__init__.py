@@ -1,0 +1,1 @@
+"""The NURBS surface, its loss, and what minimises it."""

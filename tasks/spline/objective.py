@@ -1,0 +1,180 @@
+"""What the NURBS fit minimises (the paper's section "Surface Fitting"): the loss and its gradient.
+
+``L = L_road + lambda_terrain * L_terrain + lambda_reg * L_reg`` (Eqs. loss_terrain, loss_ctrl). The data
+terms add up absolute height differences, to the DSM on filtered road cells and to the DTM elsewhere; both
+divide by the number of cells that have a height. ``L_reg`` is the mean over control points of the squared
+range (max - min) of their 8 neighbours' heights. Variables are the control heights z (m above the datum)
+and ``rho = ln w``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flexroad.tasks.spline.surface import Starts, basis
+from flexroad.tasks.types import Floats
+
+NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Targets, their factors and the basis at the raster's cell centres; the part that no step changes."""
+
+    target: Floats
+    """Height above the datum each cell is drawn to, ``(H, W)``, m; 0 where the factor is."""
+    factor: Floats
+    """Cost of a metre of difference, ``(H, W)``: 1 / cells on the road, lambda_terrain / cells elsewhere."""
+    start_u: Starts
+    """First basis function at each column, ``(W,)``."""
+    along_u: Floats
+    """Basis functions at the columns, ``(p + 1, W)``."""
+    start_v: Starts
+    """First basis function at each row, ``(H,)``; falls with the row, for row 0 is in the north."""
+    along_v: Floats
+    """Basis functions at the rows, ``(H, q + 1)``."""
+    lambda_reg: float
+    free_weights: bool
+    """Whether rho is a variable; if not, its gradient is 0."""
+
+    def __call__(self, variables: Floats) -> tuple[float, Floats]:
+        """Return the loss (m) and its gradient at ``variables``, ``(2, m, n)``: z and rho."""
+        gradient = np.zeros_like(variables)
+        z, w = variables[0], np.exp(variables[1])
+        by_a, by_w = np.zeros_like(z), np.zeros_like(z)
+        a = w * z
+        loss = _data_terms(
+            a, w, self.target, self.factor,
+            self.start_u, self.along_u, self.start_v, self.along_v, by_a, by_w,
+        )  # fmt: skip
+        # A = e^rho z and W = e^rho.
+        gradient[0] = by_a * w
+        if self.free_weights:
+            gradient[1] = by_a * a + by_w * w
+        return loss + range_term(z, self.lambda_reg, NEIGHBOURS, gradient[0]), gradient
+
+
+def objective(
+    heights: Floats,
+    factor: Floats,
+    space: tuple[Floats, Floats, tuple[int, int]],
+    lambda_reg: float,
+    free_weights: bool,
+) -> Objective:
+    """Prepare the objective for a raster whose outermost cell centres span the domain.
+
+    Parameters
+    ----------
+    heights : ndarray, (H, W)
+        Heights above the datum (m); NaN cells leave the loss.
+    factor : ndarray, (H, W)
+        Cost of a metre of difference in each cell, before the division by the number of cells.
+    space : tuple
+        Knots along easting and northing, and the degrees (p, q).
+    lambda_reg : float
+    free_weights : bool
+    """
+    valid = np.isfinite(heights)
+    rows, cols = heights.shape
+    knots_u, knots_v, (p, q) = space
+    start_u, along_u, _ = basis(knots_u, p, np.linspace(0, 1, cols))
+    start_v, along_v, _ = basis(knots_v, q, np.linspace(1, 0, rows))
+    return Objective(
+        target=np.where(valid, heights, 0.0),
+        factor=np.where(valid, factor, 0.0) / np.count_nonzero(valid),
+        start_u=start_u,
+        along_u=np.ascontiguousarray(along_u.T),
+        start_v=start_v,
+        along_v=along_v,
+        lambda_reg=lambda_reg,
+        free_weights=free_weights,
+    )
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _data_terms(
+    a: Floats, w: Floats, target: Floats, factor: Floats, start_u: Starts, along_u: Floats,
+    start_v: Starts, along_v: Floats, by_a: Floats, by_w: Floats,
+) -> float:  # fmt: skip
+    """Return the road and terrain terms and add their gradient by A and W to ``by_a`` and ``by_w``.
+
+    Separable: contract along u once per control row, then along v once per cell; the gradient goes the same
+    way back. Inner loops run along a raster row, so that the compiler can use vector instructions.
+    """
+    rows, cols = target.shape
+    a_u, w_u = _along_u(a, start_u, along_u), _along_u(w, start_u, along_u)
+    by_a_u, by_w_u = np.zeros_like(a_u), np.zeros_like(w_u)
+    losses, num, den = np.zeros(cols), np.empty(cols), np.empty(cols)
+    for r in range(rows):
+        first = start_v[r]
+        num[:] = 0.0
+        den[:] = 0.0
+        for i in range(along_v.shape[1]):
+            b = along_v[r, i]
+            for c in range(cols):
+                num[c] += b * a_u[first + i, c]
+                den[c] += b * w_u[first + i, c]
+        for c in range(cols):
+            height = num[c] / den[c]
+            difference = height - target[r, c]
+            losses[c] += factor[r, c] * abs(difference)
+            # d|x|/dx is the sign of x, 0 at 0; then dS/dA = N / W and dS/dW = -S N / W.
+            pull = factor[r, c] * np.sign(difference) / den[c]
+            num[c] = pull
+            den[c] = -pull * height
+        for i in range(along_v.shape[1]):
+            b = along_v[r, i]
+            for c in range(cols):
+                by_a_u[first + i, c] += b * num[c]
+                by_w_u[first + i, c] += b * den[c]
+    _back_along_u(by_a_u, start_u, along_u, by_a)
+    _back_along_u(by_w_u, start_u, along_u, by_w)
+    return float(losses.sum())
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _along_u(coefficients: Floats, start_u: Starts, along_u: Floats) -> Floats:
+    out = np.zeros((coefficients.shape[0], start_u.size))
+    for i in range(coefficients.shape[0]):
+        for j in range(along_u.shape[0]):
+            for c in range(start_u.size):
+                out[i, c] += along_u[j, c] * coefficients[i, start_u[c] + j]
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, out: Floats) -> None:
+    for i in range(out.shape[0]):
+        for c in range(start_u.size):
+            for j in range(along_u.shape[0]):
+                out[i, start_u[c] + j] += along_u[j, c] * gradient[i, c]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def range_term(z: Floats, lambda_reg: float, neighbours: NDArray[np.int64], by_z: Floats) -> float:
+    """Return the regulariser (Eq. loss_ctrl) and add its gradient to ``by_z``.
+
+    The range of ``P_ij - P_l`` over l is the range of the neighbours' heights: P_ij itself cancels.
+    """
+    rows, cols = z.shape
+    factor = lambda_reg / z.size
+    total = 0.0
+    for i in range(rows):
+        for j in range(cols):
+            high, low = -np.inf, np.inf
+            high_i = high_j = low_i = low_j = 0
+            for k in range(8):
+                a, b = i + neighbours[k, 0], j + neighbours[k, 1]
+                if 0 <= a < rows and 0 <= b < cols:
+                    if z[a, b] > high:
+                        high, high_i, high_j = z[a, b], a, b
+                    if z[a, b] < low:
+                        low, low_i, low_j = z[a, b], a, b
+            total += (high - low) ** 2
+            by_z[high_i, high_j] += 2 * factor * (high - low)
+            by_z[low_i, low_j] -= 2 * factor * (high - low)
+    return factor * total

@@ -1,0 +1,283 @@
+"""NURBS surfaces over a tile (the paper's step C, section "Surface Fitting", Eqs. nurbs and cox_de_boor).
+
+The surface is a graph: easting is affine in u, northing in v, and the height is the rational spline
+``z(u, v) = datum + A(u, v) / W(u, v)`` with the coefficients ``A = weight * (height - datum)`` and
+``W = weight``. Coefficient arrays are ``(m, n)``: row i belongs to the i-th basis function along v, so
+**row 0 is in the south** (rasters have row 0 in the north), column j to the j-th along u, from west to
+east. Nothing here reads files or optimises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Floats
+
+Starts = NDArray[np.intp]
+
+MAX_LOG_WEIGHT = math.log(10)
+"""Bound on abs(ln w): without it Adam reaches negative weights, that is poles, on real streets."""
+
+
+def clamped_knots(points: int, degree: int) -> Floats:
+    """Return uniform knots on [0, 1] with ``degree + 1`` equal ones at each end, ``(points + degree + 1,)``.
+
+    Raises
+    ------
+    ValueError
+        If there are not more control points than the degree.
+    """
+    if not 1 <= degree < points:
+        raise ValueError(f"degree {degree} needs at least {degree + 1} control points, not {points}")
+    inner = np.linspace(0.0, 1.0, points - degree + 1)
+    return np.concatenate([np.zeros(degree), inner, np.ones(degree)])
+
+
+def greville(knots: Floats, degree: int) -> Floats:
+    """Return the Greville abscissae, ``(points,)``: control heights there reproduce any linear function."""
+    windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
+    return np.asarray(windows.mean(axis=1))
+
+
+def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats]:
+    """Evaluate the ``degree + 1`` basis functions that are not zero at each ``u`` (Eq. cox_de_boor).
+
+    Parameters
+    ----------
+    knots : ndarray, (points + degree + 1,)
+    degree : int
+    u : ndarray, (N,)
+        Parameters in [0, 1]. At a knot the span to its right counts, at the last knot the one to its left.
+
+    Returns
+    -------
+    start : ndarray of int, (N,)
+        Index of the first function that is not zero.
+    values, slopes : ndarray, (N, degree + 1)
+        The functions ``start ... start + degree`` and their first derivatives by u.
+    """
+    u = np.asarray(u, dtype=np.float64)[:, None]
+    last = len(knots) - degree - 2
+    span = np.clip(np.searchsorted(knots, u, side="right") - 1, degree, last)
+    values = share = np.ones((len(u), 1))
+    for k in range(1, degree + 1):
+        # Each function of degree k - 1 gives a rising part to one of degree k, a falling one to its left
+        # neighbour. Its support holds the span, which is not empty: the division is safe.
+        i = span + np.arange(1 - k, 1)
+        left, right = knots[i], knots[i + k]
+        share = values / (right - left)
+        values = _pair((u - left) * share, (right - u) * share)
+    return span[:, 0] - degree, values, _pair(degree * share, -degree * share)
+
+
+def _pair(rising: Floats, falling: Floats) -> Floats:
+    """Return ``(N, k + 1)``: the rising parts one column to the right, plus the falling parts."""
+    out = np.zeros((rising.shape[0], rising.shape[1] + 1))
+    out[:, 1:] = rising
+    out[:, :-1] += falling
+    return out
+
+
+def basis_matrix(knots: Floats, degree: int, u: Floats) -> tuple[Floats, Floats]:
+    """Return all basis functions at each ``u`` and their first derivatives, both ``(N, points)``."""
+    start, values, slopes = basis(knots, degree, u)
+    return dense(start, values, len(knots) - degree - 1), dense(start, slopes, len(knots) - degree - 1)
+
+
+def dense(start: Starts, values: Floats, points: int) -> Floats:
+    """Spread the values of `basis` over all functions, ``(N, points)``."""
+    matrix = np.zeros((len(start), points))
+    np.put_along_axis(matrix, start[:, None] + np.arange(values.shape[1]), values, axis=1)
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class NurbsSurface:
+    """A NURBS height field over a rectangle (Eq. nurbs); satisfies `tasks.types.Surface`.
+
+    Beyond its domain it goes on linearly: the first-order Taylor expansion about the nearest domain point.
+    """
+
+    crs: str
+    bounds: Bounds
+    """The domain: west, south, east, north (m)."""
+    degree: tuple[int, int]
+    """Degree along easting (the paper's p) and along northing (q)."""
+    knots_u: Floats
+    """Knots along easting on [0, 1], ``(n + p + 1,)``."""
+    knots_v: Floats
+    """Knots along northing on [0, 1], ``(m + q + 1,)``."""
+    A: Floats
+    """Weight times height above the datum, ``(m, n)``, m; row 0 in the south."""
+    W: Floats
+    """Weights, ``(m, n)``, positive; row 0 in the south."""
+    datum: float
+    """Height that heights in ``A`` are relative to (m)."""
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) near the south-west that exported coordinates are relative to."""
+
+    def height(self, easting: Floats, northing: Floats) -> Floats:
+        """Return heights (m) at scattered points, in their broadcast shape."""
+        shape, (u, v) = self._scattered(easting, northing)
+        return self._height(self._at_points(u, v), u - np.clip(u, 0, 1), v - np.clip(v, 0, 1)).reshape(shape)
+
+    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
+        u, v = self._parameters(eastings, northings)
+        along_u = basis_matrix(self.knots_u, self.degree[0], np.clip(u, 0, 1))
+        along_v = basis_matrix(self.knots_v, self.degree[1], np.clip(v, 0, 1))
+        at = _LatticeBasis(along_u, along_v)
+        return self._height(at, (u - np.clip(u, 0, 1))[None, :], (v - np.clip(v, 0, 1))[:, None])
+
+    def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives of the height by easting and by northing (m/m) at scattered points.
+
+        Beyond the domain, those of the nearest domain point.
+        """
+        shape, (u, v) = self._scattered(easting, northing)
+        _, by_u, by_v = self._taylor(self._at_points(u, v))
+        west, south, east, north = self.bounds
+        return (by_u / (east - west)).reshape(shape), (by_v / (north - south)).reshape(shape)
+
+    def normal(self, easting: Floats, northing: Floats) -> Floats:
+        """Return upward unit normals at scattered points, ``(..., 3)``; see `slope` beyond the domain."""
+        by_easting, by_northing = self.slope(easting, northing)
+        normals = np.stack([-by_easting, -by_northing, np.ones_like(by_easting)], axis=-1)
+        return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+    @property
+    def control_points(self) -> Floats:
+        """Control points at the Greville abscissae, ``(m, n, 4)``: easting, northing, height (m), weight.
+
+        With unit weights they are those of the surface; with others the plan position of a point moves
+        when its weight does, and `exact` is what other programs need.
+        """
+        west, south, east, north = self.bounds
+        x = west + greville(self.knots_u, self.degree[0]) * (east - west)
+        y = south + greville(self.knots_v, self.degree[1]) * (north - south)
+        return np.stack([*np.meshgrid(x, y), self.A / self.W + self.datum, self.W], axis=-1)
+
+    def _parameters(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
+        west, south, east, north = self.bounds
+        return (np.asarray(easting) - west) / (east - west), (np.asarray(northing) - south) / (north - south)
+
+    def _scattered(self, easting: Floats, northing: Floats) -> tuple[tuple[int, ...], tuple[Floats, Floats]]:
+        u, v = np.broadcast_arrays(*self._parameters(easting, northing))
+        return u.shape, (u.ravel(), v.ravel())
+
+    def _at_points(self, u: Floats, v: Floats) -> _PointBasis:
+        start_u, *along_u = basis(self.knots_u, self.degree[0], np.clip(u, 0, 1))
+        start_v, *along_v = basis(self.knots_v, self.degree[1], np.clip(v, 0, 1))
+        return _PointBasis(start_u, along_u, start_v, along_v)
+
+    def _height(self, at: _PointBasis | _LatticeBasis, beyond_u: Floats, beyond_v: Floats) -> Floats:
+        if not (beyond_u.any() or beyond_v.any()):
+            return at.contract(self.A) / at.contract(self.W) + self.datum
+        z, by_u, by_v = self._taylor(at)
+        return z + by_u * beyond_u + by_v * beyond_v + self.datum
+
+    def _taylor(self, at: _PointBasis | _LatticeBasis) -> tuple[Floats, Floats, Floats]:
+        """Return height above the datum and its derivatives by u and v (quotient rule)."""
+        w = at.contract(self.W)
+        z = at.contract(self.A) / w
+        by_u = (at.contract(self.A, du=1) - z * at.contract(self.W, du=1)) / w
+        by_v = (at.contract(self.A, dv=1) - z * at.contract(self.W, dv=1)) / w
+        return z, by_u, by_v
+
+
+@dataclass(frozen=True, eq=False)
+class _PointBasis:
+    """Basis functions at scattered points; ``along_*`` are values and slopes, ``(N, degree + 1)`` each."""
+
+    start_u: Starts
+    along_u: Sequence[Floats]
+    start_v: Starts
+    along_v: Sequence[Floats]
+
+    def contract(self, coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
+        """Return the spline of these coefficients, or its first derivative, ``(N,)``."""
+        out = np.empty(len(self.start_u))
+        _contract(self.start_u, self.along_u[du], self.start_v, self.along_v[dv], coefficients, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _LatticeBasis:
+    """Basis matrices of a lattice's columns and rows; each a pair of values and slopes."""
+
+    along_u: tuple[Floats, Floats]
+    along_v: tuple[Floats, Floats]
+
+    def contract(self, coefficients: Floats, du: int = 0, dv: int = 0) -> Floats:
+        """Return the spline of these coefficients, or its first derivative, ``(rows, cols)``."""
+        return np.asarray(self.along_v[dv] @ coefficients @ self.along_u[du].T)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _contract(
+    start_u: Starts, along_u: Floats, start_v: Starts, along_v: Floats, coefficients: Floats, out: Floats
+) -> None:
+    for k in range(out.size):
+        total = 0.0
+        for i in range(along_v.shape[1]):
+            row = 0.0
+            for j in range(along_u.shape[1]):
+                row += along_u[k, j] * coefficients[start_v[k] + i, start_u[k] + j]
+            total += along_v[k, i] * row
+        out[k] = total
+
+
+@dataclass(frozen=True, eq=False)
+class ExactNurbs:
+    """The same surface as a NURBS with control points in space, as other programs read it."""
+
+    degree: tuple[int, int]
+    """Degree along u (easting) and v (northing)."""
+    knots_u: Floats
+    knots_v: Floats
+    points: Floats
+    """Control points, ``(m', n', 4)``: x, y (m from `origin`), z (height, m), weight; row 0 in the south."""
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) that x and y are relative to."""
+
+
+def exact(surface: NurbsSurface) -> ExactNurbs:
+    """Return the surface as an ordinary NURBS, without approximation.
+
+    Plan coordinates are affine in the parameters, so ``x * W`` and ``y * W`` have one degree more than
+    ``W`` and the same smoothness: with ``A`` and ``W`` they lie in the spline space of degree p + 1 with
+    every inner knot doubled (35 -> 67 points for p = 3). Degree elevation is a convex combination, so
+    weights stay positive.
+    """
+    west, south, east, north = surface.bounds
+    p, q = surface.degree
+    knots_u, raise_u, times_u = _raised(surface.knots_u, p)
+    knots_v, raise_v, times_v = _raised(surface.knots_v, q)
+    w = raise_v @ surface.W @ raise_u.T
+    x = west - surface.origin[0] + (east - west) * (raise_v @ surface.W @ times_u.T) / w
+    y = south - surface.origin[1] + (north - south) * (times_v @ surface.W @ raise_u.T) / w
+    z = surface.datum + raise_v @ surface.A @ raise_u.T / w
+    return ExactNurbs((p + 1, q + 1), knots_u, knots_v, np.stack([x, y, z, w], axis=-1), surface.origin)
+
+
+def _raised(knots: Floats, degree: int) -> tuple[Floats, Floats, Floats]:
+    """Return knots of the space one degree up, and the maps of f and of u * f into it, ``(points', points)``.
+
+    Both products lie in that space, so interpolating them at its Greville abscissae is exact.
+    """
+    raised = np.sort(np.concatenate([knots, np.unique(knots)]))
+    u = greville(raised, degree + 1)
+    collocation, _ = basis_matrix(raised, degree + 1, u)
+    f, _ = basis_matrix(knots, degree, u)
+    return raised, _solve(collocation, f), _solve(collocation, u[:, None] * f)
+
+
+def _solve(matrix: Floats, values: Floats) -> Floats:
+    return np.asarray(np.linalg.solve(matrix, values), dtype=np.float64)

@@ -1,0 +1,98 @@
+"""The bending energy of a B-spline height field: what a thin plate of its shape would resist.
+
+``E = sum over cells of stiffness * (z_xx^2 + 2 z_xy^2 + z_yy^2)``, derivatives by metres, so that it depends
+neither on the tile's size nor on the number of control points; planes have none. Summed over the cells, for
+the stiffness may differ from cell to cell: a road is stiffer than the ground beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexroad.tasks.spline.normal_equations import gram, pairs
+from flexroad.tasks.spline.surface import basis, dense
+from flexroad.tasks.types import Floats
+
+Derivatives = tuple[Floats, Floats, Floats]
+"""Basis functions at the cells of one axis, and their first and second derivatives, ``(N, points)`` each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A thin plate under the raster."""
+
+    stiffness: Floats
+    """Cost of squared curvature in each cell, ``(H, W)``, m3."""
+    along_u: Derivatives
+    """At the columns, by metres."""
+    along_v: Derivatives
+    """At the rows, by metres."""
+
+    def times(self, factor: float) -> Plate:
+        """Return a plate so many times as stiff."""
+        return replace(self, stiffness=factor * self.stiffness)
+
+    def __call__(self, z: Floats) -> tuple[float, Floats]:
+        """Return the energy (m) of control heights ``(m, n)`` and its gradient."""
+        loss, gradient = 0.0, np.zeros_like(z)
+        for times, along_v, along_u in self._parts():
+            curvature = along_v @ z @ along_u.T
+            pull = times * self.stiffness * curvature
+            loss += float(np.vdot(pull, curvature))
+            gradient += 2 * along_v.T @ pull @ along_u
+        return loss, gradient
+
+    def hessian(self, lags: int) -> Floats:
+        """Return the second derivatives by the control heights, laid out as by `normal_equations.gram`."""
+        parts = [
+            gram(2 * times * self.stiffness, pairs(along_v, lags), pairs(along_u, lags), lags)
+            for times, along_v, along_u in self._parts()
+        ]
+        return np.asarray(sum(parts))
+
+    def _parts(self) -> Iterator[tuple[float, Floats, Floats]]:
+        yield 1.0, self.along_v[0], self.along_u[2]
+        yield 2.0, self.along_v[1], self.along_u[1]
+        yield 1.0, self.along_v[2], self.along_u[0]
+
+
+def plate(
+    stiffness: Floats, space: tuple[Floats, Floats, tuple[int, int]], spans_m: tuple[float, float]
+) -> Plate:
+    """Return the plate of a raster whose outermost cell centres span the domain.
+
+    Parameters
+    ----------
+    stiffness : ndarray, (H, W)
+        Cost of squared curvature in each cell (m3).
+    space : tuple
+        Knots along easting and northing, and the degrees, 2 and more.
+    spans_m : tuple
+        Extent of the domain along easting and northing (m).
+    """
+    rows, cols = stiffness.shape
+    knots_u, knots_v, (p, q) = space
+    along_u = _derivatives(knots_u, p, np.linspace(0, 1, cols), spans_m[0])
+    along_v = _derivatives(knots_v, q, np.linspace(1, 0, rows), spans_m[1])
+    return Plate(stiffness, along_u, along_v)
+
+
+def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Derivatives:
+    """Evaluate the basis functions at ``u`` and their derivatives by metres.
+
+    A derivative is a spline of one degree less over the knots without the outermost (de Boor, "A practical
+    guide to splines", chapter X).
+    """
+    points = len(knots) - degree - 1
+    coefficients, found = np.eye(points), []
+    for order in range(3):
+        inner, lower = knots[order : len(knots) - order], degree - order
+        start, values, _ = basis(inner, lower, u)
+        found.append(dense(start, values, points - order) @ coefficients / span_m**order)
+        if lower:
+            rate = lower / (inner[lower + 1 : -1] - inner[1 : points - order])
+            coefficients = rate[:, None] * np.diff(coefficients, axis=0)
+    return found[0], found[1], found[2]
