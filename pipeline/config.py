@@ -21,7 +21,6 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from flexroad.pipeline.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import load, sample
-from flexroad.tasks.filter import ecsrc, planar
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.options import Options
 from flexroad.tasks.quality import assess
@@ -73,7 +72,7 @@ def methods(package: str) -> dict[str, Any]:
     """Return the stage files of a package by method: NAME.py, or NAME/segment.py of one that learns."""
     home = importlib.import_module(package)
     stage = package.rpartition(".")[2]
-    found = {}
+    found: dict[str, Any] = {}
     for file in sorted(pkgutil.iter_modules(home.__path__), key=lambda file: file.name):
         if file.name not in NO_METHODS:
             module = importlib.import_module(f"{package}.{file.name}{f'.{stage}' if file.ispkg else ''}")

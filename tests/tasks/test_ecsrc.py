@@ -156,7 +156,7 @@ def test_off_keeps_every_road_cell_with_a_height():
 
 @pytest.mark.parametrize("variant", ["paper", "off"])
 def test_no_road_has_no_cluster(variant):
-    assert not cluster(np.zeros((5, 5)), np.zeros((5, 5)), Options(variant=variant)).mask.any()
+    assert not cluster(np.zeros((5, 5)), np.zeros((5, 5)), Options(method=variant)).mask.any()
 
 
 def test_what_is_too_small_leaves_nothing():
