@@ -14,6 +14,10 @@ terrain heights (m) incl. bridges, true road mask, heights of bridge decks alone
 areas (vectors)."""
 
 
+REACH_M = 100.0
+"""A tile names the files within this distance of it, so that `load` can read a halo around it."""
+
+
 @dataclass(frozen=True)
 class Layer:
     """Where one layer of a tile is."""

@@ -22,10 +22,7 @@ from flexroad.catalog.crs import same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
-from flexroad.catalog.tile import LAYERS, Layer, Tile
-
-REACH_M = 100.0
-"""A tile names the files within this distance of it, so that `load` can read a halo around it."""
+from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile
 
 MASKS = ("road_mask", "reference_road")
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.cli import main
+from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 
 QUICK = {
@@ -62,7 +62,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def made_survey(tmp_path_factory) -> Path:
     """A folder of four neighbouring tiles of 60 m with known truth."""
-    from flexroad.pipeline.synthesis import write_scenes
+    from flexroad.pipeline.benchmark.scenes import write_scenes
 
     folder = tmp_path_factory.mktemp("survey")
     write_scenes(folder, 4, seed=3, size_m=60)

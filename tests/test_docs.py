@@ -24,7 +24,7 @@ def test_the_command_lines_of_the_docs_run(tmp_path):
     for line in lines:
         command, *words = shlex.split(line)
         assert command == "flexroad"
-        call = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", *words]
+        call = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *words]
         done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.report.evidence import FILE, KEPT, read_evidence, write_evidence
-from flexroad.pipeline.report.tables import pages
+from flexroad.pipeline.reproduce.evidence import FILE, KEPT, read_evidence, write_evidence
+from flexroad.pipeline.reproduce.tables import pages
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -49,8 +49,8 @@ def published(tmp_path):
     """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
     import pandas as pd
 
-    from flexroad.pipeline.report.evidence import Evidence
-    from flexroad.pipeline.report.published import TABLE_I
+    from flexroad.pipeline.reproduce.evidence import Evidence
+    from flexroad.pipeline.reproduce.published import TABLE_I
 
     rows = [
         ("made", "segmented", f"t{i}", "", row.variant, *map(row.value, FIGURES))

@@ -10,7 +10,7 @@ import pytest
 import typer
 import yaml
 
-from flexroad.pipeline.cli import app, spread
+from flexroad.pipeline.cli.main import app, spread
 
 UNITS = Path(__file__).parent.parent / "docs" / "operations"
 JOB = yaml.safe_load((UNITS / "cronjob.yaml").read_text())

@@ -15,5 +15,11 @@ def test_wheel_holds_one_import_package(tmp_path):
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.split("/")[0] for name in names}
     assert top == {"flexroad", f"{wheel.name.removesuffix('-py3-none-any.whl')}.dist-info"}
-    for file in ("catalog/grid.py", "tasks/load.py", "pipeline/graph.py", "configs/paper.yaml", "py.typed"):
+    for file in (
+        "catalog/grid.py",
+        "tasks/load.py",
+        "pipeline/graph/graph.py",
+        "configs/paper.yaml",
+        "py.typed",
+    ):
         assert f"flexroad/{file}" in names

@@ -14,8 +14,7 @@ from flexroad.catalog.crs import transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.rasters import matching
-from flexroad.catalog.tile import Layer, Tile
-from flexroad.catalog.tiling import REACH_M
+from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from datetime import timedelta
 from typing import Any
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 
 SETTINGS = {

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
-from flexroad.pipeline.cluster import Cluster
+from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.clusters import Workplace, opened
 from flexroad.pipeline.execute.executor import J, R

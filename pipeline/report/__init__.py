@@ -5,7 +5,7 @@ from __future__ import annotations
 from flexroad.catalog.storage.paths import Place, write
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
-from flexroad.pipeline.run import Run
+from flexroad.pipeline.run.record import Run
 
 FORMATS = ("md", "csv", "html")
 

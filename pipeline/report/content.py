@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import pandas as pd
 import yaml
 
+from flexroad.pipeline.report.quality import most_doubtful, over_tiles
 from flexroad.pipeline.report.steps import edge_steps
-from flexroad.pipeline.report.trust import most_doubtful, over_tiles
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.summary import summary
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import summary
+from flexroad.pipeline.store.tables import read_metrics
 
 FIGURES = {
     "l2_road_m": "L2 road (m)",

@@ -13,7 +13,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
-from flexroad.pipeline.report import trust
+from flexroad.pipeline.report import quality
 from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
@@ -53,9 +53,9 @@ def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
     )
 
 
-def template(name: str) -> jinja2.Template:
-    """Return one of the pages' templates, with filters for tables and pictures."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+def template(name: str, *folders: Path) -> jinja2.Template:
+    """Return a page's template, of these folders or of this one, with filters for tables and pictures."""
+    loader = jinja2.FileSystemLoader([*folders, Path(__file__).parent])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["table"] = _html
     environment.filters["inline"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
@@ -70,7 +70,7 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Further figures, mean over tiles", content.beside, ""),
         ("Per stratum, mean over tiles", content.strata, ""),
         ("Worst tiles by road L2", content.worst, ""),
-        ("Worst tiles by doubt, without ground truth", content.doubtful, trust.MEANING),
+        ("Worst tiles by doubt, without ground truth", content.doubtful, quality.MEANING),
         ("What the surfaces tell of themselves, mean over tiles", content.trust, ""),
         ("Height steps between neighbouring tiles", content.steps.head(10), content.steps_of),
         ("Failures", content.failures, ""),

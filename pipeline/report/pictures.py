@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from flexroad.pipeline.graph import TileGraph
-from flexroad.pipeline.look import look_at
-from flexroad.pipeline.pull import Pull, StageError
+from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
-from flexroad.pipeline.report.render import (
-    error_map,
-    filter_picture,
-    hillshade,
-    render_meshes,
-    support_picture,
-)
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.store import Store
+from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import look_at
+from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.worker.evaluator import Pull, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from flexroad.catalog import Grid, Tile
-from flexroad.pipeline.graph import Node, TileGraph
-from flexroad.pipeline.look import look_at
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.store import Store
+from flexroad.pipeline.graph.graph import Node, TileGraph
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import look_at
+from flexroad.pipeline.store.artefacts import Store
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]

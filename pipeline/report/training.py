@@ -17,9 +17,9 @@ import yaml
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.report.pages import template
 from flexroad.pipeline.report.render import curves, found_map
-from flexroad.pipeline.run import versions
-from flexroad.pipeline.store import no_nan
-from flexroad.pipeline.train import Judged, Outcome
+from flexroad.pipeline.run.record import versions
+from flexroad.pipeline.store.products import no_nan
+from flexroad.pipeline.training.train import Judged, Outcome
 from flexroad.tasks.roads.mask_metrics import Quality
 
 SHOWN = 3

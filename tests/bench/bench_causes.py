@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import load_config
-from flexroad.pipeline.graph import tile_graph
-from flexroad.pipeline.pull import Pull
-from flexroad.pipeline.store import Store
-from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.worker.evaluator import Pull
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs as fit

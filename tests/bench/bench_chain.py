@@ -10,12 +10,13 @@ import time
 from pathlib import Path
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import Config, compose, load_config
-from flexroad.pipeline.graph import STAGE_NAMES
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.synthesis import write_scenes
-from flexroad.pipeline.warm import warm
-from flexroad.pipeline.work import do_tile
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.graph.stages import STAGE_NAMES
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.worker.tile import do_tile
+from flexroad.pipeline.worker.warmup import warm
 
 TILES = 8
 MANY = 2000

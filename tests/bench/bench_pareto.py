@@ -26,7 +26,7 @@ from scipy.ndimage import label
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs

@@ -30,10 +30,10 @@ from bench_filter import NOISE_M, PAVED, Case, with_scars
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.cli import main as flexroad
-from flexroad.pipeline.config import load_config
-from flexroad.pipeline.graph import STAGE_NAMES, STAGES, stage_function
-from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.cli.main import main as flexroad
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_function
 from flexroad.tasks.synthetic import gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import Kind
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData

@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.config import compose
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import DaskExecutor
-from flexroad.pipeline.ledger import NAME as LEDGER
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.work import Job, TileResult, failed_row
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.database import NAME as LEDGER
+from flexroad.pipeline.worker.tile import Job, TileResult, failed_row
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
@@ -114,7 +115,7 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
 
 def sleep_tile(job: Job) -> TileResult:
     """Take as long as a real tile, and send back as much."""
-    from flexroad.pipeline.entry import Entry
+    from flexroad.pipeline.store.records import Entry
 
     time.sleep(SLEEP_S)
     rows = tuple(failed_row(job.graph, v, "") | {"status": "done"} for v in job.graph.variants)
@@ -257,7 +258,7 @@ def resumed(folder: Path, tiles: int) -> None:
 
 
 def flexroad(folder: Path, words: list[str]) -> None:
-    code = "from flexroad.pipeline.cli import main; main()"
+    code = "from flexroad.pipeline.cli.main import main; main()"
     root = Path(__file__).parents[2]
     subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(root)!r}); {code}", *words],

@@ -5,11 +5,12 @@ from collections import Counter
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.graph import tile_graph
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 
 VARIANTS = 21
 NODES = {
@@ -51,7 +52,7 @@ def test_the_true_mask_changes_the_evaluation_alone(survey):
 
 @pytest.fixture(scope="module")
 def one_tile(tmp_path_factory):
-    from flexroad.pipeline.synthesis import write_scenes
+    from flexroad.pipeline.benchmark.scenes import write_scenes
 
     return Catalog.read(write_scenes(tmp_path_factory.mktemp("one"), 1, seed=5, size_m=80))
 

@@ -18,10 +18,11 @@ from rasterio.warp import transform_bounds
 
 from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.sources import prepared
-from flexroad.pipeline.config import compose
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 from tests.conftest import QUICK, Said
 from tests.make_rasters import write
 
@@ -661,7 +662,7 @@ def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path)
     call = [
         sys.executable,
         "-c",
-        "from flexroad.pipeline.cli import main; main()",
+        "from flexroad.pipeline.cli.main import main; main()",
         "run",
         *map(str, words),
         "--out",

@@ -4,8 +4,8 @@ import rasterio
 from affine import Affine
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.check import check
-from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.inspect.catalog import check
 
 
 def test_a_moved_photo_and_a_lost_file_are_told(tmp_path):

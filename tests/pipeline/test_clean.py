@@ -9,13 +9,14 @@ import yaml
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.storage.paths import listing
-from flexroad.pipeline.clean import alone, drop, waste
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.lock import held
-from flexroad.pipeline.registry import forget, users
-from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.run.garbage import alone, drop, waste
+from flexroad.pipeline.run.lock import held
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.store_users import forget, users
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},

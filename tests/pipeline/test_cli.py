@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.cli import spread
+from flexroad.pipeline.cli.main import spread
 
 
 def flexroad(*words, expect: int = 0) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", *map(str, words)],
+        [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *map(str, words)],
         capture_output=True,
         text=True,
         check=False,
@@ -114,7 +114,7 @@ def _headless(folder: Path) -> Path:
 def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
     import rasterio
 
-    from flexroad.pipeline.query import Ground
+    from flexroad.pipeline.inspect.points import Ground
 
     tile = Catalog.read(made_survey / "catalog.parquet").tiles[1]
     with rasterio.open(tile.paths(tile.layer("dsm"))[0]) as raster:

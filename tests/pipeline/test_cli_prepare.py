@@ -13,7 +13,7 @@ from shapely import box
 from flexroad.catalog import Catalog
 from tests.make_clouds import write_cloud
 
-CALL = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()"]
+CALL = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
 WEST, SOUTH = 356_000.0, 5_699_000.0
 
 

@@ -12,8 +12,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.cli import main
-from flexroad.pipeline.lock import held
+from flexroad.pipeline.cli.main import main
+from flexroad.pipeline.run.lock import held
 
 QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
 
@@ -136,7 +136,7 @@ def test_an_interruption_rings_the_alarm_and_a_broken_alarm_changes_nothing(
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexroad.pipeline.run.execute", interrupted)
+    monkeypatch.setattr("flexroad.pipeline.run.runner.execute", interrupted)
     said = flexroad(*nightly, *alarm.words, expect=130)
     assert "interrupted; the same command goes on from here" in said
     assert alarm.told["exit_code"] == 130

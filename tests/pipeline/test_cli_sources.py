@@ -12,7 +12,7 @@ from tests.make_rasters import write
 
 
 def flexroad(*words, expect: int = 0) -> tuple[str, str]:
-    call = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", *map(str, words)]
+    call = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *map(str, words)]
     done = subprocess.run(call, capture_output=True, text=True, check=False)
     assert done.returncode == expect, done.stdout + done.stderr
     return done.stdout, done.stderr

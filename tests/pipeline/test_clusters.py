@@ -11,8 +11,8 @@ import cloudpickle
 import psutil
 import pytest
 
-from flexroad.pipeline.cluster import Cluster
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import kubernetes_options, opened, slurm_options
@@ -328,7 +328,7 @@ def test_what_is_missing_is_named(kind, remedy, monkeypatch, tmp_path):
 
 def test_who_works_changes_no_fingerprint(made_survey, tmp_path):
     from flexroad.catalog import Catalog
-    from flexroad.pipeline.graph import tile_graphs
+    from flexroad.pipeline.graph.graph import tile_graphs
 
     text = "extends: paper\ncluster: {kind: slurm, queue: night}\n"
     (tmp_path / "night.yaml").write_text(text)

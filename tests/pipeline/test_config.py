@@ -3,7 +3,8 @@ import json
 import pytest
 import yaml
 
-from flexroad.pipeline.config import compose, load_config, schema, shipped, template
+from flexroad.pipeline.config.loading import compose, load_config, shipped
+from flexroad.pipeline.config.schema import schema, template
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.filter import planar
 

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError
-from flexroad.pipeline.config import load_config
-from flexroad.pipeline.dataset import open_tile
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.query import Ground
-from flexroad.pipeline.run import Run, execute
+from flexroad.pipeline.inspect.points import Ground
+from flexroad.pipeline.inspect.tile import open_tile
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
 
 
 def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):

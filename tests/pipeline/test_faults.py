@@ -27,12 +27,13 @@ import yaml
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.journal import Journal
-from flexroad.pipeline.lock import Holder, held
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.event_log import Journal
+from flexroad.pipeline.run.lock import Holder, held
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import wait_for
 
 LIGHT = {
@@ -175,7 +176,14 @@ def test_a_scheduler_that_is_killed_for_good(
 
 
 def test_workers_that_cannot_be_started_are_said_in_one_line(config, made_survey, night, undisturbed, out):
-    call = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()", "run", "--workers", "2"]
+    call = [
+        sys.executable,
+        "-c",
+        "from flexroad.pipeline.cli.main import main; main()",
+        "run",
+        "--workers",
+        "2",
+    ]
     call += ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
     few = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh"]
     done = subprocess.run([*few, *call], capture_output=True, text=True, check=False)
@@ -392,7 +400,7 @@ def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, night, 
     call = [
         sys.executable,
         "-c",
-        "from flexroad.pipeline.cli import main; main()",
+        "from flexroad.pipeline.cli.main import main; main()",
         "run",
         "--executor",
         "serial",
@@ -445,7 +453,7 @@ def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbe
 
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
-        for module in ("meter", "work", "journal", "run"):
+        for module in ("worker.profiling", "worker.tile", "run.event_log", "run.runner"):
             monkeypatch.setattr(f"flexroad.pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
         monkeypatch.setattr(paths, "write", write_then)
 

@@ -11,16 +11,17 @@ from PIL import Image
 
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.errors import CatalogError
-from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report import figures
-from flexroad.pipeline.report.evidence import collect
-from flexroad.pipeline.report.figures import cast as casting
-from flexroad.pipeline.report.figures import dataset, maps, profile, renders, route, trade_off, view
-from flexroad.pipeline.report.figures.plate import DPI
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.reproduce import figures
+from flexroad.pipeline.reproduce.evidence import collect
+from flexroad.pipeline.reproduce.figures import cast as casting
+from flexroad.pipeline.reproduce.figures import dataset, maps, profile, renders, route, trade_off, view
+from flexroad.pipeline.reproduce.figures.plate import DPI
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 
 PLATES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
 BASE = {"fit": {"method": "nurbs", "control_points": [10, 10], "iterations": 30}}

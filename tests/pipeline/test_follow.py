@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from flexroad.pipeline import follow as followed
-from flexroad.pipeline.entry import Entry, Failure
-from flexroad.pipeline.follow import Snapshot, follow
-from flexroad.pipeline.ledger import NAME, Ledger
-from flexroad.pipeline.lock import Holder, held
+from flexroad.pipeline.monitor import live_status as followed
+from flexroad.pipeline.monitor.live_status import Snapshot, follow
+from flexroad.pipeline.run.lock import Holder, held
+from flexroad.pipeline.store.database import NAME, Ledger
+from flexroad.pipeline.store.records import Entry, Failure
 
 ME = Holder("node7", "m", "b", 4711, 99, "2026-11-21T02:00:00+00:00", "t")
 FIRST = Snapshot(when=0, tiles=10, done=4, cached=4, failed=0, holder=ME, failures=())

@@ -10,8 +10,9 @@ from dataclasses import asdict, replace
 import pytest
 
 from flexroad.catalog import Catalog, Layer
-from flexroad.pipeline.config import compose, load_config
-from flexroad.pipeline.graph import STAGE_NAMES, STAGES, Pattern, stage_module, stage_version, tile_graph
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.graph.graph import Pattern, tile_graph
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_module, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.segment import mask
 

@@ -11,10 +11,11 @@ import psutil
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import until
 
 CONFIG = """
@@ -26,7 +27,7 @@ variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    from flexroad.pipeline.synthesis import write_scenes
+    from flexroad.pipeline.benchmark.scenes import write_scenes
 
     folder = tmp_path_factory.mktemp("kill")
     (folder / "slow.yaml").write_text(CONFIG)
@@ -44,7 +45,7 @@ def undisturbed(place) -> pd.DataFrame:
 
 def command(place, out) -> list[str]:
     words = ["--config", place / "slow.yaml", "--catalog", place / "survey" / "catalog.parquet"]
-    call = "from flexroad.pipeline.cli import main; main()"
+    call = "from flexroad.pipeline.cli.main import main; main()"
     return [sys.executable, "-c", call, "run", *map(str, words), "--out", str(out), "--workers", "2"]
 
 

@@ -5,8 +5,8 @@ from collections import Counter
 
 import pytest
 
-from flexroad.pipeline.entry import Entry, Failure
-from flexroad.pipeline.ledger import NAME, PAGE, Ledger
+from flexroad.pipeline.store.database import NAME, PAGE, Ledger
+from flexroad.pipeline.store.records import Entry, Failure
 
 TILES = [f"{i}_{i}" for i in range(2 * PAGE + 7)]
 """More than two pages."""

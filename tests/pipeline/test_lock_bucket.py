@@ -8,7 +8,7 @@ import pytest
 
 from flexroad.catalog.storage.paths import place, read, write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.lock import Holder, Pace, held, holder
+from flexroad.pipeline.run.lock import Holder, Pace, held, holder
 
 ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 QUICK = Pace(beat_s=0.05, stale_s=0.5)
@@ -86,7 +86,7 @@ def test_of_many_that_race_exactly_one_wins(stale, run):
 
 def test_a_lost_answer_is_no_second_holder(run, monkeypatch):
     """It was taken, but the answer was lost: what is sent again is refused because of ourselves."""
-    from flexroad.pipeline.lock_bucket import InBucket
+    from flexroad.pipeline.run.lock_object import InBucket
 
     create = InBucket.create
     monkeypatch.setattr(InBucket, "create", lambda self, data: create(self, data) and create(self, data))

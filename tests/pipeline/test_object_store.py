@@ -13,17 +13,19 @@ from shapely import LineString
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import place
-from flexroad.pipeline import codec
-from flexroad.pipeline.cli import main
-from flexroad.pipeline.config import compose
-from flexroad.pipeline.dataset import open_tile
+from flexroad.pipeline.cli.main import main
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.query import Ground
+from flexroad.pipeline.inspect.points import Ground
+from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.report import write_report
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.summary import read_summary, summary
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.status import summary
+from flexroad.pipeline.run.summary import read_summary
+from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.io.vectors import Asked, near

@@ -3,11 +3,11 @@
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from flexroad.pipeline.entry import Entry
-from flexroad.pipeline.meter import Span
-from flexroad.pipeline.prometheus import Textfile
-from flexroad.pipeline.summary import Summary
-from flexroad.pipeline.work import TileResult
+from flexroad.pipeline.monitor.prometheus import Textfile
+from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.store.records import Entry
+from flexroad.pipeline.worker.profiling import Span
+from flexroad.pipeline.worker.tile import TileResult
 
 
 def result(status, **spans) -> TileResult:

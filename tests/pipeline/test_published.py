@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import pytest
 
-from flexroad.pipeline.config import load_config
-from flexroad.pipeline.report.claims import CLAIMS, Change, Order
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.report.published import GEROD, TABLE_I, TABLE_II, published
+from flexroad.pipeline.reproduce.claims import CLAIMS, Change, Order
+from flexroad.pipeline.reproduce.published import GEROD, TABLE_I, TABLE_II, published
 
 TEXT_AND_TABLE_DIFFER = {"Sampling at 0.5 m / 5 m doubles the triangles (four times in Table II)"}
 

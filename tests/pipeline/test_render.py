@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.report import render
+from flexroad.pipeline.report import mesh_pictures, render
 from flexroad.tasks.types import Mesh
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
@@ -172,7 +172,7 @@ def opengl():
 def test_meshes_are_drawn_the_right_way_round():
     whole = sheet()
     broken = Mesh(whole.crs, whole.origin, whole.vertices[:, :2], whole.faces, whole.road)
-    pictures = render.render_meshes({"b": whole, "broken": broken, "a": whole})
+    pictures = mesh_pictures.render_meshes({"b": whole, "broken": broken, "a": whole})
     assert list(pictures) == ["b", "broken", "a"]
     assert pictures["broken"] is None
     assert pictures["a"] == pictures["b"]
@@ -194,7 +194,7 @@ def test_a_part_of_a_mesh_is_drawn_in_given_colours():
     west, south = whole.origin[:2]
     shares = []
     for within in (None, (west + 150, south + 50, west + 240, south + 200)):
-        picture = render.render_meshes({"a": whole}, {"a": red_in_the_west}, within, (300, 240))["a"]
+        picture = mesh_pictures.render_meshes({"a": whole}, {"a": red_in_the_west}, within, (300, 240))["a"]
         image = pixels(picture)
         assert image.shape == (240, 300, 3)
         red, blue = ((image[..., a] - image[..., b]) > 60 for a, b in ((0, 2), (2, 0)))
@@ -206,7 +206,7 @@ def test_a_part_of_a_mesh_is_drawn_in_given_colours():
 
 def test_no_meshes_need_no_child(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nonexistent")
-    assert render.render_meshes({}) == {}
+    assert mesh_pictures.render_meshes({}) == {}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for VTK is a shell script")
@@ -220,6 +220,6 @@ def test_a_child_that_dies_costs_the_pictures_only(tmp_path, monkeypatch, caplog
     stand_in.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     with caplog.at_level(logging.WARNING):
-        assert render.render_meshes({"a": sheet(), "b": sheet()}) == {"a": None, "b": None}
+        assert mesh_pictures.render_meshes({"a": sheet(), "b": sheet()}) == {"a": None, "b": None}
     (record,) = caplog.records
     assert re.search(f"a, b: .*{reason}", record.getMessage())

@@ -10,16 +10,19 @@ import pytest
 import rasterio
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import compose, load_config
+from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from flexroad.pipeline.graph import Pattern
+from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.report.steps import edge_steps
-from flexroad.pipeline.run import Run, execute, select
-from flexroad.pipeline.store import Store
-from flexroad.pipeline.summary import Summary, summary
-from flexroad.pipeline.tables import read_metrics
-from flexroad.pipeline.work import TileResult
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.selection import select
+from flexroad.pipeline.run.status import summary
+from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.store.tables import read_metrics
+from flexroad.pipeline.worker.tile import TileResult
 
 FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
@@ -291,7 +294,9 @@ def test_a_resume_makes_each_graph_once_and_reads_no_marker(run, monkeypatch):
         return graph(self, tile, *how)
 
     monkeypatch.setattr(Pattern, "graph", counted)
-    monkeypatch.setattr("flexroad.pipeline.look._from_marker", lambda *_: pytest.fail("a marker was read"))
+    monkeypatch.setattr(
+        "flexroad.pipeline.run.status._from_marker", lambda *_: pytest.fail("a marker was read")
+    )
     nothing_to_do(Run.open(run.path))
     assert made == {tile.id: 1 for tile in run.catalog.tiles}
 

@@ -8,11 +8,12 @@ import yaml
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources import prepared
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.synthesis import write_scenes
-from flexroad.pipeline.tables import read_metrics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import load
 from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.head import Head, read_head

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.split import Piece, halves, inside, split
+from flexroad.pipeline.training.spatial_split import Piece, halves, inside, split
 
 
 def piece(col, row, road=10, ground=10, size=100):

@@ -8,11 +8,11 @@ import pytest
 from pyproj import Transformer
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import load_config
-from flexroad.pipeline.entry import Entry, Failure
-from flexroad.pipeline.ledger import NAME, Ledger
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.states import corners, write_states
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.monitor.geojson import corners, write_states
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.store.database import NAME, Ledger
+from flexroad.pipeline.store.records import Entry, Failure
 
 
 @pytest.fixture

@@ -8,11 +8,12 @@ import pytest
 from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import write
-from flexroad.pipeline import codec
-from flexroad.pipeline.config import compose
-from flexroad.pipeline.graph import tile_graph
-from flexroad.pipeline.pull import Pull
-from flexroad.pipeline.store import DAMAGED, Store, TileFolder, file_entry
+from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.graph.graph import tile_graph
+from flexroad.pipeline.store import codec
+from flexroad.pipeline.store.artefacts import DAMAGED, Store
+from flexroad.pipeline.store.products import TileFolder, file_entry
+from flexroad.pipeline.worker.evaluator import Pull
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},

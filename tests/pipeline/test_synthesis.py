@@ -7,8 +7,8 @@ import rasterio
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
+from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.synthesis import write_scenes
 from flexroad.tasks.load import Options, load
 from flexroad.tasks.segment import vector
 from flexroad.tasks.synthetic import make_scene

@@ -14,10 +14,11 @@ import scipy.stats
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.storage.paths import write
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.report.bootstrap import bootstrap
-from flexroad.pipeline.report.claims import (
+from flexroad.pipeline.report.content import FIGURES
+from flexroad.pipeline.reproduce.bootstrap import bootstrap
+from flexroad.pipeline.reproduce.claims import (
     HELD,
     NOT_HELD,
     NOT_TESTED,
@@ -28,13 +29,12 @@ from flexroad.pipeline.report.claims import (
     check,
     percent,
 )
-from flexroad.pipeline.report.comparison import compare
-from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.report.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
-from flexroad.pipeline.report.published import TABLE_I_DSC3D, TABLE_II, published
-from flexroad.pipeline.report.tables import pages, write_comparison
-from flexroad.pipeline.run import Run
-from flexroad.pipeline.tables import metrics_frame
+from flexroad.pipeline.reproduce.comparison import compare
+from flexroad.pipeline.reproduce.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
+from flexroad.pipeline.reproduce.published import TABLE_I_DSC3D, TABLE_II, published
+from flexroad.pipeline.reproduce.tables import pages, write_comparison
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.store.tables import metrics_frame
 
 VARIANTS = list(load_config("ablation").chains)
 

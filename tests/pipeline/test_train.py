@@ -9,12 +9,12 @@ import yaml
 from scipy import ndimage
 
 from flexroad.catalog import Catalog, Layer
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run import Run, check_models
-from flexroad.pipeline.split import inside, split
-from flexroad.pipeline.synthesis import write_scenes
-from flexroad.pipeline.train import Asked, Ground, Samples, train
+from flexroad.pipeline.run.record import Run, check_models
+from flexroad.pipeline.training.spatial_split import inside, split
+from flexroad.pipeline.training.train import Asked, Ground, Samples, train
 from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.mask_cleanup import NOTHING

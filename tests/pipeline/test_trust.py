@@ -6,12 +6,13 @@ import pytest
 import rasterio
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config import load_config
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.trust import most_doubtful, over_tiles
-from flexroad.pipeline.run import Run, execute
-from flexroad.pipeline.tables import COLUMNS, metrics_frame, read_metrics
+from flexroad.pipeline.report.quality import most_doubtful, over_tiles
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.store.tables import COLUMNS, metrics_frame, read_metrics
 from flexroad.tasks.quality.support import Support
 
 

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-CALL = [sys.executable, "-c", "from flexroad.pipeline.cli import main; main()"]
+CALL = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
 
 
 def table_after(text: str, start: str) -> list[tuple[str, list[float]]]:

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 from scipy.ndimage import map_coordinates
 
-from flexroad.pipeline.query import Ground
+from flexroad.pipeline.inspect.points import Ground
 from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
 

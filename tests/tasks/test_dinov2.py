@@ -42,7 +42,7 @@ def backbones(tmp_path_factory) -> dict[int, Path]:
 @pytest.fixture(scope="session")
 def sample(tmp_path_factory) -> Sample:
     """A made tile of 60 m with an orthophoto; a fifth of it is road."""
-    from flexroad.pipeline.synthesis import write_scenes
+    from flexroad.pipeline.benchmark.scenes import write_scenes
 
     found = Catalog.read(write_scenes(tmp_path_factory.mktemp("scene"), 2, seed=3, size_m=60, dop=True))
     data = load.load(found.tiles[1], load.Options())

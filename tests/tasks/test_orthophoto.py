@@ -6,7 +6,7 @@ import rasterio
 from scipy import ndimage
 
 from flexroad.catalog import Catalog, Grid
-from flexroad.pipeline.synthesis import write_scenes
+from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.tasks import TaskError
 from flexroad.tasks.synthetic import Kind, SceneOptions, block, make_scene
 from flexroad.tasks.synthetic.orthophoto import (

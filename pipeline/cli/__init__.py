@@ -1,0 +1,1 @@
+"""``flexroad ...``: the command line."""

@@ -1,0 +1,192 @@
+"""``flexroad catalog``: make, show and check catalogs."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexroad.pipeline.cli.run import next_run
+
+if TYPE_CHECKING:
+    from flexroad.catalog.tiling import Indexed
+
+catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")]
+RoadValue = Annotated[
+    list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
+]
+Roads = Annotated[
+    str | None, typer.Option(help="Vector files of roads: a file, or a pattern relative to ROOT.")
+]
+TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
+MinCover = Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")]
+Date = Annotated[datetime | None, typer.Option(help="When the data was taken.")]
+
+
+@catalogs.command("rasters")
+def catalog_rasters(
+    root: Annotated[Path, typer.Argument(help="Folder of rasters.")],
+    dsm: Annotated[str, typer.Option(help="Files of the surface model, relative to ROOT ('dsm/*.tif').")],
+    dtm: Annotated[str, typer.Option(help="Files of the terrain model.")],
+    output: Output,
+    dop: Annotated[str | None, typer.Option(help="Files of the orthophoto.")] = None,
+    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    road_value: RoadValue = None,
+    roads: Roads = None,
+    reference: Annotated[str | None, typer.Option(help="Files of true heights, for the evaluation.")] = None,
+    reference_road: Annotated[str | None, typer.Option(help="Files of the true road mask.")] = None,
+    tile_size: TileSize = 250,
+    min_cover: MinCover = 0.25,
+    date: Date = None,
+    crs: Annotated[str | None, typer.Option(help="CRS of files that carry none: EPSG:25832.")] = None,
+) -> None:
+    """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
+    from flexroad.catalog.sources import rasters
+
+    asked = {
+        "dsm": dsm,
+        "dtm": dtm,
+        "dop": dop,
+        "road_mask": road_mask,
+        "reference": reference,
+        "reference_road": reference_road,
+        "roads": roads,
+    }
+    found = rasters.index(
+        root,
+        {name: pattern for name, pattern in asked.items() if pattern is not None},
+        road_values=tuple(road_value or ()),
+        tile_size_m=tile_size,
+        date=date,
+        crs=crs,
+        min_cover=min_cover,
+    )
+    _write_catalog(found, output)
+
+
+@catalogs.command("nrw")
+def catalog_nrw(
+    root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads, under their own names.")],
+    output: Output,
+    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    road_value: RoadValue = None,
+    roads: Roads = None,
+    tile_size: TileSize = 250,
+    min_cover: MinCover = 0.25,
+    date: Date = None,
+) -> None:
+    """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
+    from flexroad.catalog.sources import nrw
+
+    found = nrw.index(
+        root,
+        road_mask=road_mask,
+        road_values=tuple(road_value or ()),
+        tile_size_m=tile_size,
+        date=date,
+        min_cover=min_cover,
+        derived=output.parent / f"{output.stem}_bridges",
+        roads=roads,
+    )
+    _write_catalog(found, output)
+
+
+@catalogs.command("gerod")
+def catalog_gerod(
+    root: Annotated[Path, typer.Argument(help="Folder of the paper's GeRoD dataset.")],
+    output: Output,
+    layout: Annotated[
+        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+    ] = "gerod",
+    date: Date = None,
+) -> None:
+    """List the tiles of the GeRoD dataset."""
+    from flexroad.catalog.sources import gerod
+    from flexroad.pipeline.config.loading import load_config
+
+    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output)
+
+
+@catalogs.command("dsc3d")
+def catalog_dsc3d(
+    root: Annotated[Path, typer.Argument(help="Folder of rasters of DSC3D's scenes.")],
+    output: Output,
+    layout: Annotated[
+        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+    ] = "dsc3d",
+    date: Date = None,
+) -> None:
+    """List the scenes of the DSC3D dataset, one tile each."""
+    from flexroad.catalog.sources import dsc3d
+    from flexroad.pipeline.config.loading import load_config
+
+    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
+
+
+def _write_catalog(found: Indexed, output: Path) -> None:
+    from flexroad.catalog import Catalog
+
+    for note in found.notes:
+        typer.echo(f"note: {note}", err=True)
+    catalog = Catalog(found.tiles)
+    catalog.write(output)
+    typer.echo(f"{len(catalog.tiles)} tiles in {output}")
+    typer.echo(f"next: {next_run(output)}")
+
+
+@catalogs.command("synthetic")
+def catalog_synthetic(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            help="gerod: independent tiles like the paper's 240; dsc3d: five meshes; default: neighbours."
+        ),
+    ] = None,
+    tiles: Annotated[
+        int | None, typer.Option(min=1, help="Number of tiles; default: 4, or all of the preset.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same scenes.")] = 0,
+    tile_size: Annotated[int | None, typer.Option(min=10, help="Size of a tile in m; default: 250.")] = None,
+    dop: Annotated[bool, typer.Option("--dop", help="Orthophotos of 0.5 m, too.")] = False,
+) -> None:
+    """Make scenes with known truth: rasters, truth and a catalog."""
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.benchmark.scenes import write_scenes
+
+    path = write_scenes(output, tiles, seed, tile_size, dop, preset)
+    typer.echo(f"{len(Catalog.read(path).tiles)} tiles in {path}")
+    typer.echo(f"next: {next_run(path)}")
+
+
+@catalogs.command("show")
+def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+    """List the tiles of a catalog."""
+    from flexroad.catalog import Catalog
+
+    catalog = Catalog.read(path)
+    for tile in catalog.tiles:
+        layers = " ".join(f"{layer.name}({len(layer.files)})" for layer in tile.layers)
+        when = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
+        size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
+        typer.echo(f"{tile.id}  {size}  {when}  {tile.stratum or '-'}  {layers}")
+    systems = sorted({tile.grid.crs for tile in catalog.tiles})
+    typer.echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
+
+
+@catalogs.command("check")
+def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+    """Look a catalog over: layers, missing files, and how far the photo lies off the heights."""
+    from flexroad.catalog import Catalog
+    from flexroad.pipeline.inspect.catalog import check
+
+    faults = 0
+    for remark in check(Catalog.read(path)):
+        typer.echo(f"warning: {remark.text}" if remark.fault else remark.text)
+        faults += remark.fault
+    if faults:
+        raise typer.Exit(1)

@@ -1,0 +1,51 @@
+"""``flexroad config``: show configurations."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
+
+
+@configs.command("show")
+def config_show(
+    name: Annotated[
+        str | None, typer.Argument(help="A YAML file or a shipped name; default: list them.")
+    ] = None,
+) -> None:
+    """Show a configuration as it is resolved, every option of every variant."""
+    import yaml
+
+    from flexroad.pipeline.config.loading import load_config, shipped
+
+    if name is None:
+        for known, path in shipped().items():
+            typer.echo(f"{known:10} {path.read_text().splitlines()[0].lstrip('# ')}")
+        return
+    found = load_config(name)
+    chains = {
+        variant: {stage: options.model_dump(mode="json") for stage, options in chain.items()}
+        for variant, chain in found.chains.items()
+    }
+    sections = {name: getattr(found, name).model_dump(mode="json") for name in ("export", "cluster")}
+    typer.echo(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
+
+
+@configs.command("template")
+def config_template() -> None:
+    """Print a configuration with every option, its default and its meaning."""
+    from flexroad.pipeline.config.schema import template
+
+    typer.echo(template(), nl=False)
+
+
+@configs.command("schema")
+def config_schema() -> None:
+    """Print the JSON schema of a configuration, for editors."""
+    import json
+
+    from flexroad.pipeline.config.schema import schema
+
+    typer.echo(json.dumps(schema(), indent=1))

@@ -1,0 +1,46 @@
+"""What a run would do: the graph in words, for ``--dry-run``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from flexroad.catalog.storage.paths import Place
+from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.graph.stages import STAGE_NAMES
+from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.store.products import TileFolder
+
+
+def plan(graphs: Iterable[TileGraph], store: Place, run: Place) -> Iterator[str]:
+    """Yield one line per tile and stage node, then the totals.
+
+    A node is ``stored`` if the store has it, ``to do`` if not; nodes that are never stored (what `load`
+    reads) are done again whenever a node after them is.
+    """
+    artefacts, totals, tiles = Store(store), Counter[tuple[str, str]](), 0
+    for graph in graphs:
+        tiles += 1
+        done = TileFolder.of(run, graph.tile.id).done(graph) is not None
+        yield f"{graph.tile.id}: {'done' if done else 'to do'}"
+        users = _users(graph)
+        for node in graph.nodes.values():
+            state = "stored" if node.stored and artefacts.has(node) else "to do"
+            totals[node.stage, "done" if done else state] += 1
+            takes = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in node.inputs) or "files"
+            yield (
+                f"  {node.stage:9}{node.fingerprint[:8]}  {'done' if done else state:7} "
+                f"<- {takes}  ({', '.join(users[node.fingerprint])})"
+            )
+    yield f"{tiles} tiles"
+    for stage in STAGE_NAMES:
+        counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
+        yield f"  {stage:9}{counts}"
+
+
+def _users(graph: TileGraph) -> dict[str, list[str]]:
+    users: dict[str, list[str]] = {}
+    for variant, made in graph.variants.items():
+        for fingerprint in made.values():
+            users.setdefault(fingerprint, []).append(variant)
+    return users

@@ -1,0 +1,1 @@
+"""Configurations: one set of options per stage, and variants of them."""

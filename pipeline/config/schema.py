@@ -1,0 +1,68 @@
+"""A configuration file described: its JSON schema, and a template with every option."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.models import DEFAULTS, TAG, Export, methods, stage_models
+from flexroad.tasks import load, sample
+from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.options import Options
+from flexroad.tasks.quality import assess
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON schema of a configuration file, for editors."""
+    stages = {stage: model.json_schema() for stage, model in stage_models().items()}
+    override = {stage: {"anyOf": [{"type": "string"}, {"type": "object"}]} for stage in stages}
+    variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
+    properties = {
+        "extends": {"type": "string", "description": "name of the configuration this one overrides"},
+        "dataset": {"type": "object", "description": "where a dataset's files lie: layers, road_values, crs"},
+        **stages,
+        "export": Export.model_json_schema(),
+        "cluster": {"anyOf": [{"type": "string"}, Cluster.model_json_schema()]},
+        "variants": {"type": "object", "additionalProperties": variant},
+    }
+    return {"type": "object", "properties": properties, "additionalProperties": False}
+
+
+def template() -> str:
+    """Return a configuration file with every option at its default and its meaning beside it."""
+    lines = ["# Every option with its default. Delete what you do not change."]
+    packages = {
+        "segment": "flexroad.tasks.segment",
+        "ecsrc": "flexroad.tasks.filter",
+        "fit": "flexroad.tasks.fit",
+    }
+    singles = {"load": load, "sample": sample, "evaluate": evaluate, "assess": assess}
+    for stage in stage_models():
+        lines.append(f"{stage}:")
+        if stage in packages:
+            default = DEFAULTS[stage][TAG[stage]]
+            lines += _option_lines(methods(packages[stage])[default].Options)
+            others = [name for name in methods(packages[stage]) if name != default]
+            if others:
+                lines.append(f"  # other methods: {', '.join(others)}")
+        else:
+            lines += _option_lines(singles[stage].Options)
+    lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
+    lines += ["variants:", "  flexroad: {}"]
+    return "\n".join(lines) + "\n"
+
+
+def _option_lines(model: type[Options]) -> list[str]:
+    lines = []
+    for key, field in model.model_fields.items():
+        value = field.get_default(call_default_factory=True)
+        text = yaml.safe_dump(_plain(value), default_flow_style=True).splitlines()[0]
+        meaning = f"  # {' '.join(field.description.split())}" if field.description else ""
+        lines.append(f"  {key}: {text}{meaning}")
+    return lines
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,58 @@
+"""The steps of the paper: which there are, what each takes, and the file that does it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from flexroad.tasks.options import Options
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the paper."""
+
+    name: str
+    inputs: tuple[str, ...]
+    """Stages whose results it takes, in the order of its arguments."""
+
+
+STAGES = (
+    Stage("load", ()),
+    Stage("segment", ("load",)),
+    Stage("ecsrc", ("load", "segment")),
+    Stage("fit", ("load", "ecsrc")),
+    Stage("sample", ("fit", "segment", "ecsrc")),
+    Stage("evaluate", ("sample", "load", "segment")),
+    Stage("assess", ("load", "segment", "ecsrc", "fit")),
+)
+
+
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+def stage_module(options: Options) -> ModuleType:
+    """Return the file that does the work: where the options' model is defined, with its `VERSION`."""
+    return sys.modules[type(options).__module__]
+
+
+def stage_version(stage: str, options: Options) -> tuple[str, int]:
+    """Return the name of a stage with its method, such as ``fit.nurbs``, and its `VERSION`."""
+    method = options.model_dump().get("method")
+    return f"{stage}.{method}" if method else stage, stage_module(options).VERSION
+
+
+def stage_function(stage: str, options: Options) -> Callable[..., Any]:
+    """Return what computes a stage with such options: the function of that name beside their model."""
+    function: Callable[..., Any] = getattr(stage_module(options), stage)
+    return function
+
+
+def model_files(options: Options) -> tuple[Path, ...]:
+    """Return the files that only the options name, as their module's `files` tells them."""
+    files: Callable[[Options], tuple[Path, ...]] = getattr(stage_module(options), "files", lambda _: ())
+    return files(options)

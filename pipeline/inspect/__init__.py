@@ -1,0 +1,1 @@
+"""Look into catalogs, tiles and surfaces."""

@@ -1,0 +1,77 @@
+"""One tile of a run as an xarray Dataset, to look into.
+
+>>> from flexroad.pipeline.inspect.tile import open_tile
+>>> tile = open_tile("RUN", "295500_5629250")                    # doctest: +SKIP
+>>> (tile.surface - tile.reference).where(tile.road).plot()      # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from flexroad.catalog.storage.paths import Place, place
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import look_at
+from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.worker.evaluator import Pull, StageError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+HEIGHTS = {"units": "m"}
+
+
+def open_tile(run: Place | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
+    """Return what went into a tile and what came out of it, on the tile's core.
+
+    Parameters
+    ----------
+    run : Place or str
+        The run's folder.
+    tile_id : str
+        A tile of its catalog.
+    variant : str, optional
+        Whose filter and surface; by default the first one exported.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``dsm``, ``dtm``, ``surface`` and, where the catalog has one, ``reference`` (m); ``road`` and
+        ``road_filtered``, the masks before and after the filter, and ``reference_road``. Coordinates ``x``
+        and ``y`` are eastings and northings (m) of the cell centres; the CRS is rioxarray's
+        ``spatial_ref``. Stored results are read, the rest is computed and not kept.
+
+    Raises
+    ------
+    ConfigError
+        If it is no run, the variant is unknown or a stage fails on the tile.
+    CatalogError
+        If the tile is unknown.
+    """
+    import rioxarray  # noqa: F401 (gives datasets their .rio)
+    import xarray as xr
+
+    opened = Run.open(place(run))
+    variant = variant or opened.config.export.variants[0]
+    if variant not in opened.config.chains:
+        raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")
+    (tile,) = opened.catalog.select([tile_id]).tiles
+    (stand,) = look_at(opened, [tile])
+    pull, made = Pull(stand.graph, Store(opened.store)), stand.graph.variants[variant]
+    try:
+        data, road, clusters, surface = (pull(made[stage]) for stage in ("load", "segment", "ecsrc", "fit"))
+    except StageError as error:
+        raise ConfigError(f"tile {tile_id}: {error}") from error
+    core, window = data.core, data.grid.window(data.core)
+    rasters = {name: getattr(data, name) for name in ("dsm", "dtm", "reference", "reference_road")}
+    rasters |= {"road": road.mask, "road_filtered": clusters.mask}
+    cut = {name: raster[window] for name, raster in rasters.items() if raster is not None}
+    cut["surface"] = surface.lattice(core.eastings, core.northings)
+    found = xr.Dataset(
+        {name: (("y", "x"), raster, {} if raster.dtype == bool else HEIGHTS) for name, raster in cut.items()},
+        coords={"x": core.eastings, "y": core.northings},
+        attrs={"tile": tile.id, "variant": variant, "stratum": tile.stratum},
+    )
+    placed: xr.Dataset = found.rio.write_crs(core.crs)
+    return placed

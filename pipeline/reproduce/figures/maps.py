@@ -1,0 +1,97 @@
+"""Error and smoothness of Plane, RGT and FlexRoad on one tile: the paper's Fig. 4."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import Collection
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from flexroad.catalog import Grid
+from flexroad.pipeline.reproduce.figures.cast import Cast
+from flexroad.pipeline.reproduce.figures.plate import Plate, new_figure
+from flexroad.pipeline.reproduce.figures.scales import (
+    ANGLE_COLOURS,
+    ANGLE_NORM,
+    ERROR_COLOURS,
+    ERROR_NORM,
+    drawable,
+)
+from flexroad.pipeline.reproduce.figures.view import Result, TileView, absent
+
+NAME = "error_and_smoothness"
+
+
+def plate(view: TileView, cast: Cast) -> Plate:
+    """Draw the vertical error per cell over the mean angle per face of the three methods."""
+    parts = (("Plane", cast.plane), ("RGT", cast.rgt), ("FlexRoad", cast.full))
+    missing = absent(parts)
+    caption = (
+        f"{view}: vertical distance to {view.against} per cell (top) and mean angle of each face to its "
+        "neighbours (bottom) for Plane, RGT and FlexRoad. Both scales are logarithmic; values beyond their "
+        "ends have the end's colour. Above each map the tile's means, as in the run's table."
+    )
+    columns = {label: variant for label, variant in parts if variant is not None}
+    return Plate(NAME, caption, None if missing else draw(view, columns), missing)
+
+
+def draw(view: TileView, columns: dict[str, str]) -> Figure:
+    """Draw one column per label and variant."""
+    figure = new_figure(4.6)
+    axes = figure.subplots(2, len(columns), sharex=True, sharey=True, squeeze=False)
+    drawn: list[tuple[AxesImage, Collection]] = []
+    for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
+        found = view.results[variant]
+        drawn.append((_errors(upper, view, variant), _angles(lower, found, view.grid)))
+        _titles(upper, lower, label, found)
+    for row, (artist, text) in enumerate(zip(drawn[0], ("error (m)", "angle (°)"), strict=True)):
+        bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=22, shrink=0.85)
+        bar.set_label(text)
+        bar.ax.yaxis.set_major_formatter("{x:g}")
+    _places(axes, view.grid)
+    return figure
+
+
+def _errors(axes: Axes, view: TileView, variant: str) -> AxesImage:
+    size = (0.0, view.grid.width * view.grid.cell, 0.0, view.grid.height * view.grid.cell)
+    error = drawable(view.error(variant))
+    return axes.imshow(
+        error, cmap=ERROR_COLOURS, norm=ERROR_NORM, extent=size, origin="upper", interpolation="nearest"
+    )
+
+
+def _angles(axes: Axes, found: Result, grid: Grid) -> Collection:
+    mesh = found.mesh
+    x = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west)
+    y = mesh.vertices[:, 1] + (mesh.origin[1] - grid.south)
+    # Pixels inside the PDF: a hundred thousand triangles would make it slow to open.
+    return axes.tripcolor(
+        x,
+        y,
+        mesh.faces,
+        facecolors=drawable(found.angles),
+        cmap=ANGLE_COLOURS,
+        norm=ANGLE_NORM,
+        edgecolors="none",
+        antialiased=False,
+        rasterized=True,
+    )
+
+
+def _titles(upper: Axes, lower: Axes, label: str, found: Result) -> None:
+    m = found.metrics
+    upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
+    lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
+
+
+def _places(axes: np.ndarray, grid: Grid) -> None:
+    for one in axes.flat:
+        one.set_aspect("equal")
+        one.spines[["top", "right"]].set_visible(True)
+        one.set_xlim(0, grid.width * grid.cell)
+        one.set_ylim(0, grid.height * grid.cell)
+    axes[0, 0].set_ylabel("L2 error\nm north")
+    axes[1, 0].set_ylabel("MAD\nm north")
+    for one in axes[1]:
+        one.set_xlabel("m east")

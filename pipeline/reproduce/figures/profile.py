@@ -1,0 +1,111 @@
+"""Heights along a vehicle's path for the raw surface, a plane and FlexRoad: the paper's Fig. 1."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from scipy import ndimage
+
+from flexroad.pipeline.reproduce.figures.cast import Cast
+from flexroad.pipeline.reproduce.figures.plate import FLEXROAD, PATH, PLANE, RAW, TRUTH, Plate, new_figure
+from flexroad.pipeline.reproduce.figures.route import longest_route
+from flexroad.pipeline.reproduce.figures.view import TileView, absent
+from flexroad.tasks.types import Floats
+
+NAME = "road_profile"
+CLOSE_M = 0.5
+"""Half the height of the close view of the errors."""
+HEADROOM = 0.25
+"""Of the road's own height range, shown above and below it; what stands over the road is cut off there."""
+
+
+def plate(view: TileView, cast: Cast) -> Plate:
+    """Draw the path, the heights along it and their errors."""
+    row, col = longest_route(view.street)
+    caption = (
+        f"{view}: heights along a vehicle's path (red: the longest way along the tile's roads, on their "
+        f"right) in the raw DSM, on the plane and on FlexRoad, over {view.against} (top), and their "
+        f"differences from it (bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are what stands on the "
+        "road or hangs over it."
+    )
+    missing = absent((("Plane", cast.plane),)) or ("" if row.size > 1 else "the tile has no road")
+    if missing or cast.plane is None:
+        return Plate(NAME, caption, None, missing)
+    rasters = {
+        "truth": view.truth,
+        "raw DSM": view.dsm,
+        "Plane": view.results[cast.plane].height,
+        "FlexRoad": view.results[cast.full].height,
+    }
+    heights = {label: along(raster, row, col) for label, raster in rasters.items()}
+    return Plate(NAME, caption, draw(view, row, col, heights))
+
+
+def along(raster: Floats, row: Floats, col: Floats) -> Floats:
+    """Return a raster's heights at fractional rows and columns, bilinear; NaN beside NaN."""
+    return np.asarray(ndimage.map_coordinates(raster, [row, col], order=1, mode="nearest"))
+
+
+def draw(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -> Figure:
+    """Draw a map of the path beside the heights along it, one of them ``truth``, and their errors."""
+    figure = new_figure(2.9)
+    axes = figure.subplot_mosaic([["map", "heights"], ["map", "errors"]], width_ratios=[1, 2.1])
+    cell = view.grid.cell
+    at = cell * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(row), np.diff(col)))])
+    _map(axes["map"], view, row, col, at)
+    looks: dict[str, dict[str, Any]] = {
+        "raw DSM": {"color": RAW, "linewidth": 0.8},
+        "Plane": {"color": PLANE},
+        "truth": {"color": TRUTH, "linewidth": 2.4, "alpha": 0.7},
+        "FlexRoad": {"color": FLEXROAD, "linestyle": (0, (3.5, 1.2))},
+    }
+    for label, look in looks.items():
+        axes["heights"].plot(at, heights[label], label=label, **look)
+        axes["errors"].plot(at, heights[label] - heights["truth"], label=label, **look)
+    _frame(axes["heights"], axes["errors"], at, heights)
+    return figure
+
+
+def _map(axes: Axes, view: TileView, row: Floats, col: Floats, at: Floats) -> None:
+    grid = view.grid
+    size = (0.0, grid.width * grid.cell, 0.0, grid.height * grid.cell)
+    axes.imshow(view.street, cmap=ListedColormap(["#f4f2ec", "#c9cbd0"]), vmin=0, vmax=1, extent=size)
+    x, y = (col + 0.5) * grid.cell, (grid.height - row - 0.5) * grid.cell
+    axes.plot(x, y, color=PATH)
+    for distance in np.arange(0, at[-1] + 1, 100):
+        i = int(np.searchsorted(at, distance).clip(0, at.size - 1))
+        axes.plot(x[i], y[i], "o", color=PATH, markersize=2.5)
+        # Towards the middle of the map, or labels of the ends would stand outside.
+        right, up = x[i] < x.max() / 2, y[i] < y.max() / 2
+        axes.annotate(
+            f"{distance:.0f} m",
+            (x[i], y[i]),
+            (4 if right else -4, 4 if up else -4),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            va="bottom" if up else "top",
+            fontsize=6,
+        )
+    axes.set_xlim(0, size[1])
+    axes.set_ylim(0, size[3])
+    axes.set_xlabel("m east")
+    axes.set_ylabel("m north")
+
+
+def _frame(upper: Axes, lower: Axes, at: Floats, heights: dict[str, Floats]) -> None:
+    road = np.concatenate([heights["truth"], heights["FlexRoad"]])
+    low, high = np.nanmin(road), np.nanmax(road)
+    room = max(HEADROOM * (high - low), 2.0)
+    upper.set_ylim(low - room, high + room)
+    upper.set_ylabel("height (m)")
+    upper.legend(ncols=4, loc="upper left", bbox_to_anchor=(0, 1.22), borderaxespad=0, handlelength=2.2)
+    upper.tick_params(labelbottom=False)
+    lower.set_ylim(-CLOSE_M, CLOSE_M)
+    lower.set_ylabel("error (m)")
+    lower.set_xlabel("distance along the path (m)")
+    for one in (upper, lower):
+        one.set_xlim(0, at[-1])

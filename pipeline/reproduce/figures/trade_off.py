@@ -1,0 +1,110 @@
+"""Accuracy against smoothness over the control grid, the degree and the sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from flexroad.pipeline.config.models import Chain, Config
+from flexroad.pipeline.reproduce.figures.cast import changes
+from flexroad.pipeline.reproduce.figures.plate import FLEXROAD, PATH, TRUTH, Plate, new_figure
+
+NAME = "trade_off"
+SWEEPS: dict[str, tuple[str, ...]] = {
+    "Control grid": ("fit.control_points",),
+    "Degree p = q": ("fit.degree",),
+    "Sampling, road / terrain (m)": ("sample.road_m", "sample.terrain_m"),
+}
+"""What is varied, and the options that do it."""
+
+
+def plate(config: Config, full: str, done: pd.DataFrame) -> Plate:
+    """Draw road L2 over road MAD, mean over tiles, along each sweep the run has."""
+    found = {title: sweep(config.chains, full, options) for title, options in SWEEPS.items()}
+    found = {title: names for title, names in found.items() if len(names) > 1}
+    caption = (
+        "Accuracy against smoothness on roads, mean over tiles: each dot is a variant that changes the "
+        "control grid, the degree or the sampling alone; the red one is the full pipeline. Left is smoother, "
+        "lower is more accurate."
+    )
+    if not found:
+        missing = (
+            "no variant changes the control grid, the degree or the sampling alone; `--config ablation` has"
+        )
+        return Plate(NAME, caption, None, missing)
+    means = done.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
+    return Plate(NAME, caption, draw(means, found, full))
+
+
+def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:
+    """Return the variants that change nothing but these options, and the full one, in their order.
+
+    Returns
+    -------
+    dict
+        Label by variant.
+    """
+    values = {
+        variant: tuple(_value(chain, option) for option in options)
+        for variant, chain in chains.items()
+        if changes(chain, chains[full]) <= set(options)
+    }
+    # Another name for the full pipeline is no second dot.
+    once = {variant: v for variant, v in values.items() if variant == full or v != values[full]}
+    return {variant: " / ".join(map(_text, once[variant])) for variant in sorted(once, key=once.__getitem__)}
+
+
+def _value(chain: Chain, option: str) -> Any:
+    stage, name = option.split(".")
+    return getattr(chain[stage], name)
+
+
+def _text(value: Any) -> str:
+    return "×".join(map(str, value)) if isinstance(value, tuple) else f"{value:g}"
+
+
+def draw(means: pd.DataFrame, sweeps: Mapping[str, Mapping[str, str]], full: str) -> Figure:
+    """Draw one panel per sweep.
+
+    Parameters
+    ----------
+    means : DataFrame
+        ``mad_road_deg`` and ``l2_road_m`` by variant.
+    sweeps : Mapping
+        Labels by variant, by title.
+    full : str
+        The variant all sweeps go through.
+    """
+    figure = new_figure(2.4)
+    axes = figure.subplots(1, len(sweeps), sharey=True, squeeze=False)[0]
+    for one, (title, labels) in zip(axes, sweeps.items(), strict=True):
+        _panel(one, means.reindex(list(labels)), labels, full)
+        one.set_title(title)
+        one.set_xlabel("road MAD (°)")
+    axes[0].set_ylabel("road L2 (m)")
+    axes[0].set_ylim(bottom=0)
+    return figure
+
+
+def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str) -> None:
+    axes.plot(means.mad_road_deg, means.l2_road_m, color=TRUTH, linewidth=0.8)
+    for i, (variant, x, y) in enumerate(means.itertuples(name=None)):
+        colour = PATH if variant == full else FLEXROAD
+        axes.plot(x, y, "o", color=colour, markersize=4, zorder=3)
+        # Above and below in turn: neighbours on a flat stretch would write over each other.
+        up = bool(i % 2)
+        axes.annotate(
+            labels[variant],
+            (x, y),
+            (0, 5 if up else -5),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if up else "top",
+            fontsize=6.5,
+        )
+    axes.margins(x=0.25, y=0.1)
+    axes.set_xlim(left=0)

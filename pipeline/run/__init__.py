@@ -1,0 +1,1 @@
+"""A run: its record, its tiles, its lock and its log."""

@@ -1,0 +1,137 @@
+"""How the tiles of a run stand: the ledger held against the folders of the tiles and their sources.
+
+One line of the ledger, one sweep of the tile's folder, one look at each source file. Only a tile whose marker
+is not the one in the ledger costs the reading of that marker.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from flexroad.catalog import Tile
+from flexroad.catalog.storage.paths import Place, Seen, is_remote, listing, read
+from flexroad.pipeline.graph.graph import Look, TileGraph, any_gone
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.summary import MOST_TOLD, Summary, read_summary
+from flexroad.pipeline.store.database import NAME, Ledger
+from flexroad.pipeline.store.products import TileFolder
+from flexroad.pipeline.store.records import DONE, FAILED, Entry, Failure, Marker, from_failed, from_item
+
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How one tile stands."""
+
+    graph: TileGraph
+    """As its sources and the options are now; sources that are gone as they were when the tile was done."""
+    known: Entry | None
+    """Its last result, of whatever sources and options."""
+    current: bool
+    """Whether that result is of this graph, and its products are there."""
+    fresh: bool
+    """Whether besides its sources are all there."""
+    unknown: bool
+    """Whether the ledger does not have that result: it was read from the marker."""
+
+    @property
+    def done(self) -> bool:
+        """Whether the tile has the result that is asked for."""
+        return self.current and self.known is not None and self.known.state == "done"
+
+    @property
+    def failed(self) -> bool:
+        """Whether it was tried as it is now, and failed."""
+        return self.current and self.known is not None and self.known.state == "failed"
+
+
+@dataclass(frozen=True)
+class Folders:
+    """The files of a run's tiles: folder by folder on disk, by one list of a bucket."""
+
+    run: Place
+
+    def __call__(self, tile_id: str) -> dict[str, Seen]:
+        """Return the files of a tile by name."""
+        folder = TileFolder.of(self.run, tile_id).path
+        return self._listed.get(folder.name, {}) if is_remote(self.run) else listing(folder)
+
+    @cached_property
+    def _listed(self) -> dict[str, dict[str, Seen]]:
+        found: defaultdict[str, dict[str, Seen]] = defaultdict(dict)
+        for name, seen in listing(self.run / "tiles").items():
+            folder, _, file = name.partition("/")
+            found[folder][file] = seen
+        return dict(found)
+
+
+def look_at(run: Run, tiles: Iterable[Tile]) -> Iterator[Stand]:
+    """Yield how tiles of a run stand now."""
+    with Ledger.peek(run.path / NAME) as ledger:
+        yield from stands(run, ledger, tiles)
+
+
+def stands(run: Run, ledger: Ledger, tiles: Iterable[Tile] | None = None) -> Iterator[Stand]:
+    """Yield how tiles of a run stand now, all in the catalog's order if none are named; changes nothing."""
+    folders, look = Folders(run.path), run.sightings()
+    for tile in run.catalog.tiles if tiles is None else tiles:
+        yield _stand(run, tile, ledger, folders(tile.id), look)
+
+
+def _stand(run: Run, tile: Tile, ledger: Ledger, files: dict[str, Seen], look: Look) -> Stand:
+    entry = ledger.get(tile.id)
+    known = _last_result(run.folder(tile.id).path, entry, files)
+    graph = run.graph(tile, look)
+    current, unknown = _fits(known, graph, files), known is not entry
+    if known is None or current or not any_gone(graph):
+        return Stand(graph, known, current, current, unknown)
+    graph = run.graph(tile, look, known.sources)
+    return Stand(graph, known, _fits(known, graph, files), False, unknown)
+
+
+def _last_result(folder: Place, entry: Entry | None, files: dict[str, Seen]) -> Entry | None:
+    """Return a tile's last result: by the ledger, if that is of the marker, else by the marker."""
+    name = DONE if DONE in files else FAILED if FAILED in files else None
+    if name is None:
+        # A full disk leaves no marker, but what failed is known.
+        return entry if entry and entry.state == "failed" and entry.marker is None else None
+    marker = (name, files[name].size, files[name].version)
+    return entry if entry and entry.marker == marker else _from_marker(folder, marker)
+
+
+def _from_marker(folder: Place, marker: Marker) -> Entry | None:
+    try:
+        found = json.loads(read(folder / marker[0]))
+        return (from_item if marker[0] == DONE else from_failed)(found, marker)
+    except DAMAGED:
+        return None
+
+
+def _fits(known: Entry | None, graph: TileGraph, files: dict[str, Seen]) -> bool:
+    if known is None or known.fingerprint != graph.fingerprint:
+        return False
+    return all(name in files and files[name].size == size for name, size in known.sizes.items())
+
+
+def summary(run: Run) -> Summary:
+    """Return how a run stands now: every tile, its sources and its products are looked at."""
+    counts: Counter[str] = Counter()
+    failures: list[Failure] = []
+    with Ledger.peek(run.path / NAME) as ledger:
+        for now in stands(run, ledger):
+            counts["done"] += now.done
+            counts["failed"] += now.failed
+            counts["cached"] += now.done and ledger.standing(now.graph.tile.id) == "cached"
+            if now.failed and now.known and len(failures) < MOST_TOLD:
+                failures += now.known.failures
+    tiles = len(run.catalog.tiles)
+    left = tiles - counts["done"] - counts["failed"]
+    found = Summary(tiles, counts["done"], counts["failed"], counts["cached"], left, failures=tuple(failures))
+    last = read_summary(run.path)
+    known = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
+    return replace(found, **{name: last[name] for name in known if name in last})

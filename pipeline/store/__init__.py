@@ -1,0 +1,1 @@
+"""The only writers of results: artefacts, products, database and tables."""

@@ -1,0 +1,99 @@
+"""The products of one tile in a run, whose marker is written last."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import Place
+from flexroad.pipeline.graph.graph import TileGraph
+
+
+@dataclass(frozen=True)
+class TileFolder:
+    """The products of one tile in a run, and the marker that says they are whole."""
+
+    path: Place
+
+    @classmethod
+    def of(cls, run: Place, tile_id: str) -> TileFolder:
+        """Return the tile's folder in a run."""
+        return cls(run / "tiles" / plain_name(tile_id))
+
+    def done(self, graph: TileGraph) -> dict[str, Any] | None:
+        """Return the tile's item if it is done as the graph asks and its products are there."""
+        item = self._read("item.json")
+        try:
+            if item is None or item["properties"]["flexroad:fingerprint"] != graph.fingerprint:
+                return None
+            # A marker without its rows is damaged, whatever else it holds.
+            iter(item["properties"]["flexroad:rows"])
+            files = paths.listing(self.path)
+            whole = all(files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values())
+        except (OSError, KeyError, TypeError, AttributeError):
+            return None
+        return item if whole else None
+
+    def verified(self) -> bool:
+        """Tell whether the products that the item names are as they were written, byte for byte."""
+        item = self._read("item.json") or {}
+        try:
+            return all(
+                _checksum(paths.read(self.path / asset["href"])) == asset["file:checksum"]
+                for asset in item["assets"].values()
+            )
+        except (OSError, KeyError, TypeError, AttributeError):
+            return False
+
+    def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
+        """Write the products, then the item that says so.
+
+        An item of before goes first: until the new one is there, nothing vouches for a mixture of files.
+        """
+        paths.remove(self.path / "item.json")
+        for name, data in products.items():
+            paths.write(self.path / name, data)
+        paths.write(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
+        paths.remove(self.path / "failed.json")
+
+    def fail(self, failure: dict[str, Any]) -> None:
+        """Write down a failure; the tile no longer counts as done."""
+        paths.remove(self.path / "item.json")
+        paths.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
+
+    def _read(self, name: str) -> dict[str, Any] | None:
+        try:
+            found = json.loads(paths.read(self.path / name))
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) else None
+
+
+def plain_name(tile_id: str) -> str:
+    """Return what folders and files of a tile are called: its id, or one like it that makes a file name."""
+    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
+    return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
+
+
+def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
+    """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension wants)."""
+    return {
+        "href": name,
+        "type": media_type,
+        "file:size": len(data),
+        "file:checksum": _checksum(data),
+    }
+
+
+def _checksum(data: bytes) -> str:
+    return "1220" + hashlib.sha256(data).hexdigest()
+
+
+def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row with null for what JSON has no number for."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

@@ -1,0 +1,126 @@
+"""The run's tables: fixed columns, one row per (tile, variant), one row per failure."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
+from itertools import islice
+
+import pandas as pd
+
+from flexroad.catalog.storage.paths import Place, exists, read
+from flexroad.catalog.storage.staging import whole
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.store.records import Failure, Row
+
+PIECE = 10_000
+"""Rows held at a time; also the table's row groups."""
+
+COLUMNS: dict[str, str] = {
+    "tile_id": "str",
+    "variant": "str",
+    "method": "str",
+    "stratum": "str",
+    "status": "str",
+    "l2_road_m": "float64",
+    "l2_terrain_m": "float64",
+    "rmse_road_m": "float64",
+    "rmse_terrain_m": "float64",
+    "nmad_road_m": "float64",
+    "p95_road_m": "float64",
+    "mad_road_deg": "float64",
+    "mad_terrain_deg": "float64",
+    "triangles": "Int64",
+    "road_fraction": "float64",
+    "completeness": "float64",
+    "seconds": "float64",
+    "error": "str",
+    "nearest_road_m": "float64",
+    "nearest_terrain_m": "float64",
+    "residual_median_m": "float64",
+    "residual_nmad_m": "float64",
+    "residual_p95_m": "float64",
+    "curvature_per_m": "float64",
+    "edge_step_m": "float64",
+    "measured_road": "float64",
+    "dtm_road": "float64",
+    "inferred_road": "float64",
+    "dropped_road": "float64",
+    "off_dtm_m": "float64",
+    "off_dtm_road": "float64",
+    "bounded_weights": "float64",
+    "doubt_m": "float64",
+    "doubted_m2": "float64",
+    "flags": "str",
+}
+"""Columns of metrics.parquet and their types; the fixed ones first."""
+
+
+def metrics_frame(rows: Sequence[Row]) -> pd.DataFrame:
+    """Return the rows as a table with the fixed columns."""
+    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
+    return frame.astype(COLUMNS)
+
+
+def write_tables(run: Place, rows: Iterable[Row], failures: Iterable[Failure]) -> None:
+    """Write metrics.parquet and failures.csv, piece by piece.
+
+    Raises
+    ------
+    OSError
+        If they cannot be written, as on a full disk.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
+    with whole(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
+        for piece in _pieces(rows):
+            table.write_table(pa.Table.from_pandas(metrics_frame(piece), schema, preserve_index=False))
+    names = [field.name for field in fields(Failure) if field.name != "trace"]
+    with whole(run / "failures.csv") as path, path.open("w", newline="") as file:
+        lines = csv.writer(file, lineterminator="\n")
+        lines.writerow(names)
+        lines.writerows([getattr(failure, name) for name in names] for failure in failures)
+
+
+def _pieces(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    left = iter(rows)
+    while piece := list(islice(left, PIECE)):
+        yield piece
+
+
+def read_metrics(run: Place) -> pd.DataFrame:
+    """Read the rows of a run.
+
+    Raises
+    ------
+    ConfigError
+        If there are none yet, or the table is damaged.
+    """
+    path = run / "metrics.parquet"
+    if not exists(path):
+        raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
+    try:
+        # Runs of earlier days lack the later columns.
+        return frame_of(read(path)).reindex(columns=list(COLUMNS))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error
+
+
+def frame_of(data: bytes) -> pd.DataFrame:
+    """Return a table of a Parquet file's bytes.
+
+    Raises
+    ------
+    OSError, ValueError
+        If they are no such file.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    # pandas' own way starts threads, which may be alive when a short command ends, and abort it then.
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    found: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
+    return found
