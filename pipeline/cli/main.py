@@ -21,7 +21,6 @@ from flexroad.pipeline.cli.run import rerun, run, status
 from flexroad.pipeline.cli.train import train
 from flexroad.pipeline.errors import ConfigError
 
-
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
