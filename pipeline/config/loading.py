@@ -18,7 +18,7 @@ from flexroad.pipeline.errors import ConfigError
 def shipped() -> dict[str, Path]:
     """Return the configurations that come with the program, by name."""
     # In a checkout the package is a link to this folder, and the configurations lie beside it, too.
-    folder = Path(__file__).resolve().parents[1] / "configs"
+    folder = Path(__file__).resolve().parents[2] / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
