@@ -14,6 +14,18 @@ from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.models import DEFAULTS, TAG, Config, Export, stage_models
 from flexroad.pipeline.errors import ConfigError
 
+SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
+RENAMED = {
+    "variant": "; it is called method",
+    "grounded": "; it is called planar",
+    "solver": SPLINE,
+    "smoothness": SPLINE,
+    "huber_m": SPLINE,
+    "bending_m3": SPLINE,
+    "bending_terrain": SPLINE,
+}
+"""Words of earlier versions, and what stands for them."""
+
 
 def shipped() -> dict[str, Path]:
     """Return the configurations that come with the program, by name."""
@@ -155,11 +167,15 @@ def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> A
 
 def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
     # A discriminated union puts the chosen method first in the path; the file has no such level.
-    tags = model.json_schema().get("discriminator", {}).get("mapping", {})
-    path = [str(part) for i, part in enumerate(fault["loc"]) if i or part not in tags]
+    keys = _keys(model)
+    method = next((str(part) for part in fault["loc"][:1] if part in keys), "")
+    path = [str(part) for part in fault["loc"][bool(method) :]]
     key = ".".join([where, *path])
     if fault["type"] == "extra_forbidden":
-        return f"{key}: unknown key{_hint(path[-1], _keys(model))}"
+        return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
+    if fault["type"] == "union_tag_invalid":
+        tag = fault["ctx"]["tag"]
+        return f"{key}: there is no method {tag!r}{RENAMED.get(tag) or _hint(tag, sorted(keys))}"
     message = fault["msg"].removeprefix("Value error, ")
     if isinstance(fault["input"], dict):
         # A fault of several options together has told their values itself.
@@ -167,10 +183,22 @@ def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
     return f"{key}: {message[0].lower()}{message[1:]}, not {fault['input']!r}"
 
 
-def _keys(model: TypeAdapter[Any]) -> list[str]:
-    found = model.json_schema()
-    models = [found, *found.get("$defs", {}).values()]
-    return sorted({key for m in models for key in m.get("properties", {})})
+def _remedy(key: str, method: str, keys: Mapping[str, list[str]]) -> str:
+    others = [name for name, known in keys.items() if key in known and name != method]
+    if key not in RENAMED and others:
+        return f"; it is an option of method {' and '.join(others)}, not of {method}"
+    return RENAMED.get(key) or _hint(key, keys[method])
+
+
+def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
+    """Return the options of each method of a stage; of a stage without methods, those of ``""``."""
+    schema = model.json_schema()
+    tags = schema.get("discriminator", {}).get("mapping", {"": ""})
+    parts = {tag: schema["$defs"][ref.rpartition("/")[2]] if ref else schema for tag, ref in tags.items()}
+    found = {tag: list(part.get("properties", {})) for tag, part in parts.items()}
+    # Options within options, such as how a mask is cleaned.
+    within = [key for part in schema.get("$defs", {}).values() for key in part.get("properties", {})]
+    return {tag: sorted({*own, *(within if tags == {"": ""} else ())}) for tag, own in found.items()}
 
 
 def _main(chains: Mapping[str, Any]) -> tuple[str, ...]:

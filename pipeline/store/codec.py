@@ -17,6 +17,7 @@ import numpy as np
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.config.models import methods
+from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
 HEADER = "header.json"
@@ -67,9 +68,8 @@ def _plain(item: Any) -> Any:
 
 
 def _types() -> dict[str, type]:
-    known: dict[str, type] = {
-        kind.__name__: kind for kind in (Mesh, Metrics, Quality, RoadClusters, RoadMask)
-    }
+    kinds = (Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
+    known: dict[str, type] = {kind.__name__: kind for kind in kinds}
     for module in methods("flexroad.tasks.fit").values():
         known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
     return known

@@ -73,8 +73,8 @@ def factor(lower: Floats) -> Floats:
     factored, failed = dpbtrf(lower.T, lower=1, overwrite_ab=1)
     if failed:
         raise TaskError(
-            f"control point {failed} of the surface is undetermined; take fewer (fit.control_points), "
-            "or set fit.smoothness to bending"
+            f"control point {failed} of the surface is undetermined; take fewer (a larger fit.spacing_m), "
+            "or raise fit.bending_m3"
         )
     return np.asarray(factored)
 

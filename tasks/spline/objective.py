@@ -62,8 +62,8 @@ def objective(
     heights: Floats,
     factor: Floats,
     space: tuple[Floats, Floats, tuple[int, int]],
-    lambda_reg: float,
-    free_weights: bool,
+    lambda_reg: float = 0.0,
+    free_weights: bool = False,
 ) -> Objective:
     """Prepare the objective for a raster whose outermost cell centres span the domain.
 

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.types import Floats
 
 Starts = NDArray[np.intp]
@@ -122,6 +122,29 @@ class NurbsSurface:
     """Height that heights in ``A`` are relative to (m)."""
     origin: tuple[float, float]
     """Whole-metre (easting, northing) near the south-west that exported coordinates are relative to."""
+
+    @classmethod
+    def over(
+        cls,
+        grid: Grid,
+        space: tuple[Floats, Floats, tuple[int, int]],
+        A: Floats,
+        W: Floats,
+        datum: float,
+    ) -> NurbsSurface:
+        """Return the surface with these knots, degrees and coefficients over the hull of a grid's centres."""
+        east, north = grid.origin
+        return cls(
+            crs=grid.crs,
+            bounds=grid.hull,
+            degree=space[2],
+            knots_u=space[0],
+            knots_v=space[1],
+            A=A,
+            W=W,
+            datum=datum,
+            origin=(float(east), float(north)),
+        )
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""

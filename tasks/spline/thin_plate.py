@@ -1,14 +1,14 @@
-"""The bending energy of a B-spline height field: what a thin plate of its shape would resist.
+"""The bending energy of a B-spline height field, that of a thin plate of its shape.
 
 ``E = sum over cells of stiffness * (z_xx^2 + 2 z_xy^2 + z_yy^2)``, derivatives by metres, so that it depends
-neither on the tile's size nor on the number of control points; planes have none. Summed over the cells, for
-the stiffness may differ from cell to cell: a road is stiffer than the ground beside it.
+neither on the tile's size nor on the number of control points; planes have none. The sum is over the cells
+because the stiffness may differ from cell to cell: a road is stiffer than the ground beside it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,8 +21,8 @@ Derivatives = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
-class Plate:
-    """A thin plate under the raster."""
+class BendingEnergy:
+    """The bending energy of a thin plate over a raster."""
 
     stiffness: Floats
     """Cost of squared curvature in each cell, ``(H, W)``, m3."""
@@ -30,10 +30,6 @@ class Plate:
     """At the columns, by metres."""
     along_v: Derivatives
     """At the rows, by metres."""
-
-    def times(self, factor: float) -> Plate:
-        """Return a plate so many times as stiff."""
-        return replace(self, stiffness=factor * self.stiffness)
 
     def __call__(self, z: Floats) -> tuple[float, Floats]:
         """Return the energy (m) of control heights ``(m, n)`` and its gradient."""
@@ -59,10 +55,10 @@ class Plate:
         yield 1.0, self.along_v[2], self.along_u[0]
 
 
-def plate(
+def bending_energy(
     stiffness: Floats, space: tuple[Floats, Floats, tuple[int, int]], spans_m: tuple[float, float]
-) -> Plate:
-    """Return the plate of a raster whose outermost cell centres span the domain.
+) -> BendingEnergy:
+    """Return the bending energy over a raster whose outermost cell centres span the domain.
 
     Parameters
     ----------
@@ -77,7 +73,7 @@ def plate(
     knots_u, knots_v, (p, q) = space
     along_u = _derivatives(knots_u, p, np.linspace(0, 1, cols), spans_m[0])
     along_v = _derivatives(knots_v, q, np.linspace(1, 0, rows), spans_m[1])
-    return Plate(stiffness, along_u, along_v)
+    return BendingEnergy(stiffness, along_u, along_v)
 
 
 def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Derivatives:

@@ -25,6 +25,7 @@ from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs as fit
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.spline import adam
+from flexroad.tasks.spline.space import start_heights
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
@@ -81,8 +82,8 @@ def experiment(tile, store: Store) -> list[dict[str, float | str]]:
 
 def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
     """Fit as the pipeline does, but from the tile's mean height."""
-    space = fit.spline_space(data.grid, options)
-    heights, datum = fit.start_heights(data, clusters.mask, space, options.terrain)
+    space = fit.space_of(data, options)
+    heights, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = fit.objective_of(data, clusters.mask, space, datum, options)
     limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]
     schedule = adam.Schedule(
@@ -94,7 +95,7 @@ def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) ->
 
 def squared(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
     """Fit by separable least squares, without regulariser, with unit weights."""
-    space = fit.spline_space(data.grid, options)
+    space = fit.space_of(data, options)
     rows, cols = data.grid.shape
     along_u = basis_matrix(space[0], space[2][0], np.linspace(0, 1, cols))[0]
     along_v = basis_matrix(space[1], space[2][1], np.linspace(1, 0, rows))[0]

@@ -143,7 +143,7 @@ def kept(case: Case, function: Filter) -> pd.Series:
 
 def fitted_table(name: str, cases: Sequence[Case]) -> None:
     fits = {
-        "unit": nurbs.Options(weights="unit", solver="irls", spacing_m=7.3),
+        "unit": nurbs.Options(weights="unit", spacing_m=7.3),
         "paper": nurbs.Options(spacing_m=7.3),
     }
     rows = {

@@ -18,6 +18,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.objective import NEIGHBOURS, Objective
+from flexroad.tasks.spline.space import start_heights
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
@@ -148,8 +149,8 @@ def best(function: Callable[[], object], repeats: int) -> float:
 def main() -> None:
     """Print the table; an error if the three do not compute the same, or the fit is too slow."""
     data, clusters = case()
-    space = nurbs.spline_space(data.grid, OPTIONS)
-    heights, datum = nurbs.start_heights(data, clusters.mask, space, True)
+    space = nurbs.space_of(data, OPTIONS)
+    heights, datum = start_heights(data, clusters.mask, space, True)
     objective = nurbs.objective_of(data, clusters.mask, space, datum, OPTIONS)
     start = np.stack([heights - datum, np.zeros_like(heights)])
     limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]

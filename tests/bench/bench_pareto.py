@@ -29,7 +29,7 @@ from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
-from flexroad.tasks.fit import nurbs
+from flexroad.tasks.fit import nurbs, smoothing_spline
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.segment import mask
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, TileData
@@ -37,40 +37,29 @@ from flexroad.tasks.types import Bools, RoadClusters, RoadMask, TileData
 TILES, SEED = 48, 1
 SOUND_M = 0.3
 NOISE_M, SCAR_M, BUILDING_M = 0.1, 0.3, 2.0
-IRLS = {"weights": "unit", "solver": "irls"}
-PLATE = {**IRLS, "smoothness": "bending"}
 
 
-def grid(n: int) -> dict[str, object]:
-    return {"control_points": (n, n)}
+def bending(points: int, **options: float) -> smoothing_spline.Options:
+    """Return options with so many control points each way over a tile, all differences absolute."""
+    plain = {"bending_m3": 100, "lambda_terrain": 1, "huber_m": 0}
+    return smoothing_spline.Options(spacing_m=249 / (points - 1), **(plain | options))
 
 
 LESS = {"lambda_terrain": 0.3}
-CHOICES: dict[str, dict[str, object]] = {
-    "paper: free weights, Adam, 35": {},
-    "unit weights, Adam, 35": {"weights": "unit"},
-    **{f"range, {n}": {**IRLS, **grid(n)} for n in (35, 50, 70)},
-    "range, 70, terrain 0.3": {**IRLS, **grid(70), **LESS},
+CHOICES: dict[str, nurbs.Options | smoothing_spline.Options] = {
+    "paper: free weights, Adam, 35": nurbs.Options(),
+    "unit weights, Adam, 35": nurbs.Options(weights="unit"),
+    **{f"bending {b} all over, 70": bending(70, bending_m3=b, bending_terrain=1) for b in (30, 100)},
+    "bending 100 on roads, 70": bending(70),
+    **{f"bending {b} on roads, 70, terrain 0.3": bending(70, **LESS, bending_m3=b) for b in (30, 100, 300)},
+    "bending 100 on roads, 50, terrain 0.3": bending(50, **LESS),
+    "bending 100 on roads, 35, terrain 0.3": bending(35, **LESS),
     **{
-        f"bending {b} all over, 70": {**PLATE, **grid(70), "bending_m3": b, "bending_terrain": 1}
-        for b in (30, 100)
-    },
-    "bending 100 on roads, 70": {**PLATE, **grid(70)},
-    **{
-        f"bending {b} on roads, 70, terrain 0.3": {**PLATE, **grid(70), **LESS, "bending_m3": b}
-        for b in (30, 100, 300)
-    },
-    "bending 100 on roads, 50, terrain 0.3": {**PLATE, **grid(50), **LESS},
-    "bending 100 on roads, 35, terrain 0.3": {**PLATE, **LESS},
-    "bending auto on roads, 70, terrain 0.3": {**PLATE, **grid(70), **LESS, "bending_m3": "auto"},
-    **{
-        f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1": {**PLATE, **grid(n), **LESS, "huber_m": 0.1}
+        f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1": bending(n, **LESS, huber_m=0.1)
         for n in (50, 70)
     },
-    "bending 100 on roads, 50, terrain 0.5, Huber 0.1": {
-        **PLATE, **grid(50), "lambda_terrain": 0.5, "huber_m": 0.1,
-    },
-}  # fmt: skip
+    "bending 100 on roads, 50, terrain 0.5, Huber 0.1": bending(50, lambda_terrain=0.5, huber_m=0.1),
+}
 """Name: options of the fit. The number behind the smoothness is that of control points each way."""
 
 
@@ -142,7 +131,8 @@ def rows(found: Case) -> Iterator[dict[str, float | str]]:
     for roads, kept in found.roads.items():
         for name, options in CHOICES.items():
             start = time.process_time()
-            surface = nurbs.fit(found.data, kept, nurbs.Options(**options))
+            method = nurbs if options.method == "nurbs" else smoothing_spline
+            surface = method.fit(found.data, kept, options)
             seconds = time.process_time() - start
             mesh = sample.sample(surface, found.road, kept, sample.Options())
             figures = evaluate.evaluate(mesh, found.data, found.road, evaluate.Options())

@@ -390,7 +390,7 @@ DEEP = "{a: " * 2000 + "1" + "}" * 2000
             "degree 5 needs more control points each way than 5 x 9",
         ),
         ("fit: {learning_rate: .inf}", "fit.learning_rate: input should be a finite number, not inf"),
-        ("fit: bspline", "fit: input tag 'bspline'"),
+        ("fit: bspline", "fit: there is no method 'bspline'"),
         ("fit:\n\tdegree: 3", "not readable as YAML: .*line 2"),
         ("- a", "expected a mapping, not ['a']"),
         ("variants: [a, b]", "variants: expected a mapping, not ['a', 'b']"),

@@ -78,7 +78,7 @@ def test_loss_is_the_papers():
             if (a, b) != (i, j) and 0 <= a < z.shape[0] and 0 <= b < z.shape[1]
         ]  # fmt: skip
         reg += (max(z[i, j] - p for p in around) - min(z[i, j] - p for p in around)) ** 2
-    space = nurbs.spline_space(data.grid, opts)
+    space = nurbs.space_of(data, opts)
     evaluate = nurbs.objective_of(data, clusters.mask, space, surface.datum, opts)
     value, _ = evaluate(np.stack([z, np.log(surface.W)]))
     assert value == pytest.approx(loss / count + 0.2 * reg / z.size, rel=1e-10)
@@ -120,7 +120,7 @@ def test_engines_agree():
 def test_loss_decreases_and_ends_low():
     data, clusters, _ = tile(noise=0.05)
     opts = options()
-    space = nurbs.spline_space(data.grid, opts)
+    space = nurbs.space_of(data, opts)
     evaluate = nurbs.objective_of(data, clusters.mask, space, 160.0, opts)
     z = np.zeros((15, 15))
     limit = np.array([np.inf, 1.0])[:, None, None]
