@@ -1,8 +1,29 @@
 """What exists: tiles, where they lie, and where their layers are."""
 
-from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.index import Catalog
-from flexroad.catalog.tile import LAYERS, Layer, Tile
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flexroad.catalog.errors import CatalogError
+    from flexroad.catalog.grid import Bounds, Grid
+    from flexroad.catalog.index import Catalog
+    from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 __all__ = ["LAYERS", "Bounds", "Catalog", "CatalogError", "Grid", "Layer", "Tile"]
+
+_HOMES = {
+    "errors": ("CatalogError",),
+    "grid": ("Bounds", "Grid"),
+    "index": ("Catalog",),
+    "tile": ("LAYERS", "Layer", "Tile"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: commands that open no catalog start without its libraries."""
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"flexroad.catalog.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,18 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
-from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import Unit, height_unit
-from flexroad.catalog.headers.rasters import quiet
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.raster import Patch, Unreadable, misfit, onto, read
 from flexroad.tasks.types import Bools, Floats, Source, TileData
+
+if TYPE_CHECKING:
+    from flexroad.tasks.io.raster import Patch
 
 VERSION = 1
 
@@ -84,6 +85,8 @@ def load(tile: Tile, options: Options) -> TileData:
     for name in ("dsm", "dtm"):
         if tile.layer(name) is None:
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")
+    from flexroad.catalog.headers.rasters import quiet
+
     grid = tile.grid.buffered(options.halo_m)
     with quiet():
         found = {layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in READS}
@@ -122,6 +125,10 @@ def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:
 
 
 def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
+    from rasterio.enums import Resampling
+
+    from flexroad.tasks.io.raster import Unreadable, misfit, onto, read
+
     values = np.full(grid.shape, np.nan)
     reached = np.zeros(grid.shape, bool)
     broken: list[Unreadable] = []

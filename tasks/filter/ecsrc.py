@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks import options as base
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.filter.kit.union_find import Roots, clean, flatten, half_disc, least_cells, plant, root
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
 
@@ -70,7 +70,7 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     return RoadClusters(data.grid, labels)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: float) -> None:
     """Unite the sets of any two points one of the steps apart and within ``theta_z`` in height."""
     rows, cols = heights.shape

@@ -13,12 +13,12 @@ import math
 from typing import Literal
 
 import numpy as np
-from numba import njit
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import binary_erosion, distance_transform_edt, label
 
 from flexroad.tasks import options as base
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.filter.kit.ground_consistency import ALONE, ON, against_known
 from flexroad.tasks.filter.kit.planar_patches import Patches, flat_patches
 from flexroad.tasks.filter.kit.union_find import Roots, clean, flatten, half_disc, least_cells, plant, root
@@ -118,10 +118,10 @@ def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
     """
     if not kept.any() or width <= 0:
         return np.zeros_like(mask)
-    parts, count = label(mask, np.ones((3, 3)))
+    parts, count = scipy.ndimage.label(mask, np.ones((3, 3)))
     street = np.zeros(count + 1, np.bool_)
     street[parts[kept]] = True
-    verge: Bools = ~mask & (distance_transform_edt(~street[parts]) <= width)
+    verge: Bools = ~mask & (scipy.ndimage.distance_transform_edt(~street[parts]) <= width)
     return verge
 
 
@@ -173,11 +173,11 @@ def _labels(kept: Bools, cell: float, options: Options) -> NDArray[np.int32]:
 
 def _edges(members: Bools) -> Bools:
     """Return the members with a neighbour that is none: of two clusters the nearest cells are such."""
-    edges: Bools = members & ~binary_erosion(members, np.ones((3, 3)))
+    edges: Bools = members & ~scipy.ndimage.binary_erosion(members, np.ones((3, 3)))
     return edges
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _join(
     roots: Roots, members: Bools, steps: NDArray[np.int64], heights: Floats, slope: Floats, theta: float
 ) -> None:
@@ -204,7 +204,7 @@ def _join(
             roots[b] = a
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _covered(roots: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
     """Return the first of the clusters whose patches cover a cell, ``(H, W)``; -1 where none does."""
     rows, cols = roots.shape

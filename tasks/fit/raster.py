@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 
@@ -75,7 +75,7 @@ class RasterSurface:
         return np.asarray(_on_triangles(ringed, cols.ravel(), rows.ravel()).reshape(*cols.shape, 3))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _on_triangles(heights: Floats, cols: Floats, rows: Floats) -> Floats:
     out = np.empty((cols.size, 3))
     for k in range(cols.size):
@@ -94,13 +94,13 @@ def _on_triangles(heights: Floats, cols: Floats, rows: Floats) -> Floats:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _snapped(position: float) -> float:
     nearest = np.rint(position)
     return float(nearest if abs(position - nearest) < SNAP else position)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _part(share: float, height: float) -> float:
     """Return what a corner adds; nothing, not NaN, if the point lies on the opposite edge."""
     return 0.0 if share == 0 else share * height

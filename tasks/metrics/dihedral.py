@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Mesh
 
 Indices = NDArray[np.int32]
@@ -25,7 +25,7 @@ def mean_angles(mesh: Mesh) -> Floats:
         return np.asarray(np.degrees(totals / counts))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _normals(vertices: Floats, faces: Indices) -> Floats:
     """Return a normal per face, ``(F, 3)``, as long as the face's doubled area."""
     normals = np.empty((faces.shape[0], 3))
@@ -38,7 +38,7 @@ def _normals(vertices: Floats, faces: Indices) -> Floats:
     return normals
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _edges(faces: Indices, vertices: int) -> tuple[Indices, Indices, Indices]:
     """Sort the faces' edges by their lower vertex.
 
@@ -61,7 +61,7 @@ def _edges(faces: Indices, vertices: int) -> tuple[Indices, Indices, Indices]:
     return start, far, owner
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _add_angles(
     normals: Floats, start: Indices, far: Indices, owner: Indices, totals: Floats, counts: Floats
 ) -> None:

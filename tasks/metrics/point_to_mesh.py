@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 Indices = NDArray[np.int32]
@@ -42,7 +42,7 @@ def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _bins(boxes: Indices, rows: int, cols: int) -> tuple[Indices, Indices]:
     """List the faces whose bounding box touches each bin.
 
@@ -64,7 +64,7 @@ def _bins(boxes: Indices, rows: int, cols: int) -> tuple[Indices, Indices]:
     return start, members
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _search(
     vertices: Floats,
     faces: Indices,
@@ -99,7 +99,7 @@ def _search(
         out[i] = math.sqrt(best)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _to_triangle(vertices: Floats, face: Indices, x: float, y: float, z: float, best: float) -> float:
     """Return the squared distance from a point to a triangle, or ``best`` if its bounding box is farther."""
     ax, ay, az = vertices[face[0], 0] - x, vertices[face[0], 1] - y, vertices[face[0], 2] - z
@@ -127,7 +127,7 @@ def _to_triangle(vertices: Floats, face: Indices, x: float, y: float, z: float, 
     return min(ab, bc, ca)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _to_edge(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     """Return the squared distance from the origin to the segment a - b."""
     ux, uy, uz = bx - ax, by - ay, bz - az

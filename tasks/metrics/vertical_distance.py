@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Mesh
 
 TOLERANCE_M = 1e-6
@@ -28,7 +28,7 @@ def drape(mesh: Mesh, grid: Grid) -> Floats:
     return heights
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _drape(points: Floats, faces: NDArray[np.int32], cell: float, heights: Floats) -> None:
     rows, cols = heights.shape
     for f in range(faces.shape[0]):

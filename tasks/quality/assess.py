@@ -8,9 +8,9 @@ doubt; tiles with the most are worth a look first. A fault in one place shows as
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import distance_transform_edt, label, uniform_filter
 
 from flexroad.tasks import options as base
 from flexroad.tasks.metrics.statistics import mean, nmad
@@ -151,15 +151,18 @@ def doubt(
     by_scan = np.where(kept, np.maximum(np.abs(off_dsm), scatter), np.nan)
     inferred = rests_on == Support.INFERRED
     by_dtm = np.where(inferred, np.nan, np.abs(off_dtm))
-    away = distance_transform_edt(inferred) * cell
+    away = scipy.ndimage.distance_transform_edt(inferred) * cell
     return np.where(inferred, AGREE_M + rise(away), np.fmin(by_scan, by_dtm))
 
 
 def _scatter(values: Floats, known: Bools, size: int) -> Floats:
     """Return the standard deviation of the known values in a square around each cell; 0 without any."""
-    share = np.maximum(uniform_filter(known.astype(np.float64), size), 1e-9)
+    share = np.maximum(scipy.ndimage.uniform_filter(known.astype(np.float64), size), 1e-9)
     values = np.where(known, values, 0.0)
-    mean, square = uniform_filter(values, size) / share, uniform_filter(values**2, size) / share
+    mean, square = (
+        scipy.ndimage.uniform_filter(values, size) / share,
+        scipy.ndimage.uniform_filter(values**2, size) / share,
+    )
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
@@ -184,7 +187,7 @@ def _edge_steps(height: Floats, on_road: Bools) -> Floats:
 
 def _patch(cells: Bools) -> int:
     """Return how many cells the largest patch of neighbours has."""
-    patches, _ = label(cells)
+    patches, _ = scipy.ndimage.label(cells)
     return int(np.bincount(patches[cells], minlength=1).max())
 
 

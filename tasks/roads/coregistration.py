@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Bools, Floats, Photo, TileData
@@ -115,7 +115,7 @@ def pair(data: TileData, photo: Photo) -> Pair:
     height = np.where(known, height, ground)
     height = np.where(np.isfinite(height), height, np.nanmin(height, initial=9e9))
     above = np.nan_to_num(height - ground)
-    rough = ndimage.uniform_filter(np.abs(height - ndimage.median_filter(height, 5)), 5)
+    rough = scipy.ndimage.uniform_filter(np.abs(height - scipy.ndimage.median_filter(height, 5)), 5)
     high = np.clip((above - 0.5) / 2, 0, 1)
     n = _reach(grid.cell)
     always = [_expected(values, known, grid.cell) for values in (high, high * np.clip(2 * rough, 0, 1))]
@@ -179,8 +179,10 @@ def _light(height: Floats, cell: float, sun: Sun) -> tuple[Floats, Floats]:
     """Return how far a cell lies in the cast shadow and how squarely it faces the sun, both 0 to 1."""
     azimuth, rise = math.radians(sun[0]), math.radians(sun[1])
     east, north = math.sin(azimuth), math.cos(azimuth)
-    shade = ndimage.gaussian_filter(_shadow(height, cell, east, north, math.tan(rise)).astype(float), 0.5)
-    southward, eastward = np.gradient(ndimage.gaussian_filter(height, 0.7), cell)
+    shade = scipy.ndimage.gaussian_filter(
+        _shadow(height, cell, east, north, math.tan(rise)).astype(float), 0.5
+    )
+    southward, eastward = np.gradient(scipy.ndimage.gaussian_filter(height, 0.7), cell)
     facing = math.sin(rise) - math.cos(rise) * (east * eastward - north * southward)
     return shade, np.clip(facing / np.sqrt(1 + southward**2 + eastward**2), 0, 1)
 
@@ -245,8 +247,8 @@ def _targets(photo: Photo, grid: Grid) -> tuple[Floats, Floats]:
 def _detail(values: Floats, cell: float) -> Floats:
     """Return the values less their smooth part, ``(H, W)``; 0 where unknown."""
     known = np.isfinite(values)
-    weight = ndimage.gaussian_filter(known.astype(float), DETAIL_M / cell)
-    smooth = ndimage.gaussian_filter(np.where(known, values, 0.0), DETAIL_M / cell)
+    weight = scipy.ndimage.gaussian_filter(known.astype(float), DETAIL_M / cell)
+    smooth = scipy.ndimage.gaussian_filter(np.where(known, values, 0.0), DETAIL_M / cell)
     return np.where(known, values - smooth / np.maximum(weight, 1e-9), 0.0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import correlate1d, distance_transform_edt
+import scipy
 
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
@@ -49,7 +49,7 @@ def unsound(data: TileData, road: RoadMask, kept: Bools) -> Bools:
     asked = road.mask & ~kept & np.isfinite(data.dtm)
     if not (asked.any() and kept.any()):
         return np.zeros_like(asked)
-    away = distance_transform_edt(~kept) * data.grid.cell
+    away = scipy.ndimage.distance_transform_edt(~kept) * data.grid.cell
     expected, scatter = continuation(data.dsm, kept, data.grid.cell)
     off = np.abs(data.dtm - expected)
     return np.asarray(asked & (away <= REACH_M) & (off > AGREE_M + scatter + rise(away)))
@@ -108,5 +108,5 @@ def _moment(values: Floats, cell: float, row_power: int, col_power: int) -> Floa
     n = int(REACH_M / cell)
     offset = np.arange(-n, n + 1) * cell
     bell = np.exp(-0.5 * (offset / NEAR_M) ** 2)
-    along = correlate1d(values, bell * offset**row_power, axis=0, mode="constant")
-    return np.asarray(correlate1d(along, bell * offset**col_power, axis=1, mode="constant"))
+    along = scipy.ndimage.correlate1d(values, bell * offset**row_power, axis=0, mode="constant")
+    return np.asarray(scipy.ndimage.correlate1d(along, bell * offset**col_power, axis=1, mode="constant"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from flexroad.tasks.types import Bools, TileData
 
@@ -15,7 +15,7 @@ def outside(data: TileData) -> Bools:
     A void inside, as water or deep shade leave one, is no end of the survey: meshes bridge it.
     """
     void = np.isnan(data.dsm) & np.isnan(data.dtm)
-    labels, _ = ndimage.label(void)
+    labels, _ = scipy.ndimage.label(void)
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     beyond: Bools = np.isin(labels, edge[edge > 0])
     return beyond

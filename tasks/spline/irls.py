@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
-from scipy.optimize import minimize_scalar
-from scipy.sparse import csr_array
+import scipy
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.spline.normal_equations import band, factor, gram, pairs, solve
 from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.surface import dense
@@ -54,7 +53,7 @@ class HuberObjective:
         return dense(self.objective.start_u, self.objective.along_u.T, self.shape[1])
 
     @cached_property
-    def pairs(self) -> tuple[csr_array, csr_array]:
+    def pairs(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         """Products of the basis functions that overlap, along v and along u."""
         return pairs(self.along_v, self.lags), pairs(self.along_u, self.lags)
 
@@ -139,7 +138,9 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
         step = solve(factored, -slope)
         change = loss.heights(step)
         along = loss.line_loss(z, off, step, change)
-        found = minimize_scalar(along, bounds=(0, FARTHEST), method="bounded", options={"xatol": NEAR})
+        found = scipy.optimize.minimize_scalar(
+            along, bounds=(0, FARTHEST), method="bounded", options={"xatol": NEAR}
+        )
         if found.fun < losses[-1]:
             z, off = z + found.x * step, off + found.x * change
         losses.append(min(float(found.fun), losses[-1]))
@@ -148,7 +149,7 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
     return Solution(z, losses)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")
 def _differences(off: Floats, change: Floats, t: float, factor: Floats, huber_m: float) -> float:
     """Return the sum over cells of Huber's function of ``off + t * change`` times the factor (m)."""
     sums = np.zeros(off.shape[1])

@@ -8,8 +8,7 @@ products with sparse matrices, first along v, then along u.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dpbtrf, dpbtrs
-from scipy.sparse import csr_array
+import scipy
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
@@ -18,7 +17,7 @@ RIDGE = 1e-9
 """Part of the diagonal's mean added to it: control points that nothing holds then stay where they are."""
 
 
-def pairs(basis: Floats, lags: int) -> csr_array:
+def pairs(basis: Floats, lags: int) -> scipy.sparse.csr_array:
     """Return each function times itself and the next ones, ``(points * lags, N)``.
 
     Parameters
@@ -32,10 +31,12 @@ def pairs(basis: Floats, lags: int) -> csr_array:
     out = np.zeros((points, lags, len(basis)))
     for lag in range(lags):
         out[: points - lag, lag] = (basis[:, : points - lag] * basis[:, lag:]).T
-    return csr_array(out.reshape(-1, len(basis)))
+    return scipy.sparse.csr_array(out.reshape(-1, len(basis)))
 
 
-def gram(weight: Floats, pairs_v: csr_array, pairs_u: csr_array, lags: int) -> Floats:
+def gram(
+    weight: Floats, pairs_v: scipy.sparse.csr_array, pairs_u: scipy.sparse.csr_array, lags: int
+) -> Floats:
     """Return the weighted products of basis functions, summed over the cells ``(H, W)``.
 
     Returns
@@ -70,7 +71,7 @@ def factor(lower: Floats) -> Floats:
         If rounding has made the matrix indefinite.
     """
     lower[:, 0] += RIDGE * lower[:, 0].mean() + np.finfo(float).tiny
-    factored, failed = dpbtrf(lower.T, lower=1, overwrite_ab=1)
+    factored, failed = scipy.linalg.lapack.dpbtrf(lower.T, lower=1, overwrite_ab=1)
     if failed:
         raise TaskError(
             f"control point {failed} of the surface is undetermined; take fewer (a larger fit.spacing_m), "
@@ -81,5 +82,5 @@ def factor(lower: Floats) -> Floats:
 
 def solve(factored: Floats, right: Floats) -> Floats:
     """Solve for one right-hand side, in its shape."""
-    solution, _ = dpbtrs(factored, right.ravel(), lower=1)
+    solution, _ = scipy.linalg.lapack.dpbtrs(factored, right.ravel(), lower=1)
     return np.asarray(solution.reshape(right.shape))

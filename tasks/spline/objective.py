@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.spline.surface import Starts, basis
 from flexroad.tasks.types import Floats
 
@@ -95,7 +95,7 @@ def objective(
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")
 def _data_terms(
     a: Floats, w: Floats, target: Floats, factor: Floats, start_u: Starts, along_u: Floats,
     start_v: Starts, along_v: Floats, by_a: Floats, by_w: Floats,
@@ -136,7 +136,7 @@ def _data_terms(
     return float(losses.sum())
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _along_u(coefficients: Floats, start_u: Starts, along_u: Floats) -> Floats:
     out = np.zeros((coefficients.shape[0], start_u.size))
     for i in range(coefficients.shape[0]):
@@ -146,7 +146,7 @@ def _along_u(coefficients: Floats, start_u: Starts, along_u: Floats) -> Floats:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, out: Floats) -> None:
     for i in range(out.shape[0]):
         for c in range(start_u.size):
@@ -154,7 +154,7 @@ def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, out: Float
                 out[i, start_u[c] + j] += along_u[j, c] * gradient[i, c]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def range_term(z: Floats, lambda_reg: float, neighbours: NDArray[np.int64], by_z: Floats) -> float:
     """Return the regulariser (Eq. loss_ctrl) and add its gradient to ``by_z``.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, map_coordinates
+import scipy
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
@@ -73,7 +73,9 @@ def start_heights(data: TileData, road: Bools, space: Space, terrain: bool = Tru
     u, v = (greville(knots, degree) for knots, degree in zip(space[:2], space[2], strict=True))
     cols, rows = u * (data.grid.width - 1), (1 - v) * (data.grid.height - 1)
     if terrain and np.isfinite(data.dtm).any():
-        heights = map_coordinates(_nearest_filled(data.dtm), np.meshgrid(rows, cols, indexing="ij"), order=1)
+        heights = scipy.ndimage.map_coordinates(
+            _nearest_filled(data.dtm), np.meshgrid(rows, cols, indexing="ij"), order=1
+        )
     else:
         r, c = np.nonzero(road & np.isfinite(data.dsm))
         if not len(r):
@@ -88,5 +90,5 @@ def _nearest_filled(heights: Floats) -> Floats:
     missing = ~np.isfinite(heights)
     if not missing.any():
         return heights
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
     return np.asarray(heights[tuple(nearest)])

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 Starts = NDArray[np.intp]
@@ -243,7 +243,7 @@ class _LatticeBasis:
         return np.asarray(self.along_v[dv] @ coefficients @ self.along_u[du].T)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _contract(
     start_u: Starts, along_u: Floats, start_v: Starts, along_v: Floats, coefficients: Floats, out: Floats
 ) -> None:

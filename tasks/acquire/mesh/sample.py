@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.to_metres import Frame
 from flexroad.tasks.acquire.types import Points
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, Photo
 
 CHUNK = 500_000
@@ -191,7 +191,7 @@ def _rays(mesh: TexturedMesh, pixel: float) -> int:
     return int(np.clip(math.ceil(pixel / max(float(np.median(size)), 1e-9) - 0.01), 1, MOST_RAYS))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _weights(vertices: Floats, corners: Faces, east: Floats, north: Floats, weights: Floats) -> None:
     """Find how much each corner of a face, ``(n, 3)``, counts at a place in plan."""
     for n in range(corners.shape[0]):
@@ -220,11 +220,11 @@ def _colour(mesh: TexturedMesh, face: Faces | NDArray[np.intp], weights: Floats)
     return colour
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _texels(
     texture: NDArray[np.uint8],
     uv: NDArray[np.float32],
-    face: NDArray[np.int64],
+    face: Faces | NDArray[np.intp],
     weights: Floats,
     here: NDArray[np.int64],
     colour: NDArray[np.float32],
@@ -267,7 +267,7 @@ def _look_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
     return heights, owner
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, owner: Faces) -> None:
     """Keep, per centre, the highest of the faces over it; of equal ones the first."""
     rows, cols = heights.shape

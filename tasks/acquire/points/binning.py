@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 Cells = NDArray[np.int64]
@@ -30,7 +30,7 @@ def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     return cells
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _bins(
     easting: Floats, northing: Floats, west: float, north: float, cell: float, rows: int, cols: int
 ) -> Cells:

@@ -11,11 +11,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks import options as base
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 
@@ -159,7 +159,7 @@ class _Buckets:
         return self.x, self.y, self.z, self.start, self.shape, self.side
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _span(at: float, reach: float, side: float, count: int) -> tuple[int, int]:
     """Return the first bucket within reach of a coordinate and the one past the last."""
     first = math.floor((at - reach - SLACK_M) / side)
@@ -167,13 +167,13 @@ def _span(at: float, reach: float, side: float, count: int) -> tuple[int, int]:
     return max(first, 0), min(last, count - 1) + 1
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _gap(low: float, high: float, index: int, side: float) -> float:
     """Return how far a bucket is at least from low to high along one axis."""
     return max(index * side - high, low - (index + 1) * side, SLACK_M) - SLACK_M
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _low(
     x: Floats,
     y: Floats,
@@ -201,7 +201,7 @@ def _low(
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _count(
     x: Floats,
     y: Floats,
@@ -230,7 +230,7 @@ def _count(
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _ground(
     x: Floats,
     y: Floats,
@@ -272,7 +272,7 @@ def _ground(
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _over(
     x: Floats,
     y: Floats,
@@ -297,7 +297,7 @@ def _over(
     return False
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _lowest(floor: Floats, shape: tuple[int, int], side: float, b: int, radius: float, slope: float) -> int:
     """Return the bucket whose lowest point leaves the least room over it at bucket b, by their middles."""
     row, col = divmod(b, shape[1])
@@ -315,7 +315,7 @@ def _lowest(floor: Floats, shape: tuple[int, int], side: float, b: int, radius: 
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _suspects(
     floor: Floats,
     shape: tuple[int, int],

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from flexroad.tasks.acquire.points.binning import Cells
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
@@ -34,7 +34,7 @@ def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: floa
     return single
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _tops(cells: Cells, height: Floats, size: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Return the two greatest heights per cell (-inf if there is none) and the index of the greatest."""
     top, second = np.full(size, -np.inf), np.full(size, -np.inf)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points.binning import Cells, bins
 from flexroad.tasks.acquire.types import Points
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Photo
 
 Codes = NDArray[np.int32]
@@ -42,7 +42,7 @@ def photo(points: Points, grid: Grid, fill_m: float) -> Photo:
     return Photo(grid, np.where(known, colour, np.uint8(0)), known)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _top_codes(cells: Cells, height: Floats, codes: Codes, shape: tuple[int, int]) -> Codes:
     top = np.full(shape[0] * shape[1], -np.inf)
     best = np.full(top.size, -1, np.int32)
@@ -62,7 +62,7 @@ def _steps(radius: float) -> NDArray[np.int64]:
     return np.stack([row, col], axis=1)[order[: np.count_nonzero(square <= radius**2 + 1e-9)]]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _nearest(codes: Codes, steps: NDArray[np.int64]) -> Codes:
     rows, cols = codes.shape
     filled = codes.copy()

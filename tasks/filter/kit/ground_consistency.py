@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
 
 ALONE, OFF, ON = np.uint8(0), np.uint8(1), np.uint8(2)
@@ -17,7 +17,7 @@ Window = tuple[int, int, int, int]
 """First and last row, first and last column; the last ones not included."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def against_known(
     dsm: Floats, dtm: Floats, known: Bools, asked: Bools, reach: int, theta: float
 ) -> NDArray[np.uint8]:
@@ -43,7 +43,7 @@ def against_known(
     return found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _count_and_offset(dsm: Floats, dtm: Floats, known: Bools, window: Window) -> tuple[int, float]:
     """Return how many cells are known and their mean height over the DTM (m), NaN without one."""
     top, bottom, left, right = window
@@ -57,7 +57,7 @@ def _count_and_offset(dsm: Floats, dtm: Floats, known: Bools, window: Window) ->
     return n, over / m if m > 0 else np.nan
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _above_plane(dsm: Floats, known: Bools, window: Window, n: int, r: int, c: int) -> float:
     """Return a cell's height over the plane of the known ones (m), NaN where that is not sure."""
     top, bottom, left, right = window

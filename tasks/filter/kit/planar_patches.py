@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
 
 PATCH_M = 3.0
@@ -61,7 +61,7 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
     return Patches(centres, trend, reach)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple[Floats, NDArray[np.bool_]]:
     """Return slopes by row and column (m per cell), ``(H, W, 2)``, and where a plane fits a whole patch."""
     rows, cols = heights.shape
@@ -85,7 +85,7 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
     return slopes, smooth
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _trend(slopes: Floats, smooth: Bools, around: int) -> Floats:
     """Return the mean slope of the smooth patches around each of them, ``(H, W, 2)``."""
     rows, cols = smooth.shape

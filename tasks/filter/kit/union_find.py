@@ -7,9 +7,9 @@ the merges.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools
 
 Roots = NDArray[np.int32]
@@ -36,7 +36,7 @@ def half_disc(radius: float) -> NDArray[np.int64]:
     return np.ascontiguousarray(steps[np.argsort(square[forward], kind="stable")])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def root(roots: Roots, i: int) -> int:
     """Return the root of a cell, and shorten the way to it."""
     while roots[i] != i:
@@ -45,7 +45,7 @@ def root(roots: Roots, i: int) -> int:
     return i
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def flatten(roots: Roots) -> Roots:
     """Let every member point at its root, in place."""
     # A parent comes before its children, so it already points at the root.

@@ -12,13 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from rasterio.enums import Resampling
-from rasterio.warp import reproject
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import outside
 from flexroad.tasks.roads.mask_cleanup import Hygiene, clean
@@ -115,6 +112,8 @@ def _seen(
 ) -> tuple[Photo, NDArray[np.float32]]:
     """Return the photo around the tile and the probability of road of its pixels, 0 where it has none."""
     gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
+    from flexroad.tasks.io.orthophoto import read_photo
+
     overlap = round(size * options.overlap)
     assert data.dop is not None
     photo = read_photo(data.dop, cover(data.grid, gsd_m, size, overlap), gsd_m)
@@ -130,6 +129,9 @@ def _centres(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray[np.float32]:
     """Return the mean over each cell, ``(H, W)``; between pixels where they are coarser than cells."""
+    from rasterio.enums import Resampling
+    from rasterio.warp import reproject
+
     cells = np.zeros(grid.shape, np.float32)
     reproject(
         probability,

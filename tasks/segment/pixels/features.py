@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.types import Photo, TileData
 
 Layer = NDArray[np.float32]
@@ -50,6 +49,8 @@ def look(data: TileData) -> Photo | None:
     TaskError
         As `read_photo`.
     """
+    from flexroad.tasks.io.orthophoto import read_photo
+
     return read_photo(data.dop, data.grid, data.grid.cell / 2) if data.dop else None
 
 

@@ -1,0 +1,56 @@
+"""Functions that numba compiles when they are first called.
+
+Importing them costs nothing, so that commands that compute nothing start at once. What is compiled is kept on
+disk, and the next process reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Compiled(Generic[P, R]):
+    """A function in numba's subset of Python, compiled at its first call."""
+
+    def __init__(self, function: Callable[P, R], error_model: str) -> None:
+        self.function = function
+        self.error_model = error_model
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the compiled function."""
+        result: R = self.dispatcher(*args, **kwargs)
+        return result
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """The function as numba's dispatcher."""
+        from numba import njit
+
+        # The functions that this one calls: numba must find dispatchers under their names.
+        names = self.function.__globals__
+        for name in self.function.__code__.co_names:
+            if isinstance(names.get(name), Compiled):
+                names[name] = names[name].dispatcher
+        return njit(cache=True, error_model=self.error_model)(self.function)
+
+
+def compiled(
+    error_model: Literal["python", "numpy"] = "python",
+) -> Callable[[Callable[P, R]], Compiled[P, R]]:
+    """Return a decorator that compiles a function with numba when it is first called.
+
+    Parameters
+    ----------
+    error_model : str
+        ``python``: dividing by zero raises an error; ``numpy``: it gives inf or NaN, and loops are faster.
+    """
+
+    def decorate(function: Callable[P, R]) -> Compiled[P, R]:
+        return Compiled(function, error_model)
+
+    return decorate
