@@ -22,7 +22,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used: commands that open no catalog start without its libraries."""
+    """Import a public name when it is first used, so that commands without a catalog start fast."""
     for home, names in _HOMES.items():
         if name in names:
             return getattr(importlib.import_module(f"flexroad.catalog.{home}"), name)

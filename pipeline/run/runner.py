@@ -24,7 +24,6 @@ from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.store.tables import write_tables
 from flexroad.pipeline.worker.profiling import now
 from flexroad.pipeline.worker.tile import Job, TileResult, do_tile, failed_row, give_up
-from flexroad.pipeline.worker.warmup import warm
 
 
 @dataclass(frozen=True)
@@ -135,8 +134,6 @@ def _nothing_there(run: Run, graph: TileGraph) -> str:
 
 
 def _jobs(run: Run, stock: Stock, anew: frozenset[str]) -> Iterator[Job]:
-    if stock.todo:
-        warm(run.config)
     look = run.sightings()
     for position in stock.todo:
         # Made a second time: thousands kept since the stocktaking would fill the memory, and be old by now.

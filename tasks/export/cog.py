@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.io import MemoryFile
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
@@ -61,6 +60,8 @@ def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
 
 
 def _encode(values: NDArray[Any], grid: Grid, name: str, unit: str, **options: Any) -> bytes:
+    from rasterio.io import MemoryFile
+
     if values.shape != grid.shape:
         raise TaskError(f"{name} of {values.shape} cells does not fit a grid of {grid.shape}")
     profile = {
