@@ -3,6 +3,7 @@
 import atexit
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -20,9 +21,11 @@ ONE_THREAD = dict.fromkeys(
 """Environment of every process: at these sizes two BLAS threads are up to 400 times slower than one."""
 
 # Libraries read these once, when they are imported, so it is done before any of them is. What the user
-# has set stays.
-for name, value in ONE_THREAD.items():
-    os.environ.setdefault(name, value)
+# has set stays. In a notebook NumPy is there already, and the environment is the notebook's: numba even
+# refuses to go on when its number of threads changes.
+if "numpy" not in sys.modules:
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)
 
 
 def _writable(folder: Path) -> bool:
