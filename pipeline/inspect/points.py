@@ -96,6 +96,8 @@ class Ground:
         tiles = self.run.catalog.tiles
         tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
         point, number = tree.query(points(easting, northing), predicate="intersects")
+        if not point.size:
+            return
         order = np.argsort(number, kind="stable")
         under, starts = np.unique(number[order], return_index=True)
         free = np.ones(easting.shape, dtype=bool)
