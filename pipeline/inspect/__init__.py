@@ -1,1 +1,1 @@
-"""Look into catalogs, tiles and surfaces."""
+"""Look into catalogs, runs, tiles and surfaces; fit one surface in memory."""

@@ -1,0 +1,313 @@
+"""A fitted surface as notebooks use it: heights, normals, rasters, a mesh, and one file."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flexroad.catalog import Bounds, Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks import sample, types
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.export import npz
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask
+
+if TYPE_CHECKING:
+    import trimesh
+    import xarray as xr
+
+AXES = {"z": "x east, y north, z up", "y": "x east, y up, z south"}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Surface:
+    """The fitted ground of one area; made by `flexroad.fit` or `flexroad.open_surface`.
+
+    Examples
+    --------
+    >>> import flexroad
+    >>> scene = flexroad.example(size_m=60)
+    >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+    >>> surface.crs, surface.bounds
+    ('EPSG:25832', (500200.0, 5600000.0, 500260.0, 5600060.0))
+    """
+
+    fitted: types.Surface
+    """What the stage ``fit`` made: a `NurbsSurface`, a plane or a raster."""
+    crs: str
+    """CRS of x and y: ``EPSG:25832``, or WKT where there is no code."""
+    bounds: Bounds
+    """West, south, east, north (m)."""
+    road: RoadMask | None
+    """The road mask before the filter, on the grid with its halo; None for a file that a run wrote."""
+    clusters: RoadClusters | None
+    """What the filter kept of it; None for a file that a run wrote."""
+    sampling: sample.Options
+    """How `to_mesh` samples."""
+    config: str
+    """The configuration that the surface was fitted with; empty if unknown."""
+
+    def __repr__(self) -> str:
+        west, south, east, north = (f"{edge:.10g}" for edge in self.bounds)
+        kind = type(self.fitted).__name__.removesuffix("Surface").lower()
+        if isinstance(self.fitted, NurbsSurface):
+            rows, columns = self.fitted.A.shape
+            kind = f"{kind} of {columns} x {rows} control points"
+        size = f"{self.bounds[2] - self.bounds[0]:g} x {self.bounds[3] - self.bounds[1]:g} m"
+        crs = self.crs if len(self.crs) < 40 else f"{self.crs[:40]}..."
+        road = "road: unknown"
+        if self.road is not None and self.clusters is not None:
+            given, kept = (_cut(mask, self.road).sum() for mask in (self.road.mask, self.clusters.mask))
+            road = f"road: {given} cells given, {kept} kept by the filter"
+        return (
+            f"<flexroad.Surface: {kind}{f', config {self.config}' if self.config else ''}>\n"
+            f"{crs}, {size}, bounds {west} {south} {east} {north}\n{road}"
+        )
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        """Return the height under points.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Eastings and northings (m) in `crs`, of shapes that broadcast.
+
+        Returns
+        -------
+        ndarray
+            Heights (m) in the broadcast shape; NaN outside `bounds` and where the survey has no data.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+        >>> surface.height([500210.0, 500220.0, 0.0], 5600030.0).round(1)
+        array([152.4, 152.5,   nan])
+        """
+        easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        return np.where(self._known(easting, northing), self.fitted.height(easting, northing), np.nan)[()]
+
+    def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        """Return the upward unit normal under points.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Eastings and northings (m) in `crs`, of shapes that broadcast.
+
+        Returns
+        -------
+        ndarray, (..., 3)
+            East, north and up components; NaN outside `bounds` and where the survey has no data.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+        >>> surface.normal(500210.0, 5600030.0).round(2)
+        array([-0.03, -0.04,  1.  ])
+        """
+        easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        known = self._known(easting, northing)[..., None]
+        return np.where(known, self.fitted.normal(easting, northing), np.nan)
+
+    def to_xarray(self, resolution: float = 1.0) -> xr.Dataset:
+        """Return heights and road on a grid of square cells over `bounds`.
+
+        Parameters
+        ----------
+        resolution : float
+            Cell size (m). The grid starts in the north-west corner.
+
+        Returns
+        -------
+        xarray.Dataset, (y, x)
+            ``height`` (m; NaN where the survey has no data) at the cell centres and, if the mask is known,
+            ``road``: the filtered road mask, of the nearest input cell. Coordinates ``x`` (ascending) and
+            ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set.
+
+        Raises
+        ------
+        ConfigError
+            If the resolution is not above 0.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+        >>> raster = surface.to_xarray(resolution=0.5)
+        >>> dict(raster.sizes), list(raster.data_vars), raster.rio.crs.to_epsg()
+        ({'y': 120, 'x': 120}, ['height', 'road'], 25832)
+        """
+        import rioxarray  # noqa: F401 (gives datasets their .rio)
+        import xarray as xr
+
+        if not 0 < resolution < np.inf:
+            raise ConfigError(f"resolution {resolution:g} m is no cell size; give one above 0, such as 0.5")
+        grid = Grid.covering(self.crs, self.bounds, resolution)
+        x, y = np.meshgrid(grid.eastings, grid.northings)
+        heights = self.fitted.lattice(grid.eastings, grid.northings)
+        known = self._known(x, y)
+        heights[~known] = np.nan
+        layers: dict[str, Any] = {"height": (("y", "x"), heights, {"units": "m"})}
+        if self.road is not None and self.clusters is not None:
+            road = _cut(self.clusters.mask, self.road)[self.road.core.cells(x, y)]
+            layers["road"] = ("y", "x"), road & known
+        raster = xr.Dataset(layers, coords={"x": grid.eastings, "y": grid.northings})
+        placed: xr.Dataset = raster.rio.write_crs(self.crs).rio.write_transform(grid.transform)
+        return placed
+
+    def to_mesh(self, up: Literal["z", "y"] = "z") -> trimesh.Trimesh:
+        """Return the surface as a triangle mesh, sampled as the configuration's ``sample`` says.
+
+        Parameters
+        ----------
+        up : {"z", "y"}
+            The upward axis: z for CAD, PLY and OBJ, y for glTF (GLB).
+
+        Returns
+        -------
+        trimesh.Trimesh
+            Vertices (m) relative to a whole-metre origin: float32 formats keep millimetres. ``metadata`` has
+            ``crs``, ``origin`` (easting, northing, height; m) and ``axes``; ``face_attributes["road"]``,
+            (F,), is True for faces on the road.
+
+        Raises
+        ------
+        ConfigError
+            If the surface has no road mask: it was opened from a file that a run wrote.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+        >>> mesh = surface.to_mesh()
+        >>> mesh.metadata["origin"]
+        [500200.0, 5600000.0, 150.0]
+        """
+        import trimesh
+
+        if self.road is None or self.clusters is None:
+            raise ConfigError(
+                "the surface has no road mask, as it comes from the file of a run; take the mesh of the run"
+            )
+        mesh = sample.sample(self.fitted, self.road, self.clusters, self.sampling)
+        east, north, height = mesh.vertices.T
+        vertices = np.stack([east, height, -north], axis=1) if up == "y" else mesh.vertices
+        metadata = {"crs": mesh.crs, "origin": [float(v) for v in mesh.origin], "axes": AXES[up]}
+        return trimesh.Trimesh(
+            vertices, mesh.faces, face_attributes={"road": mesh.road}, metadata=metadata, process=False
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the surface to one ``.npz`` file, for `flexroad.open_surface` or any NumPy.
+
+        The file holds knots, coefficients and weights in float64, as the ``.npz`` files of a run, and beside
+        them the road mask.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file; its name should end in ``.npz``.
+
+        Raises
+        ------
+        TaskError
+            If the surface is a plane or a raster, which the format does not hold.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+        >>> surface.save("road.npz")
+        >>> bool(flexroad.open_surface("road.npz").height(500210, 5600030) == surface.height(500210, 5600030))
+        True
+        """
+        if not isinstance(self.fitted, NurbsSurface):
+            raise TaskError(f"a {type(self.fitted).__name__} is no NURBS surface; save its to_xarray()")
+        buffer = io.BytesIO(npz.encode(self.fitted))
+        if self.road is not None and self.clusters is not None:
+            with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
+                for name, values in _masks(self.road, self.clusters, self.sampling, self.config).items():
+                    with archive.open(f"{name}.npy", "w") as member:
+                        np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+        Path(path).write_bytes(buffer.getvalue())
+
+    def _known(self, easting: Floats, northing: Floats) -> Bools:
+        """Return where points are inside the bounds and the survey."""
+        west, south, east, north = self.bounds
+        inside: Bools = (west <= easting) & (easting <= east) & (south <= northing) & (northing <= north)
+        if self.road is None:
+            return inside
+        return inside & ~_cut(self.road.outside, self.road)[self.road.core.cells(easting, northing)]
+
+
+def open_surface(path: str | Path) -> Surface:
+    """Open a surface that `Surface.save` or a run wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        An ``.npz`` file, such as ``RUN/tiles/ID/ID_flexroad_surface.npz``. Files of a run hold no road mask:
+        the surface then has heights and normals over its whole domain, but no mesh.
+
+    Raises
+    ------
+    TaskError
+        If the file is missing, damaged, no surface, or of a later version.
+
+    Examples
+    --------
+    >>> import flexroad
+    >>> scene = flexroad.example(size_m=60)
+    >>> flexroad.fit(scene.dsm, scene.dtm, scene.road_mask).save("road.npz")
+    >>> flexroad.open_surface("road.npz").bounds
+    (500200.0, 5600000.0, 500260.0, 5600060.0)
+    """
+    fitted = npz.decode(Path(path))
+    try:
+        with np.load(Path(path), allow_pickle=False) as archive:
+            if "labels" not in archive.files:
+                return Surface(fitted, fitted.crs, fitted.bounds, None, None, sample.Options(), "")
+            grid, core = (_grid(fitted.crs, archive[name]) for name in ("grid", "core"))
+            road = RoadMask(grid, core, archive["road_mask"], archive["outside"])
+            clusters = RoadClusters(grid, archive["labels"])
+            sampling = sample.Options.model_validate_json(str(archive["sampling"]))
+            return Surface(fitted, core.crs, core.bounds, road, clusters, sampling, str(archive["config"]))
+    except npz.DAMAGED as error:
+        raise TaskError(f"{path}: its road mask is damaged ({error}); save it again", str(path)) from error
+
+
+def _cut(values: Bools, road: RoadMask) -> Bools:
+    """Return the part of a mask that lies on the core."""
+    return values[road.grid.window(road.core)]
+
+
+def _masks(road: RoadMask, clusters: RoadClusters, sampling: sample.Options, config: str) -> dict[str, Any]:
+    """Return what stands beside the spline's own arrays in the file."""
+    return {
+        "grid": np.asarray(astuple(road.grid)[1:], np.float64),
+        "core": np.asarray(astuple(road.core)[1:], np.float64),
+        "road_mask": road.mask,
+        "outside": road.outside,
+        "labels": clusters.labels,
+        "sampling": np.array(sampling.model_dump_json()),
+        "config": np.array(config),
+    }
+
+
+def _grid(crs: str, numbers: Floats) -> Grid:
+    west, north, cell, width, height = map(float, numbers)
+    return Grid(crs, west, north, cell, int(width), int(height))

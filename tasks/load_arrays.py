@@ -1,0 +1,237 @@
+"""The same as `load` for rasters that are in memory as DataArrays: one tile's data on one lattice."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rasterio.enums import Resampling
+
+from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.raster import Lattice, Patch, misfit, onto
+from flexroad.tasks.load import HIGHEST_M, LOWEST_M, UNITS, Options
+from flexroad.tasks.types import Floats, TileData
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TILE_ID = "arrays"
+"""The tile id of data that come from no catalog."""
+
+
+def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, options: Options) -> TileData:
+    """Return the data of one tile, whose core is the grid of the DSM.
+
+    Parameters
+    ----------
+    dsm, dtm : xarray.DataArray, (H, W)
+        Heights (m). NaN and the array's nodata value mean unknown.
+    road_mask : xarray.DataArray, (H, W)
+        Road where True or not 0.
+    options : Options
+        The halo is NaN where the DTM and the mask do not reach beyond the DSM.
+
+    Returns
+    -------
+    TileData
+        The DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they are
+        resampled (heights bilinearly, the mask to the nearest cell), with a note.
+
+    Raises
+    ------
+    TaskError
+        If an array has no CRS, is in degrees or feet, is rotated, has pixels that are not square or more
+        than two dimensions; if the CRS of two arrays differ; if there are too few heights or no road cell.
+    """
+    patches = {
+        name: _patch(name, array) for name, array in (("dsm", dsm), ("dtm", dtm), ("road_mask", road_mask))
+    }
+    core = _grid(patches["dsm"])
+    grid = core.buffered(options.halo_m)
+    notes = [_absurd(patches[name]) for name in ("dsm", "dtm")]
+    notes += [_misfit(patches[name], core) for name in ("dtm", "road_mask")]
+    heights = {name: _onto(patches[name], grid, Resampling.bilinear) for name in ("dsm", "dtm")}
+    window = grid.window(core)
+    _check_valid("dsm", heights["dsm"][window], options.min_valid)
+    _check_valid("dtm", heights["dtm"][window], 0.0)
+    road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
+    if not road[window].any():
+        raise TaskError(
+            "road_mask has no road cell on the grid of the dsm; a road cell is True or not 0, "
+            "for example landcover == 1"
+        )
+    return TileData(
+        TILE_ID, grid, core, heights["dsm"], heights["dtm"], road, notes=tuple(filter(None, notes))
+    )
+
+
+def _patch(name: str, array: xr.DataArray) -> Patch:
+    """Return an array's values, rows from the north, and where they lie; refuse what has no such place."""
+    array = _plane(name, array)
+    crs = _crs(name, array)
+    _check_unit(name, array, crs)
+    lattice, west_first = _lattice(name, array)
+    values = _values(name, array)
+    values = values if west_first else values[:, ::-1]
+    return Patch(name, "", values[::-1] if lattice.northward else values, lattice, "", crs)
+
+
+def _plane(name: str, array: xr.DataArray) -> xr.DataArray:
+    """Return the array as ``(y, x)``; a band or time of length 1 is dropped."""
+    import rioxarray  # noqa: F401 (gives arrays their .rio)
+    import xarray as xr
+    from rioxarray.exceptions import MissingSpatialDimensionError
+
+    if not isinstance(array, xr.DataArray):
+        raise TaskError(f"{name} is a {type(array).__name__}; give an xarray.DataArray with y, x and a CRS")
+    array = array.squeeze(drop=True) if array.ndim > 2 else array
+    try:
+        x, y = array.rio.x_dim, array.rio.y_dim
+    except MissingSpatialDimensionError:
+        x = y = ""
+    if {x, y} != set(array.dims):
+        sizes = ", ".join(f"{dim}: {size}" for dim, size in array.sizes.items())
+        raise TaskError(f"{name} has dimensions ({sizes}), not y and x alone; select with .isel or .rename")
+    return array.transpose(y, x)
+
+
+def _crs(name: str, array: xr.DataArray) -> str:
+    if array.rio.crs is None:
+        raise TaskError(f"{name} has no CRS; write it, e.g. {name}.rio.write_crs('EPSG:25832')")
+    crs: str = array.rio.crs.to_wkt()
+    remedy = f"reproject it to metres, e.g. {name}.rio.reproject({name}.rio.estimate_utm_crs())"
+    if is_geographic(crs):
+        raise TaskError(f"{name} is in {short(crs)}, a geographic CRS in degrees; {remedy}")
+    unit, metres = plan_unit(crs)
+    if not is_projected(crs) or not math.isclose(metres, 1.0):
+        raise TaskError(f"{name} is in {short(crs)}, whose coordinates are in {unit}; {remedy}")
+    return crs
+
+
+def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:
+    """Refuse heights that are declared in another unit than metres."""
+    if name == "road_mask":
+        return
+    unit, metres = array.attrs.get("units"), 1.0
+    if unit:
+        known = UNITS.get(str(unit).lower())
+        if known is None:
+            raise TaskError(f"{name} has units {unit!r}; give metres and set {name}.attrs['units'] = 'm'")
+        metres = known
+    else:
+        unit, metres = height_unit(crs) or ("metre", 1.0)
+    if not math.isclose(metres, 1.0):
+        raise TaskError(
+            f"{name} has heights in {unit}; multiply it by {metres:.10g} and set {name}.attrs['units'] = 'm'"
+        )
+
+
+def _lattice(name: str, array: xr.DataArray) -> tuple[Lattice, bool]:
+    """Return where the cells lie, and whether the first column is in the west."""
+    y, x = array.dims
+    transform = array.rio.transform()
+    if transform.b or transform.d:
+        raise TaskError(f"{name} is rotated; turn it north up, e.g. {name}.rio.reproject({name}.rio.crs)")
+    if min(array.shape) < 2:
+        raise TaskError(f"{name} has {array.shape[0]} x {array.shape[1]} cells; give at least 2 x 2")
+    if x in array.coords and y in array.coords:
+        # Coordinates tell more than a stored transform, which goes stale when an array is cut.
+        (west, dx), (south, dy) = _axis(name, array[x]), _axis(name, array[y])
+    else:
+        dx, dy = transform.a, transform.e
+        west = min(transform.c, transform.c + array.shape[1] * dx)
+        south = min(transform.f, transform.f + array.shape[0] * dy)
+    if not math.isclose(abs(dx), abs(dy), rel_tol=1e-5):
+        raise TaskError(
+            f"{name} has pixels of {abs(dx):.6g} x {abs(dy):.6g} m; make them square, "
+            f"e.g. {name}.rio.reproject({name}.rio.crs, resolution={max(abs(dx), abs(dy)):.6g})"
+        )
+    rows, columns = array.shape
+    north = round(south + rows * abs(dy), 6)
+    return Lattice(west, north, abs(dx), abs(dy), columns, rows, northward=dy > 0), dx > 0
+
+
+def _axis(name: str, centres: xr.DataArray) -> tuple[float, float]:
+    """Return the lower edge of an axis and its signed step (m), without the rounding of float arithmetic."""
+    at = np.asarray(centres.values, dtype=np.float64)
+    steps = np.diff(at)
+    step = float(at[-1] - at[0]) / steps.size
+    if not step or not np.allclose(steps, step, rtol=LATTICE_TOLERANCE, atol=0):
+        raise TaskError(
+            f"{name} has {centres.name} in steps of {steps.min():.6g} to {steps.max():.6g} m, not equal; "
+            f"resample it, e.g. {name}.rio.reproject({name}.rio.crs)"
+        )
+    return round(float(at.min()) - abs(step) / 2, 6), round(step, 9)
+
+
+def _values(name: str, array: xr.DataArray) -> Floats:
+    scale, offset = array.attrs.get("scale_factor", 1.0), array.attrs.get("add_offset", 0.0)
+    if (scale, offset) != (1.0, 0.0):
+        raise TaskError(
+            f"{name} has scale_factor {scale:g} and add_offset {offset:g}, not yet applied; "
+            "open it with mask_and_scale=True"
+        )
+    raw: np.ndarray[Any, Any] = np.asarray(array.values)
+    if raw.dtype.kind not in "buif":
+        raise TaskError(f"{name} holds {raw.dtype}, not numbers; convert it with .astype(float)")
+    values = raw.astype(np.float64)
+    nodata = array.rio.nodata
+    if nodata is not None and raw.dtype.kind != "b":
+        # Compared as the array has it: -3.4e38 is another number in float32 than in float64.
+        values[values == np.float64(np.asarray(nodata).astype(raw.dtype))] = np.nan
+    return values
+
+
+def _grid(dsm: Patch) -> Grid:
+    at = dsm.lattice
+    return Grid(in_plan(dsm.crs or ""), at.west, at.north, at.dx, at.width, at.height)
+
+
+def _absurd(patch: Patch) -> str:
+    """Make heights that can be none NaN, as `load` does; return a note if there were any."""
+    absurd = (patch.values < LOWEST_M) | (patch.values > HIGHEST_M)
+    patch.values[absurd] = np.nan
+    if not absurd.any():
+        return ""
+    return f"{patch.name}: {absurd.sum()} cells outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
+
+
+def _misfit(patch: Patch, core: Grid) -> str:
+    """Refuse another CRS than the DSM's; return a note if cells do not coincide with the DSM's."""
+    if not same(patch.crs or "", core.crs):
+        raise TaskError(
+            f"{patch.name} is in {short(patch.crs or '')}, the dsm in {short(core.crs)}; "
+            f"reproject it, e.g. {patch.name}.rio.reproject_match(dsm)"
+        )
+    why = misfit(patch.lattice, core).replace("the tile's", "the dsm's")
+    return f"{patch.name} resampled to the grid of the dsm: {why}" if why else ""
+
+
+def _onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
+    slices = patch.lattice.under(grid)
+    if slices is None:
+        bounds = " ".join(f"{edge:.10g}" for edge in patch.lattice.bounds)
+        raise TaskError(f"{patch.name} ({bounds}) does not overlap the dsm; give arrays of the same place")
+    cut = Patch(
+        patch.name,
+        "",
+        patch.values[slices],
+        patch.lattice.cut(*slices),
+        "",
+        patch.crs,
+    )
+    return onto(cut, grid, resampling)
+
+
+def _check_valid(name: str, values: Floats, min_valid: float) -> None:
+    share = 1 - np.isnan(values).mean()
+    if share == 0:
+        raise TaskError(f"{name} has only nodata on the grid of the dsm; give heights in metres")
+    if share < min_valid:
+        raise TaskError(
+            f"{name} has {share:.1%} valid cells, below {min_valid:.0%}; "
+            "cut the arrays to the survey, or lower load.min_valid in the configuration"
+        )
