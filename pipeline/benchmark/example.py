@@ -1,0 +1,61 @@
+"""A small made scene as a Dataset, for examples and first tries."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from flexroad.catalog import Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks.synthetic import make_scene
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+LAYERS = ("dsm", "dtm", "road_mask", "reference")
+CRS = "EPSG:25832"
+WEST_M, SOUTH_M = 500_200, 5_600_000
+"""South-west corner of every scene."""
+
+
+def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
+    """Make the rasters of one area, with streets, houses, trees, cars and known truth.
+
+    Parameters
+    ----------
+    seed : int
+        The world; 0 or more.
+    size_m : int
+        Side of the area (m), 20 to 1000; cells are 1 m.
+
+    Returns
+    -------
+    xarray.Dataset, (y, x)
+        ``dsm`` and ``dtm`` (m) and ``road_mask`` as a survey delivers them, with noise, holes and errors;
+        ``reference``, the true height of road and terrain (m). ``.rio.crs`` is EPSG:25832.
+
+    Raises
+    ------
+    ConfigError
+        If the seed or the size is out of range.
+
+    Examples
+    --------
+    >>> import flexroad
+    >>> scene = flexroad.example(seed=0, size_m=60)
+    >>> list(scene.data_vars), dict(scene.sizes)
+    (['dsm', 'dtm', 'road_mask', 'reference'], {'y': 60, 'x': 60})
+    """
+    import rioxarray  # noqa: F401 (gives datasets their .rio)
+    import xarray as xr
+
+    if seed < 0 or not 20 <= size_m <= 1000:
+        raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 20 to 1000 m")
+    grid = Grid(CRS, WEST_M, SOUTH_M + size_m, 1.0, size_m, size_m)
+    layers = make_scene(grid, seed).layers
+    scene = xr.Dataset(
+        {name: (("y", "x"), layers[name], {} if name == "road_mask" else {"units": "m"}) for name in LAYERS},
+        coords={"x": grid.eastings, "y": grid.northings},
+        attrs={"title": f"made scene, seed {seed}"},
+    )
+    placed: xr.Dataset = scene.rio.write_crs(grid.crs)
+    return placed

@@ -1,0 +1,301 @@
+"""A run as notebooks use it: its tiles, its tables, and its finished tiles as one ground."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flexroad.catalog import Bounds
+from flexroad.catalog.storage.paths import exists, place, read
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
+from flexroad.pipeline.inspect.points import Answer, Ground
+from flexroad.pipeline.inspect.tile import open_tile
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import look_at
+from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tasks.types import Floats
+
+if TYPE_CHECKING:
+    import geopandas
+    import pandas as pd
+    import xarray as xr
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RunView:
+    """A run to look into; made by `flexroad.open_run`. Nothing here changes the run.
+
+    Every access reads the run's files as they are then, also while it runs.
+    """
+
+    run: Run
+    """The opened run folder."""
+    variant: str
+    """The variant whose surfaces are shown."""
+
+    def __repr__(self) -> str:
+        counts = self.tiles["state"].value_counts()
+        states = ", ".join(f"{counts[state]} {state}" for state in counts.index)
+        return (
+            f"<flexroad.RunView: {self.run.path}>\n"
+            f"config {self.run.config.name}, variant {self.variant}\n"
+            f"{len(self.run.catalog.tiles)} tiles: {states}"
+        )
+
+    @property
+    def tiles(self) -> geopandas.GeoDataFrame:
+        """The tiles of the run.
+
+        Returns
+        -------
+        geopandas.GeoDataFrame
+            One row per tile: ``id``; ``state``, which is ``done``, ``failed`` or ``pending`` (not tried, or
+            its sources or options have changed); ``geometry``, its outline in the CRS of the tiles.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> flexroad.open_run("runs/city").tiles[["id", "state"]]
+                       id    state
+        0  499980_5599980     done
+        1  500040_5599980  pending
+        """
+        import geopandas
+        import shapely
+
+        tiles = self.run.catalog.tiles
+        states = [
+            "done" if now.done else "failed" if now.failed else "pending" for now in look_at(self.run, tiles)
+        ]
+        bounds = np.array([tile.grid.bounds for tile in tiles]).reshape(-1, 4)
+        return geopandas.GeoDataFrame(
+            {"id": [tile.id for tile in tiles], "state": states},
+            geometry=shapely.box(*bounds.T),
+            crs=tiles[0].grid.crs if tiles else None,
+        )
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The figures of ``metrics.parquet``: one row per tile and variant.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such file yet, or it is damaged.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> flexroad.open_run("runs/city").metrics[["tile_id", "variant", "l2_road_m"]].round(2)
+                  tile_id   variant  l2_road_m
+        0  499980_5599980  flexroad       0.02
+        """
+        return read_metrics(self.run.path)
+
+    @property
+    def failures(self) -> pd.DataFrame:
+        """The failures of ``failures.csv``: one row per failure.
+
+        Returns
+        -------
+        pandas.DataFrame
+            ``tile_id``, ``stage``, ``kind`` (the type of the error), ``message`` and ``file``, the source
+            file at fault; no rows if nothing failed.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such file yet, or it is damaged.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> len(flexroad.open_run("runs/city").failures)
+        0
+        """
+        import pandas as pd
+
+        path = self.run.path / "failures.csv"
+        if not exists(path):
+            raise ConfigError(f"{path} does not exist; `flexroad rerun {self.run.path}` finishes the run")
+        try:
+            return pd.read_csv(io.BytesIO(read(path)), dtype=str, keep_default_na=False)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        """Return the height under points.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Eastings and northings (m) in the CRS of the tiles, of shapes that broadcast.
+
+        Returns
+        -------
+        ndarray
+            Heights (m) in the broadcast shape; NaN where no finished tile is.
+
+        Raises
+        ------
+        ConfigError
+            If a result of a tile is missing from the store and cannot be computed.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> flexroad.open_run("runs/city").height([500010.0, 500050.0], 5600030.0).round(1)
+        array([151.3,   nan])
+        """
+        shape, answer = self._at(x, y)
+        return answer.height.reshape(shape)[()]
+
+    def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        """Return the upward unit normal under points.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Eastings and northings (m) in the CRS of the tiles, of shapes that broadcast.
+
+        Returns
+        -------
+        ndarray, (..., 3)
+            East, north and up components; NaN where no finished tile is.
+
+        Raises
+        ------
+        ConfigError
+            If a result of a tile is missing from the store and cannot be computed.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> flexroad.open_run("runs/city").normal(500010.0, 5600030.0).round(2)
+        array([-0.03,  0.01,  1.  ])
+        """
+        shape, answer = self._at(x, y)
+        return answer.normal.reshape(*shape, 3)
+
+    def to_xarray(self, bounds: Bounds | None = None) -> xr.Dataset:
+        """Return the height and the road mask of the finished tiles as one lazy raster.
+
+        Parameters
+        ----------
+        bounds : tuple of float, optional
+            West, south, east, north (m), grown to whole cells; by default all tiles.
+
+        Returns
+        -------
+        xarray.Dataset, (y, x)
+            ``height`` (m, float32; NaN where no finished tile is) and ``road`` (bool, the filtered mask),
+            backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is computed. Coordinates
+            ``x`` (ascending) and ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set. Of
+            tiles that overlap, the first of the catalog counts.
+
+        Raises
+        ------
+        ConfigError
+            If the bounds are empty, the run does not export GeoTIFF (``cog``), or its tiles have different
+            cells.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> raster = flexroad.open_run("runs/city").to_xarray((500000, 5600000, 500060, 5600030))
+        >>> dict(raster.sizes), dict(raster.chunksizes)
+        ({'y': 30, 'x': 60}, {'y': (30,), 'x': (40, 20)})
+        >>> bool(raster.height.isnull().sum() == 20 * 30)
+        True
+        """
+        import rioxarray  # noqa: F401 (gives datasets their .rio)
+        import xarray as xr
+
+        exported = self.run.config.export
+        if "cog" not in exported.formats or self.variant not in exported.variants:
+            raise ConfigError(
+                f"{self.run.path} exports no GeoTIFF of {self.variant}; add cog to export.formats and rerun"
+            )
+        mosaic = Mosaic.of(self.run, self.variant, bounds)
+        grid = mosaic.grid
+        raster = xr.Dataset(
+            {
+                "height": (("y", "x"), mosaic.layer(LAYERS["height"]), {"units": "m"}),
+                "road": (("y", "x"), mosaic.layer(LAYERS["road"])),
+            },
+            coords={"x": grid.eastings, "y": grid.northings},
+        )
+        placed: xr.Dataset = raster.rio.write_crs(grid.crs).rio.write_transform(grid.transform)
+        return placed
+
+    def tile(self, tile_id: str) -> xr.Dataset:
+        """Return what went into one tile and what came out of it.
+
+        Parameters
+        ----------
+        tile_id : str
+            An ``id`` of `tiles`.
+
+        Returns
+        -------
+        xarray.Dataset, (y, x)
+            ``dsm``, ``dtm``, ``surface`` (m), ``road``, ``road_filtered`` and, where the catalog has them,
+            ``reference`` (m) and ``reference_road``.
+
+        Raises
+        ------
+        ConfigError
+            If a stage fails on the tile.
+        CatalogError
+            If there is no such tile.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> tile = flexroad.open_run("runs/city").tile("499980_5599980")
+        >>> float(abs(tile.surface - tile.reference).where(tile.road).mean().round(1))
+        0.0
+        """
+        return open_tile(self.run.path, tile_id, self.variant)
+
+    def _at(self, x: ArrayLike, y: ArrayLike) -> tuple[tuple[int, ...], Answer]:
+        easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        return easting.shape, Ground(self.run, self.variant).at(easting.ravel(), northing.ravel())
+
+
+def open_run(path: str | Path, variant: str | None = None) -> RunView:
+    """Open the folder of a run, finished or not.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder that ``flexroad run --out`` made, or its address in a bucket (``s3://...``).
+    variant : str, optional
+        Whose surfaces are shown; by default those of the first variant exported.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is no run, or has no such variant.
+    CatalogError
+        If its catalog is damaged.
+
+    Examples
+    --------
+    >>> import flexroad
+    >>> flexroad.open_run("runs/city")
+    <flexroad.RunView: runs/city>
+    config nightly, variant flexroad
+    2 tiles: 1 done, 1 pending
+    """
+    run = Run.open(place(path))
+    variant = variant or run.config.export.variants[0]
+    if variant not in run.config.chains:
+        raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
+    return RunView(run, variant)
