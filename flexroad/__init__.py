@@ -1,1 +1,67 @@
-"""Smooth, light, georeferenced 3D road surfaces from aerial geodata."""
+"""Smooth, light, georeferenced 3D road surfaces from aerial geodata.
+
+>>> import flexroad
+>>> scene = flexroad.example(size_m=60)
+>>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+>>> float(surface.height(500210.0, 5600030.0).round(1))
+152.4
+
+The names below are imported on first use: ``import flexroad`` alone loads no numerical library.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flexroad.catalog.errors import CatalogError
+    from flexroad.pipeline.benchmark.example import example
+    from flexroad.pipeline.errors import ConfigError
+    from flexroad.pipeline.inspect.fit import fit
+    from flexroad.pipeline.inspect.run import RunView, open_run
+    from flexroad.pipeline.inspect.surface import Surface, open_surface
+    from flexroad.tasks.errors import TaskError
+
+    __version__: str
+
+__all__ = [
+    "CatalogError",
+    "ConfigError",
+    "RunView",
+    "Surface",
+    "TaskError",
+    "__version__",
+    "example",
+    "fit",
+    "open_run",
+    "open_surface",
+]
+
+_HOME = {
+    "CatalogError": "catalog.errors",
+    "ConfigError": "pipeline.errors",
+    "RunView": "pipeline.inspect.run",
+    "Surface": "pipeline.inspect.surface",
+    "TaskError": "tasks.errors",
+    "example": "pipeline.benchmark.example",
+    "fit": "pipeline.inspect.fit",
+    "open_run": "pipeline.inspect.run",
+    "open_surface": "pipeline.inspect.surface",
+}
+"""The module of each public name, below this package."""
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: Any = version("flexroad")
+    elif name in _HOME:
+        value = getattr(importlib.import_module(f"flexroad.{_HOME[name]}"), name)
+    else:
+        raise AttributeError(f"module 'flexroad' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

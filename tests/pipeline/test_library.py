@@ -1,0 +1,312 @@
+"""The library: `import flexroad` in a notebook."""
+
+import contextlib
+import doctest
+import importlib
+import io
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rioxarray
+import trimesh
+import xarray as xr
+
+import flexroad
+from flexroad.catalog import Catalog
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import execute
+
+ROOT = Path(__file__).parents[2]
+MODULES = [
+    "flexroad",
+    "flexroad.pipeline.benchmark.example",
+    "flexroad.pipeline.inspect.fit",
+    "flexroad.pipeline.inspect.run",
+    "flexroad.pipeline.inspect.surface",
+]
+CENTRE = 500210.0, 5600030.0
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory) -> Path:
+    """A folder with a survey of two tiles of 60 m and ``runs/city``, which has done the first."""
+    folder = tmp_path_factory.mktemp("library")
+    catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=0, size_m=60))
+    run = Run.create(folder / "runs" / "city", load_config("nightly"), catalog)
+    execute(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rasters(city) -> dict[str, xr.DataArray]:
+    """The files of the first tile."""
+    return {
+        layer: rioxarray.open_rasterio(city / "survey" / layer / "499980_5599980.tif")
+        for layer in ("dsm", "dtm", "road_mask")
+    }
+
+
+@pytest.fixture(scope="module")
+def scene() -> xr.Dataset:
+    return flexroad.example(size_m=60)
+
+
+@pytest.fixture(scope="module")
+def surface(scene) -> flexroad.Surface:
+    return flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_of_docstrings_run(name, city, monkeypatch):
+    monkeypatch.chdir(city)
+    failed, tried = doctest.testmod(importlib.import_module(name))
+    assert not failed
+    assert tried
+
+
+def test_every_public_method_has_an_example():
+    for owner in (flexroad.Surface, flexroad.RunView):
+        members = {name: member for name, member in vars(owner).items() if name[0] != "_" and member.__doc__}
+        for name, member in members.items():
+            if callable(member) or isinstance(member, property):
+                assert ">>> " in member.__doc__, f"{owner.__name__}.{name}"
+
+
+def test_page_of_the_docs_runs(city, tmp_path, monkeypatch, flexroad):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "library.md").read_text()
+    names: dict[str, object] = {}
+    blocks = re.findall(r"```(console|python)\n(.*?)```", page, flags=re.DOTALL)
+    assert len(blocks) > 4
+    for kind, block in blocks:
+        if kind == "python":
+            with contextlib.redirect_stdout(io.StringIO()):
+                exec(compile(block, "library.md", "exec"), names)
+            continue
+        for line in block.splitlines():
+            command, *words = shlex.split(line.removeprefix("$ "))
+            assert command == "flexroad"
+            assert flexroad(*words).code == 0, line
+    assert {"road.npz", "road.glb", "height.tif", "height.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_import_loads_no_heavy_library():
+    heavy = "numpy numba scipy rasterio pandas xarray torch dask pydantic".split()
+    code = f"import sys, flexroad; dir(flexroad); print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_there():
+    assert set(flexroad.__all__) <= set(dir(flexroad))
+    assert all(hasattr(flexroad, name) for name in flexroad.__all__)
+    assert not hasattr(flexroad, "unknown")
+
+
+def test_environment_of_a_notebook_stays():
+    code = (
+        "import os, numpy, numba; before = dict(os.environ); import flexroad; flexroad.fit; "
+        "print(before == dict(os.environ))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "True"
+
+
+def test_fit_equals_a_run_over_the_same_rasters(city, rasters):
+    ours = flexroad.fit(**rasters)
+    run = flexroad.open_run(city / "runs" / "city")
+    west, south, east, north = ours.bounds
+    x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
+    np.testing.assert_allclose(ours.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.normal(x, y), run.normal(x, y), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(
+        ours.clusters.mask[50:-50, 50:-50], run.tile("499980_5599980").road_filtered
+    )
+    stored = flexroad.open_surface(
+        city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad_surface.npz"
+    )
+    np.testing.assert_allclose(stored.height(x, y), ours.height(x, y), rtol=0, atol=1e-9)
+    with pytest.raises(flexroad.ConfigError, match="no road mask"):
+        stored.to_mesh()
+    mesh = trimesh.load(city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad.glb")
+    assert sum(len(part.faces) for part in mesh.geometry.values()) == len(ours.to_mesh().faces)
+
+
+def test_fit_takes_coordinates_in_either_direction(scene, surface):
+    turned = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
+    same = flexroad.fit(turned.dsm, scene.dtm, turned.road_mask.astype("uint8").expand_dims("band"))
+    assert same.height(*CENTRE) == surface.height(*CENTRE)
+    assert same.road.core == surface.road.core
+
+
+def test_fit_takes_arrays_without_coordinates(scene, surface):
+    bare = scene.rio.write_transform().drop_vars(["x", "y"])
+    assert flexroad.fit(bare.dsm, bare.dtm, bare.road_mask).height(*CENTRE) == surface.height(*CENTRE)
+
+
+def test_fit_takes_dask_arrays_and_nodata(scene, surface):
+    numbers = scene.dsm.where(scene.x > 500202, -9999.0).rio.write_nodata(-9999.0).chunk(20)
+    lacking = flexroad.fit(numbers, scene.dtm, scene.road_mask)
+    missing = flexroad.fit(scene.dsm.where(scene.x > 500202), scene.dtm, scene.road_mask)
+    assert lacking.height(*CENTRE) == missing.height(*CENTRE)
+
+
+def test_other_grid_is_resampled_with_a_warning(scene, surface):
+    wider = flexroad.example(size_m=80)
+    assert (
+        flexroad.fit(scene.dsm, wider.dtm.sel(y=scene.y, x=scene.x), scene.road_mask).bounds == surface.bounds
+    )
+    with pytest.warns(
+        UserWarning, match=r"dtm resampled to the grid of the dsm: its cells are 2 m, the dsm's 1"
+    ):
+        coarse = flexroad.fit(scene.dsm, scene.dtm.coarsen(x=2, y=2).mean(), scene.road_mask)
+    assert abs(coarse.height(*CENTRE) - surface.height(*CENTRE)) < 0.1
+
+
+def feet(array):
+    return array.assign_attrs(units="ft")
+
+
+def rotated(array):
+    from affine import Affine
+
+    turn = Affine.translation(500200, 5600060) @ Affine.rotation(10) @ Affine.scale(1, -1)
+    return array.drop_vars(["x", "y"]).rio.write_transform(turn)
+
+
+@pytest.mark.parametrize(
+    ("layer", "spoil", "message"),
+    [
+        ("dsm", lambda a: a.drop_vars("spatial_ref"), "dsm has no CRS; write it"),
+        ("dtm", lambda a: a.rio.write_crs(4326), "dtm is in EPSG:4326, a geographic CRS in degrees"),
+        ("dsm", lambda a: a.rio.write_crs(2264), "dsm is in EPSG:2264, whose coordinates are in US"),
+        ("dsm", lambda a: a.rio.write_crs("EPSG:25832+6360"), "heights in US survey foot; multiply"),
+        ("dtm", feet, "dtm has heights in ft; multiply it by 0.3048 and set dtm.attrs"),
+        ("dtm", lambda a: a.assign_attrs(units="K"), "dtm has units 'K'; give metres"),
+        ("dsm", rotated, "dsm is rotated; turn it north up"),
+        ("dsm", lambda a: a.assign_coords(y=5600060 - 2 * np.arange(60.0)), "dsm has pixels of 1 x 2 m"),
+        ("dsm", lambda a: a.assign_coords(x=500200 + np.arange(60.0) ** 2), "dsm has x in steps of 1 to 117"),
+        ("dtm", lambda a: a.rio.write_crs(25833), "dtm is in EPSG:25833, the dsm in EPSG:25832"),
+        ("dtm", lambda a: a.assign_coords(x=a.x + 5000), "dtm .* does not overlap the dsm"),
+        ("road_mask", lambda a: a & False, "road_mask has no road cell on the grid of the dsm"),
+        ("dsm", lambda a: a.where(a.x < 500206), "dsm has 10.0% valid cells, below 25%"),
+        ("dtm", lambda a: a * np.nan, "dtm has only nodata"),
+        ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
+        ("dsm", lambda a: xr.concat([a, a], "time"), r"dsm has dimensions \(time: 2, y: 60, x: 60\)"),
+        ("dsm", lambda a: a.assign_attrs(units="m", scale_factor=0.01), "scale_factor 0.01"),
+        ("road_mask", lambda a: a.astype(str), "road_mask holds <U5, not numbers"),
+        ("dsm", lambda a: a[:1], "dsm has 1 x 60 cells; give at least 2 x 2"),
+    ],
+)  # fmt: skip
+def test_unusable_array_is_refused_in_one_line(scene, layer, spoil, message):
+    plain = {name: scene[name].copy() for name in ("dsm", "dtm", "road_mask")}
+    for array in plain.values():
+        array.attrs = {}
+    with pytest.raises(flexroad.TaskError, match=message) as error:
+        flexroad.fit(**{**plain, layer: spoil(plain[layer])})
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_configuration_or_variant_is_refused(scene):
+    with pytest.raises(flexroad.ConfigError, match="did you mean nightly"):
+        flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, config="nightli")
+    with pytest.raises(flexroad.ConfigError, match="no variant 'plane'"):
+        flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, variant="plane")
+
+
+def test_surface_to_xarray_has_heights_and_road(surface):
+    raster = surface.to_xarray()
+    assert raster.rio.crs.to_epsg() == 25832
+    assert tuple(raster.rio.bounds()) == surface.bounds
+    assert raster.y[0] > raster.y[-1]
+    x, y = np.meshgrid(raster.x, raster.y)
+    np.testing.assert_allclose(raster.height, surface.height(x, y), rtol=0, atol=1e-9)
+    assert raster.road.sum() == surface.clusters.mask.sum()
+    odd = surface.to_xarray(0.7)
+    assert np.isfinite(odd.height.sel(x=slice(None, 500260), y=slice(None, 5600000))).all()
+    with pytest.raises(flexroad.ConfigError, match="resolution 0 m"):
+        surface.to_xarray(0)
+
+
+def test_surface_survives_its_file(surface, tmp_path):
+    surface.save(tmp_path / "road.npz")
+    again = flexroad.open_surface(tmp_path / "road.npz")
+    assert repr(again) == repr(surface)
+    assert again.to_xarray().identical(surface.to_xarray())
+    assert np.array_equal(again.to_mesh().vertices, surface.to_mesh().vertices)
+    (tmp_path / "road.npz").write_bytes(b"nothing")
+    with pytest.raises(flexroad.TaskError, match="not a FlexRoad surface"):
+        flexroad.open_surface(tmp_path / "road.npz")
+
+
+def test_plane_and_raster_are_surfaces_too(scene, tmp_path):
+    for variant, kind in (("plane", "plane"), ("rgt", "raster")):
+        flat = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, "ablation", variant)
+        assert repr(flat).startswith(f"<flexroad.Surface: {kind}, config ablation>")
+        assert np.isfinite(flat.height(*CENTRE))
+        with pytest.raises(flexroad.TaskError, match="no NURBS surface"):
+            flat.save(tmp_path / "flat.npz")
+
+
+def test_mesh_lies_on_the_surface(surface):
+    mesh = surface.to_mesh()
+    east, north, up = (mesh.vertices + mesh.metadata["origin"]).T
+    np.testing.assert_allclose(up, surface.height(east, north), atol=1e-6)
+    assert mesh.face_attributes["road"].any()
+    upright = surface.to_mesh(up="y")
+    np.testing.assert_array_equal(upright.vertices[:, 1], mesh.vertices[:, 2])
+    assert (upright.face_normals[:, 1] > 0).all()
+
+
+def test_run_to_xarray_is_lazy_and_equals_the_surface(city):
+    run = flexroad.open_run(city / "runs" / "city")
+    raster = run.to_xarray()
+    assert raster.height.chunks == ((60,), (60, 60))
+    assert raster.height.dtype == np.float32
+    done, pending = raster.isel(x=slice(0, 60)), raster.isel(x=slice(60, None))
+    x, y = np.meshgrid(done.x, done.y)
+    np.testing.assert_allclose(done.height, run.height(x, y), rtol=0, atol=1e-4)
+    assert pending.height.isnull().all()
+    assert not pending.road.any()
+    assert done.road.any()
+    inner = run.to_xarray((499990.2, 5599990.7, 500000.0, 5600000.0))
+    assert inner.height.equals(raster.height.sel(x=inner.x, y=inner.y))
+    assert tuple(inner.rio.bounds()) == (499990, 5599990, 500000, 5600000)
+    beyond = run.to_xarray((499970, 5599970, 499990, 5599990))
+    assert int(beyond.height.notnull().sum()) == 100
+    with pytest.raises(flexroad.ConfigError, match="are empty"):
+        run.to_xarray((1, 1, 0, 0))
+
+
+def test_run_to_xarray_needs_geotiffs(city, tmp_path):
+    (tmp_path / "light.yaml").write_text("extends: nightly\nexport: {formats: [npz]}\n")
+    catalog = Catalog.read(city / "survey" / "catalog.parquet")
+    run = Run.create(tmp_path / "run", load_config(tmp_path / "light.yaml"), catalog)
+    with pytest.raises(flexroad.ConfigError, match="exports no GeoTIFF of flexroad"):
+        flexroad.open_run(run.path).to_xarray()
+
+
+def test_run_lists_failures(city, tmp_path):
+    catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
+    (tmp_path / "survey" / "dsm" / "499980_5599980.tif").unlink()
+    run = Run.create(tmp_path / "run", load_config("nightly"), catalog)
+    with pytest.raises(flexroad.ConfigError, match=r"failures.csv does not exist"):
+        assert flexroad.open_run(run.path).failures
+    execute(run, SerialExecutor())
+    view = flexroad.open_run(run.path)
+    assert view.failures[["tile_id", "stage"]].values.tolist() == [["499980_5599980", "load"]]
+    assert view.tiles.state.tolist() == ["failed"]
+    assert np.isnan(view.height(500010, 5600030))
+    assert np.isnan(view.normal([0, 1], 0)).all()
+    with pytest.raises(flexroad.ConfigError, match="is no run"):
+        flexroad.open_run(tmp_path)
+    with pytest.raises(flexroad.ConfigError, match="no variant 'x'"):
+        flexroad.open_run(run.path, "x")
