@@ -25,7 +25,7 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     seed : int
         The world; 0 or more.
     size_m : int
-        Side of the area (m), 20 to 1000; cells are 1 m.
+        Side of the area (m), 60 to 1000; cells are 1 m.
 
     Returns
     -------
@@ -48,8 +48,8 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
 
-    if seed < 0 or not 20 <= size_m <= 1000:
-        raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 20 to 1000 m")
+    if seed < 0 or not 60 <= size_m <= 1000:
+        raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 60 to 1000 m")
     grid = Grid(CRS, WEST_M, SOUTH_M + size_m, 1.0, size_m, size_m)
     layers = make_scene(grid, seed).layers
     scene = xr.Dataset(

@@ -29,7 +29,7 @@ def fit(
     """Fit a smooth surface to the road and the terrain of one area.
 
     The stages are those of a run over the same rasters, and so is the result. The area is fitted as one tile,
-    which suits up to about 500 m x 500 m. For more, make a catalog and a run.
+    which suits 60 m x 60 m to about 500 m x 500 m. For more, make a catalog and a run.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def fit(
     ------
     TaskError
         If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if the CRS of
-        two arrays differ; if the DSM has too few heights, or the mask no road cell.
+        two arrays differ; if the DSM has too few heights, or the mask no road cell; if a stage fails.
     ConfigError
         If there is no such configuration or variant.
 

@@ -111,6 +111,11 @@ def test_every_public_name_is_there():
     assert not hasattr(flexroad, "unknown")
 
 
+def test_example_refuses_a_size_out_of_range():
+    with pytest.raises(flexroad.ConfigError, match="size_m 10: give"):
+        flexroad.example(size_m=10)
+
+
 def test_environment_of_a_notebook_stays():
     code = (
         "import os, numpy, numba; before = dict(os.environ); import flexroad; flexroad.fit; "
