@@ -42,7 +42,7 @@ def _part(chain: Chain, full: Chain) -> str:
         return "plane"
     if fit["method"] == "raster" and fit["road"] == "dsm":
         return {"dsm": "rgt", "dtm": "wo_nurbs"}[fit["terrain"]]
-    return "wo_ecsrc" if changes(chain, full) == {"ecsrc.variant"} else ""
+    return "wo_ecsrc" if changes(chain, full) == {"ecsrc.method"} else ""
 
 
 def changes(chain: Chain, full: Chain) -> set[str]:
