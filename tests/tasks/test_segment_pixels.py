@@ -1,5 +1,6 @@
 """`pixels` from made tiles with an orthophoto to a mask, end to end."""
 
+import importlib.util
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from skops.io import dumps, loads
 from flexroad.tasks import TaskError
 from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.pixels import train as training
-from flexroad.tasks.segment.pixels.model import TRUSTED, read_model
+from flexroad.tasks.segment.pixels.model import TRUSTED, read_model, require
 from flexroad.tasks.segment.pixels.segment import Options, files, segment
 from flexroad.tasks.segment.pixels.train import even_threshold
 from flexroad.tasks.segment.training_types import Sample
@@ -204,3 +205,11 @@ def test_cells_of_one_probability_are_called_together():
     threshold, iou = even_threshold(told, road, np.ones(5))
     assert threshold == pytest.approx(0.4)
     assert iou == pytest.approx(2 / 4)
+
+
+@pytest.mark.parametrize("module", ["sklearn", "skops"])
+def test_missing_extra_is_named_in_one_line(monkeypatch, module):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == module else find(name))
+    with pytest.raises(TaskError, match=r"pip install 'flexroad\[train\]'"):
+        require()

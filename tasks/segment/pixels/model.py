@@ -6,6 +6,7 @@ on the list of known types is refused before anything of it is built.
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,6 +37,20 @@ class About(Options):
     threshold: float = Field(gt=0, lt=1, description="probability from which a cell is road")
     scikit_learn: str = Field(description="version that made the classifier")
     trained: dict[str, str | int | float] = Field(description="provenance: tiles, options, figures")
+
+
+def require() -> None:
+    """Check that the libraries of the extra ``train`` are installed.
+
+    Raises
+    ------
+    TaskError
+        If one is missing.
+    """
+    for package in ("sklearn", "skops"):
+        if importlib.util.find_spec(package) is None:
+            name = {"sklearn": "scikit-learn"}.get(package, package)
+            raise TaskError(f"segment: pixels needs {name}: pip install 'flexroad[train]'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +104,7 @@ def read_model(path: Path) -> Model:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, size: int, mtime_ns: int) -> Model:
+    require()
     from sklearn import __version__
     from sklearn.ensemble import HistGradientBoostingClassifier
     from skops.io import loads

@@ -20,7 +20,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.segment.pixels.features import features, look
-from flexroad.tasks.segment.pixels.model import About, Model
+from flexroad.tasks.segment.pixels.model import About, Model, require
 from flexroad.tasks.segment.training_types import Progress, Round, Sample, Trained
 from flexroad.tasks.types import Bools, Floats
 
@@ -97,9 +97,10 @@ def train(
     Raises
     ------
     TaskError
-        If there is no tile to train or to validate on, one lacks the orthophoto that others have, or the
-        labels know only one kind of cell.
+        If scikit-learn or skops is missing, there is no tile to train or to validate on, one lacks the
+        orthophoto that others have, or the labels know only one kind of cell.
     """
+    require()
     learnt = _draw(train, options, "training")
     judged = _draw(validate, options.model_copy(update={"photo": learnt.has_colours}), "validation")
     rounds, threshold, expected = _set_apart(learnt, judged, options)

@@ -1,0 +1,54 @@
+"""How soon commands start: CPU time of whole processes, as ratios to ``python -c "import numpy"`` in one run.
+
+Targets: ``flexroad --help`` at most 5, ``flexroad config show`` at most 8, a run with nothing to do over ten
+tiles at most 15.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROUNDS = 7
+FLEXROAD = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+def cpu_s(command: list[str]) -> float:
+    """Return the CPU time of a process and its children (s)."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, **ONE_THREAD})
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        survey, run = Path(scratch, "survey"), Path(scratch, "run")
+        made = ["catalog", "synthetic", "-o", str(survey), "--tiles", "10", "--tile-size", "60"]
+        subprocess.run([*FLEXROAD, *made], check=True, capture_output=True)
+        catalog = ["--catalog", str(survey / "catalog.parquet"), "--out", str(run)]
+        commands = {
+            "python -c 'import numpy'": ([sys.executable, "-c", "import numpy"], 1),
+            "flexroad --help": ([*FLEXROAD, "--help"], 5),
+            "flexroad config show nightly": ([*FLEXROAD, "config", "show", "nightly"], 8),
+            "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "nightly", *catalog], 15),
+        }
+        for command, _ in commands.values():
+            # Once not counted: files come into memory, and the run is done.
+            subprocess.run(command, check=True, capture_output=True)
+        # In turn, so that a machine that slows down slows all of them.
+        rounds = [{name: cpu_s(command) for name, (command, _) in commands.items()} for _ in range(ROUNDS)]
+    best = {name: min(times[name] for times in rounds) for name in commands}
+    base = best["python -c 'import numpy'"]
+    print(f"{'command':32}{'CPU s':>8}{'ratio':>8}{'target':>8}")
+    for name, (_, target) in commands.items():
+        print(f"{name:32}{best[name]:8.2f}{best[name] / base:8.1f}{target:8}")
+
+
+if __name__ == "__main__":
+    main()
