@@ -11,7 +11,8 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.models import DEFAULTS, TAG, Config, Export, stage_models
+from flexroad.pipeline.config.methods import DEFAULTS
+from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
 from flexroad.pipeline.errors import ConfigError
 
 SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
@@ -52,7 +53,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     _refuse_unknown(raw, known, name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
-        stage: _merge(DEFAULTS.get(stage, {}), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
+        stage: _merge(DEFAULTS.get(stage), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
         for stage in stages
     }
     chains = {}
@@ -114,7 +115,7 @@ def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
             merged[key] = value
         else:
             # A parent that names no method has the usual one, and another starts from its own defaults.
-            below = _merge(DEFAULTS.get(key, {}), parent.get(key), TAG.get(key), key)
+            below = _merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
             merged[key] = _merge(below, value, TAG.get(key), key)
     return merged
 

@@ -7,11 +7,9 @@ from typing import Any
 import yaml
 
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.models import DEFAULTS, TAG, Export, methods, stage_models
-from flexroad.tasks import load, sample
-from flexroad.tasks.metrics import evaluate
+from flexroad.pipeline.config.methods import DEFAULTS, HOMES, methods
+from flexroad.pipeline.config.models import Export, stage_models
 from flexroad.tasks.options import Options
-from flexroad.tasks.quality import assess
 
 
 def schema() -> dict[str, Any]:
@@ -33,22 +31,12 @@ def schema() -> dict[str, Any]:
 def template() -> str:
     """Return a configuration file with every option at its default and its meaning beside it."""
     lines = ["# Every option with its default. Delete what you do not change."]
-    packages = {
-        "segment": "flexroad.tasks.segment",
-        "ecsrc": "flexroad.tasks.filter",
-        "fit": "flexroad.tasks.fit",
-    }
-    singles = {"load": load, "sample": sample, "evaluate": evaluate, "assess": assess}
-    for stage in stage_models():
-        lines.append(f"{stage}:")
-        if stage in packages:
-            default = DEFAULTS[stage][TAG[stage]]
-            lines += _option_lines(methods(packages[stage])[default].Options)
-            others = [name for name in methods(packages[stage]) if name != default]
-            if others:
-                lines.append(f"  # other methods: {', '.join(others)}")
-        else:
-            lines += _option_lines(singles[stage].Options)
+    for stage in HOMES:
+        default = DEFAULTS.get(stage, "")
+        lines += [f"{stage}:", *_option_lines(methods(stage)[default].Options)]
+        others = [name for name in methods(stage) if name != default]
+        if others:
+            lines.append(f"  # other methods: {', '.join(others)}")
     lines += ["export:", *_option_lines(Export), "cluster:", *_option_lines(Cluster)]
     lines += ["variants:", "  flexroad: {}"]
     return "\n".join(lines) + "\n"

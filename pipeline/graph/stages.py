@@ -1,4 +1,17 @@
-"""The steps of the paper: which there are, what each takes, and the file that does it."""
+"""The steps of the paper: which there are, what each takes, and the file that does it.
+
+::
+
+    load      tasks/load.py               DSM, DTM, masks and reference of a tile, on one lattice
+    segment   tasks/segment/METHOD.py     the road mask M^r (step B)
+    ecsrc     tasks/filter/METHOD.py      the filtered mask M^{r+} (step B, Algorithm 1)
+    fit       tasks/fit/METHOD.py         the surface S (step C)
+    sample    tasks/sample.py             the mesh (dynamic surface sampling)
+    evaluate  tasks/metrics/evaluate.py   its error, its smoothness and its size
+    assess    tasks/quality/assess.py     flags and an error estimate without ground truth; not the paper's
+
+`pipeline.config.methods` finds the files.
+"""
 
 from __future__ import annotations
 

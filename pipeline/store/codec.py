@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.config.models import methods
+from flexroad.pipeline.config.methods import methods
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
@@ -70,6 +70,6 @@ def _plain(item: Any) -> Any:
 def _types() -> dict[str, type]:
     kinds = (Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
     known: dict[str, type] = {kind.__name__: kind for kind in kinds}
-    for module in methods("flexroad.tasks.fit").values():
+    for module in methods("fit").values():
         known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
     return known

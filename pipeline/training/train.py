@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
-from flexroad.pipeline.config.models import Config, methods
+from flexroad.pipeline.config.methods import methods
+from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.training.spatial_split import Piece, Split, halves, inside, split
 from flexroad.tasks import load
@@ -217,7 +218,7 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
         say(f"round {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
 
     trained: Trained = method.train(*sides_read, settings, progress)
-    segment = methods("flexroad.tasks.segment")[asked.method]
+    segment = methods("segment")[asked.method]
     with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
@@ -232,7 +233,7 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
 def segment_options(config: Config, method: str, model: Path) -> Options:
     """Return how a model is applied to be judged: as configured, without hygiene."""
     configured = _chain(config)["segment"]
-    module = methods("flexroad.tasks.segment")[method]
+    module = methods("segment")[method]
     given = configured.model_dump() if isinstance(configured, module.Options) else {"method": method}
     options: Options = module.Options(**given | {"model": model, "hygiene": NOTHING})
     return options
