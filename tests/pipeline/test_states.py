@@ -9,7 +9,7 @@ from pyproj import Transformer
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.monitor.geojson import corners, write_states
+from flexroad.pipeline.monitor.geojson import outlines, write_states
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.database import NAME, Ledger
 from flexroad.pipeline.store.records import Entry, Failure
@@ -51,13 +51,13 @@ def test_other_programs_read_it(run, tmp_path):
 def test_tiles_of_several_systems_lie_where_they_are(made_survey):
     one, two, *_ = Catalog.read(made_survey / "catalog.parquet").tiles
     other = replace(two, grid=replace(two.grid, crs="EPSG:32633"))
-    rings = corners([one, other, one])
+    rings = np.array([polygon.exterior.coords for polygon in outlines([one, other, one])])
     assert rings.shape == (3, 5, 2)
     assert np.array_equal(rings[0], rings[2])
     to_wgs84 = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
     west, south, east, north = other.grid.bounds
     expected = [
-        to_wgs84.transform(*at) for at in ((west, south), (east, south), (east, north), (west, north))
+        to_wgs84.transform(*at) for at in ((east, south), (east, north), (west, north), (west, south))
     ]
     assert rings[1, :4] == pytest.approx(np.array(expected), abs=1e-7)
 
