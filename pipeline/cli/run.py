@@ -272,24 +272,12 @@ def status(
     geojson: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a map of the tiles' states, for QGIS.")
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until Ctrl-C.")] = False,
-    every: Annotated[float, typer.Option(min=0.1, help="With --watch: how often to look (s).")] = 2,
 ) -> None:
     """Tell how a run stands, and what failed why."""
-    from flexroad.catalog.storage.paths import exists, place
+    from flexroad.catalog.storage.paths import place
     from flexroad.pipeline.run.record import Run
 
-    where = place(path)
-    # Not opened for a look at its ledger: that reads the catalog.
-    if watch and exists(where / "run.json"):
-        from rich.console import Console
-
-        from flexroad.pipeline.monitor.live_status import follow
-
-        with contextlib.suppress(KeyboardInterrupt):
-            follow(where, Console(), every)
-        return
-    opened = Run.open(where)
+    opened = Run.open(place(path))
     if geojson is not None:
         from flexroad.pipeline.monitor.geojson import write_states
 
@@ -304,18 +292,19 @@ def _tell(run: Run, as_json: bool) -> None:
     from dataclasses import asdict
 
     from flexroad.pipeline.run.lock import at_work, dead, holder
-    from flexroad.pipeline.run.status import summary
+    from flexroad.pipeline.run.status import progress, summary
 
-    how, who = summary(run), holder(run.path)
+    who = holder(run.path)
+    alive = who if who and not dead(who) else None
     if as_json:
-        found = asdict(how)
+        found = asdict(summary(run))
         found["failures"] = [{k: v for k, v in one.items() if k != "trace"} for one in found["failures"]]
-        who = None if who is None or dead(who) else who
-        found["at_work"] = {"host": who.host, "pid": who.pid, "since": who.since} if who else None
+        found["at_work"] = {"host": alive.host, "pid": alive.pid, "since": alive.since} if alive else None
         typer.echo(json.dumps(found, indent=1))
         return
+    how, pace = progress(run, alive) if alive else (summary(run), "")
     typer.echo(line(how))
     if who:
-        typer.echo(at_work(who))
+        typer.echo(at_work(who) + pace)
     for failure in how.failures:
         typer.echo(f"  {failure.notice}")

@@ -7,16 +7,19 @@ is not the one in the ledger costs the reading of that marker.
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Place, Seen, is_remote, listing, read
 from flexroad.pipeline.graph.graph import Look, TileGraph, any_gone
+from flexroad.pipeline.run.lock import Holder
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.summary import MOST_TOLD, Summary, read_summary
+from flexroad.pipeline.run.summary import MOST_TOLD, Summary, read_summary, summarise
 from flexroad.pipeline.store.database import NAME, Ledger
 from flexroad.pipeline.store.products import TileFolder
 from flexroad.pipeline.store.records import DONE, FAILED, Entry, Failure, Marker, from_failed, from_item
@@ -135,3 +138,17 @@ def summary(run: Run) -> Summary:
     last = read_summary(run.path)
     known = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(found, **{name: last[name] for name in known if name in last})
+
+
+def progress(run: Run, who: Holder) -> tuple[Summary, str]:
+    """Return how a run that a process is at work on stands, and how fast it goes, in words.
+
+    By the ledger alone, so that it can be repeated every few seconds.
+    """
+    with Ledger.peek(run.path / NAME) as ledger:
+        how, tried = summarise(len(run.catalog.tiles), ledger), ledger.tried_since(who.since)
+    minutes = (time.time() - datetime.fromisoformat(who.since).timestamp()) / 60
+    if not tried or minutes <= 0:
+        return how, ""
+    left = how.pending / (tried / minutes)
+    return how, f", {tried / minutes:.1f} tiles a minute, about {left:.0f} min left"

@@ -178,6 +178,12 @@ class Ledger:
             dict(self._connection.execute("SELECT standing, count(*) FROM asked GROUP BY standing"))
         )
 
+    def tried_since(self, when: str) -> int:
+        """Return how many tiles were finished, done or failed, since a time (ISO 8601, UTC)."""
+        self.flush()
+        line = self._line("SELECT count(*) FROM entry WHERE finished >= ?", when)
+        return int(line[0]) if line else 0
+
     def standing(self, tile_id: str) -> Standing | None:
         """Return how a tile stood when the last run looked at it, None if it was not asked for."""
         line = self._line("SELECT standing FROM asked WHERE tile = ?", tile_id)
@@ -208,10 +214,10 @@ class Ledger:
         ):
             yield from (Failure(**failure) for failure in json.loads(failures))
 
-    def _line(self, query: str, tile_id: str) -> Sequence[Any] | None:
+    def _line(self, query: str, value: str) -> Sequence[Any] | None:
         # What cannot be read is not known: the marker tells.
         with contextlib.suppress(sqlite3.DatabaseError):
-            found: Sequence[Any] | None = self._connection.execute(query, (tile_id,)).fetchone()
+            found: Sequence[Any] | None = self._connection.execute(query, (value,)).fetchone()
             return found
         return None
 
