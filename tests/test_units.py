@@ -10,7 +10,7 @@ import pytest
 import typer
 import yaml
 
-from flexroad.pipeline.cli.main import app, spread
+from flexroad.pipeline.cli.main import app
 
 UNITS = Path(__file__).parent.parent / "docs" / "operations"
 JOB = yaml.safe_load((UNITS / "cronjob.yaml").read_text())
@@ -34,7 +34,7 @@ def test_its_command_runs(name, made_survey, tmp_path, capsys):
     words = command(name)
     words[words.index("--catalog") + 1] = str(made_survey / "catalog.parquet")
     words[words.index("--out") + 1] = str(tmp_path / "run")
-    typer.main.get_command(app)(spread([*words, "--dry-run"]), standalone_mode=False)
+    typer.main.get_command(app)([*words, "--dry-run"], standalone_mode=False)
     assert "to do" in capsys.readouterr().out
 
 

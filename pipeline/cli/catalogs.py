@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.run import next_run
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ MinCover = Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles cov
 Date = Annotated[datetime | None, typer.Option(help="When the data was taken.")]
 
 
-@catalogs.command("rasters")
+@catalogs.command("rasters", cls=Command)
 def catalog_rasters(
     root: Annotated[Path, typer.Argument(help="Folder of rasters.")],
     dsm: Annotated[str, typer.Option(help="Files of the surface model, relative to ROOT ('dsm/*.tif').")],
@@ -68,7 +69,7 @@ def catalog_rasters(
     _write_catalog(found, output)
 
 
-@catalogs.command("nrw")
+@catalogs.command("nrw", cls=Command)
 def catalog_nrw(
     root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads, under their own names.")],
     output: Output,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import os
 import signal
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import typer
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Place
@@ -45,10 +46,13 @@ def line(how: Summary) -> str:
     return f"{how.tiles} tiles: {now}; {since}; {how.seconds:.0f} s"
 
 
+def warn(line: str, kind: str = "warning") -> None:
+    """Print a line beside the results, on standard error."""
+    typer.echo(f"{kind}: {line}", err=True)
+
+
 @contextlib.contextmanager
-def overseen(
-    run: Place, on_failure: str | None, prometheus: Path | None, warn: Callable[[str], None]
-) -> Iterator[Ending]:
+def overseen(run: Place, on_failure: str | None, prometheus: Path | None) -> Iterator[Ending]:
     """See to it that whatever ends the work inside is told to those who asked to be.
 
     An interruption ends here; everything else goes on.
@@ -64,7 +68,7 @@ def overseen(
     ending = Ending()
     with _end_as_ctrl_c(), contextlib.ExitStack() as stack:
         # Leaves in the opposite order: the alarm rings when the file is written.
-        stack.callback(_alarm, ending, run, before, on_failure, warn)
+        stack.callback(_alarm, ending, run, before, on_failure)
         try:
             ending.textfile = _textfile(stack, run, prometheus)
             yield ending
@@ -79,14 +83,10 @@ def overseen(
                 ending.textfile.ended(ending.exit_code, ending.how)
 
 
-def unread(words: Sequence[str], warn: Callable[[str], None]) -> None:
-    """Tell the alarm, if it can be made out, that a command line could not be read."""
-    if not words or words[0] not in ("run", "rerun"):
-        return
-    target = _after(words, "--on-failure") or os.environ.get(ON_FAILURE)
+def unread(run: Path | None, target: str) -> None:
+    """Tell the alarm that the command line of a run could not be read."""
     text = "the command line could not be read; `flexroad run --help` shows it"
-    run = Path(_after(words, "--out") or (words[1] if words[0] == "rerun" and words[1:] else ""))
-    _alarm(Ending(CANNOT_START, text), run, {}, target, warn)
+    _alarm(Ending(CANNOT_START, text), run or Path(), {}, target)
 
 
 @contextlib.contextmanager
@@ -133,9 +133,7 @@ def _told_by(error: BaseException) -> tuple[int, str]:
     return 1, f"{type(error).__name__}: {error}"
 
 
-def _alarm(
-    ending: Ending, run: Place, before: dict[str, Any], target: str | None, warn: Callable[[str], None]
-) -> None:
+def _alarm(ending: Ending, run: Place, before: dict[str, Any], target: str | None) -> None:
     if not target or not ending.exit_code:
         return
     from flexroad.pipeline.monitor.alerts import notify
@@ -154,12 +152,3 @@ def _alarm(
     }
     if why := notify(target, told):
         warn(f"--on-failure: {why}")
-
-
-def _after(words: Sequence[str], option: str) -> str | None:
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        if word == option:
-            return following or None
-        if word.startswith(option + "="):
-            return word.removeprefix(option + "=")
-    return None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.run import next_run
 from flexroad.pipeline.prepare.asked import Asked
 
@@ -141,7 +142,7 @@ def _carry_out(make: Callable[[], Published]) -> None:
     typer.echo(f"next: {next_run(made.catalog)}")
 
 
-@prepare.command("points")
+@prepare.command("points", cls=Command)
 @with_common
 def prepare_points(
     asked: Asked,

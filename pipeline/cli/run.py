@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Ending, line, overseen
+from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Ending, line, overseen, warn
 from flexroad.pipeline.cli.stdio import patient
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 
@@ -100,7 +100,7 @@ def run(
         for line in plan(graphs, root or path / "store", path):
             typer.echo(line)
         return
-    with overseen(path, on_failure, prometheus, _warn) as ending:
+    with overseen(path, on_failure, prometheus) as ending:
         chosen = load_config(config)
         whole, tiles = wanted(chosen)
         some = bool(tile) or bbox is not None
@@ -138,7 +138,7 @@ def rerun(
     from flexroad.pipeline.run.selection import select
 
     where = place(path)
-    with overseen(where, on_failure, prometheus, _warn) as ending:
+    with overseen(where, on_failure, prometheus) as ending:
         if from_stage is not None and from_stage not in STAGE_NAMES:
             raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
         anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
@@ -163,7 +163,7 @@ def _alone(path: Place, make: bool = False) -> Iterator[None]:
             path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
-    with held(path, lambda line: _warn(line, "note")):
+    with held(path, lambda line: warn(line, "note")):
         yield
 
 
@@ -239,7 +239,7 @@ def _draw(run: Run) -> None:
     try:
         write_states(run, run.path / NAME)
     except OSError as error:
-        _warn(f"no map of the tiles: {error}")
+        warn(f"no map of the tiles: {error}")
 
 
 def _leave(ending: Ending) -> None:
@@ -247,10 +247,6 @@ def _leave(ending: Ending) -> None:
     if ending.exit_code and ending.how is None:
         typer.echo(ending.text if ending.exit_code == 130 else f"error: {ending.text}", err=True)
     raise typer.Exit(ending.exit_code)
-
-
-def _warn(line: str, kind: str = "warning") -> None:
-    typer.echo(f"{kind}: {line}", err=True)
 
 
 def next_run(catalog: Path) -> str:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.cli.main import spread
+from flexroad.pipeline.cli.main import app
 
 
 def flexroad(*words, expect: int = 0) -> str:
@@ -46,13 +47,22 @@ def finished(made_survey, tmp_path_factory) -> Path:
     return out
 
 
-def test_spread_repeats_the_option_for_each_value():
-    assert spread(["run", "--tile", "a", "b", "--out", "x"]) == [
-        "run", "--tile", "a", "--tile", "b", "--out", "x",
-    ]  # fmt: skip
-    rasters = ["catalog", "rasters", "root", "--road-value", "1", "-3", "-o", "c.json"]
-    assert spread(rasters)[3:7] == ["--road-value", "1", "--road-value", "-3"]
-    assert spread(["rerun", "--tile", "a", "RUN"]) == ["rerun", "--tile", "a", "RUN"]
+def parsed(*words) -> dict:
+    """The parameters that a command gets of a command line, unchecked."""
+    command = typer.main.get_command(app)
+    for name in words[: 2 if words[0] == "catalog" else 1]:
+        command = command.commands[name]
+    rest = list(words[words.index(command.name) + 1 :])
+    return command.make_context(command.name, rest, resilient_parsing=True).params
+
+
+def test_an_option_takes_several_values():
+    run = parsed("run", "--tile", "a", "b", "--out", "x")
+    assert (run["tile"], run["out"]) == (["a", "b"], Path("x"))
+    rasters = parsed("catalog", "rasters", "root", "--road-value", "1", "-3", "-o", "c.json")
+    assert (rasters["road_value"], rasters["root"]) == ([1, -3], Path("root"))
+    rerun = parsed("rerun", "--tile", "a", "RUN")
+    assert (rerun["tile"], rerun["path"]) == (["a"], Path("RUN"))
 
 
 def test_figures(finished, tmp_path):
