@@ -30,7 +30,7 @@ class Cluster(Options):
         "a tile that needs more is stopped and becomes a failed row",
     )
     patience_s: float = Field(
-        60, ge=0, le=86_400, description="how long a run waits for a scheduler or workers that went away (s)"
+        60, ge=0, le=86_400, description="how long a run waits for a worker when none is left (s)"
     )
     start_s: float = Field(
         3600, gt=0, le=604_800, description="slurm, kubernetes: how long to wait for the first worker (s)"

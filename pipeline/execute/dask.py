@@ -1,4 +1,4 @@
-"""Many jobs at once, on Dask: connect, see that the workers are fit, fly, and connect again if need be."""
+"""Many jobs at once, on Dask: connect, check that the workers are fit, and submit."""
 
 from __future__ import annotations
 
@@ -68,24 +68,28 @@ class DaskExecutor:
         if not first:
             # Nothing to do needs no workers.
             return
-        from flexroad.pipeline.execute.session import SchedulerGone, Session, Todo
+        from flexroad.pipeline.execute.session import Session
 
-        todo = Todo(chain(first, queue))
-        with _quiet(), opened(self.cluster, self.workers, self.scheduler, self.dashboard) as place:
-            connect = self._first
-            while True:
-                with connect(place) as client:
-                    guard = _guard(client, place, probe)
-                    session = Session(client, guard, function, todo, lost, self.cluster.patience_s, self.say)
-                    try:
-                        yield from session.results()
-                        return
-                    except SchedulerGone:
-                        session.give_back()
-                connect = self._again
+        with (
+            _quiet(),
+            opened(self.cluster, self.workers, self.scheduler, self.dashboard) as place,
+            self._connected(place) as client,
+        ):
+            guard = _guard(client, place, probe)
+            session = Session(
+                client,
+                place.name,
+                guard,
+                function,
+                chain(first, queue),
+                lost,
+                self.cluster.patience_s,
+                self.say,
+            )
+            yield from session.results()
 
     @contextlib.contextmanager
-    def _first(self, place: Workplace) -> Iterator[Client]:
+    def _connected(self, place: Workplace) -> Iterator[Client]:
         from distributed import Client
 
         try:
@@ -99,27 +103,6 @@ class DaskExecutor:
                 raise ConfigError(
                     f"{place.name} has no workers; start some (`dask worker ADDRESS --nthreads 1`)"
                 )
-            yield client
-
-    @contextlib.contextmanager
-    def _again(self, place: Workplace) -> Iterator[Client]:
-        from distributed import Client
-
-        patience = self.cluster.patience_s
-        end = time.monotonic() + patience
-        self.say(f"{place.name} is gone; waiting up to {patience:g} s for it")
-        while True:
-            try:
-                client = Client(place.target, timeout=min(ANSWER_S, max(patience, 1)), set_as_default=False)
-                break
-            except OSError as error:
-                if time.monotonic() > end:
-                    raise ClusterLost(f"{place.name} was gone for {patience:g} s") from error
-                time.sleep(0.2)
-        with client:
-            if not _any_worker(client, end):
-                raise ClusterLost(f"{place.name} came back, but no worker within {patience:g} s")
-            self.say(f"{place.name} is back")
             yield client
 
 

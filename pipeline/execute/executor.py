@@ -33,5 +33,5 @@ class Executor(Protocol):
         ConfigError
             If the workers cannot do the work: none there, other versions, a store they cannot write.
         ClusterLost
-            If scheduler or workers went away for longer than one waits; what is done is done.
+            If the scheduler went away, or all workers for longer than one waits; what is done is done.
         """

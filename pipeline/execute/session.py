@@ -1,4 +1,4 @@
-"""A window of jobs in flight on a scheduler, for as long as it can be reached.
+"""A window of jobs in flight on a scheduler.
 
 A worker that dies takes with it every job it had been given. Which of them killed it nobody knows, so all
 of them are suspects and are done last, one at a time on a worker: whoever loses its worker there is lost.
@@ -9,9 +9,9 @@ from __future__ import annotations
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count, islice
 from typing import Generic
 
@@ -27,27 +27,6 @@ from flexroad.pipeline.execute.workers import work
 
 TICK_S = 1.0
 """How long nothing must happen before one looks whether scheduler and workers are there."""
-
-
-class SchedulerGone(Exception):
-    """The connection to the scheduler broke; what flew is unknown."""
-
-
-@dataclass
-class Todo(Generic[J]):
-    """Jobs not done yet; outlives the connection."""
-
-    jobs: Iterator[J]
-    back: deque[J] = field(default_factory=deque)
-    """Taken, but not done."""
-    suspects: deque[J] = field(default_factory=deque)
-    """Were on a worker that died."""
-
-    def take(self) -> Iterable[J]:
-        """Return the next job, if there is one."""
-        if self.back:
-            return (self.back.popleft(),)
-        return islice(self.jobs, 1)
 
 
 @dataclass(frozen=True)
@@ -66,6 +45,8 @@ class Session(Generic[J, R]):
     ----------
     client : distributed.Client
         With a `Guard` on every worker and a `no_second_try` on the scheduler.
+    name : str
+        What the scheduler is called in messages.
     guard : str
         The guard's name; makes keys this run's own, too.
     patience_s : float
@@ -75,17 +56,21 @@ class Session(Generic[J, R]):
     def __init__(
         self,
         client: Client,
+        name: str,
         guard: str,
         function: Callable[[J], R],
-        todo: Todo[J],
+        jobs: Iterator[J],
         lost: Callable[[J, str], R],
         patience_s: float,
         say: Callable[[str], None],
     ) -> None:
         self.client = client
+        self.name = name
         self.guard = guard
         self.function = function
-        self.todo = todo
+        self.jobs = jobs
+        self.suspects: deque[J] = deque()
+        """Jobs that were on a worker that died."""
         self.lost = lost
         self.patience_s = patience_s
         self.say = say
@@ -104,40 +89,31 @@ class Session(Generic[J, R]):
 
         Raises
         ------
-        SchedulerGone
-            If the connection broke; `give_back` what flew and connect anew.
         ClusterLost
-            If there was no worker for longer than one waits.
+            If the connection to the scheduler broke, or there was no worker for longer than one waits.
         ConfigError
             If a worker is not fit for the work.
         """
         while True:
             self._look()
             self._send()
-            if not (self.flying or self.todo.suspects):
+            if not (self.flying or self.suspects):
                 return
             for future in self._landed():
                 yield from self._outcome(future, self.flying.pop(future))
                 future.release()
-
-    def give_back(self) -> None:
-        """Take down again as undone all that flew."""
-        for flight in self.flying.values():
-            self._put_back(flight)
-        self.flying.clear()
 
     def _send(self) -> None:
         apart = {flight.alone for flight in self.flying.values() if flight.alone}
         if not apart:
             # Twice the threads keeps every worker busy while constant memory holds the rest back.
             room = max(2, 2 * sum(self.crew.values())) - len(self.flying)
-            for _ in range(room):
-                for job in self.todo.take():
-                    self._fly(Flight(job))
+            for job in islice(self.jobs, max(0, room)):
+                self._fly(Flight(job))
         if len(self.flying) == len(apart):
             for address in [address for address in self.crew if address not in apart]:
-                if self.todo.suspects:
-                    self._fly(Flight(self.todo.suspects.popleft(), address))
+                if self.suspects:
+                    self._fly(Flight(self.suspects.popleft(), address))
 
     def _fly(self, flight: Flight[J]) -> None:
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
@@ -168,17 +144,17 @@ class Session(Generic[J, R]):
             return
         if self.client.status != "running":
             # Asked now, it would not answer for long.
-            raise SchedulerGone
+            raise self._gone()
         try:
             self.crew = self.client.nthreads()
         except OSError as error:
-            raise SchedulerGone from error
+            raise self._gone() from error
         self.looked = time.monotonic()
         self._wait_for_workers()
         for future, flight in list(self.flying.items()):
             if flight.alone and flight.alone not in self.crew and not future.done():
                 # Its worker went before it got there.
-                self._put_back(self.flying.pop(future))
+                self.suspects.append(self.flying.pop(future).job)
                 future.release()
 
     def _wait_for_workers(self) -> None:
@@ -196,14 +172,16 @@ class Session(Generic[J, R]):
             yield from self._died(flight, error)
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be set to give up what waits for workers; patience is this side's.
-            self._put_back(flight)
+            if flight.alone:
+                self.suspects.append(flight.job)
+            else:
+                self._fly(flight)
         elif future.status == "error":
             future.result()
         elif future.status == "finished":
             yield from self._fetched(future, flight)
         else:
-            self._put_back(flight)
-            raise SchedulerGone
+            raise self._gone()
 
     def _fetched(self, future: Future, flight: Flight[J]) -> Iterator[R]:
         try:
@@ -212,8 +190,7 @@ class Session(Generic[J, R]):
             # The worker died between doing the job and handing over the result.
             yield from self._died(flight, error)
         except (CancelledError, OSError) as error:
-            self._put_back(flight)
-            raise SchedulerGone from error
+            raise self._gone() from error
         else:
             if fault:
                 raise ConfigError(fault)
@@ -223,10 +200,10 @@ class Session(Generic[J, R]):
         if flight.alone:
             yield self.lost(flight.job, self._why(error))
         else:
-            self.todo.suspects.append(flight.job)
+            self.suspects.append(flight.job)
 
-    def _put_back(self, flight: Flight[J]) -> None:
-        (self.todo.suspects if flight.alone else self.todo.back).append(flight.job)
+    def _gone(self) -> ClusterLost:
+        return ClusterLost(f"{self.name} is gone")
 
     def _why(self, error: KilledWorker) -> str:
         worker = error.last_worker
