@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Place, absolute
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -120,9 +120,8 @@ def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Tex
         return None
     from flexroad.pipeline.monitor.prometheus import Textfile
 
-    name = str(run.resolve()) if isinstance(run, Path) else str(run)
     try:
-        return stack.enter_context(Textfile(path, name))
+        return stack.enter_context(Textfile(path, str(absolute(run))))
     except OSError as error:
         raise ConfigError(f"cannot write --prometheus {path}: {error.strerror or error}") from error
 
