@@ -1,9 +1,7 @@
 """ECSRC against Algorithm 1 written with Python's sets, on a 250 x 250 tile with 20% road."""
 
-import importlib.util
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -11,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.filter.ecsrc import Options, ecsrc
 from flexroad.tasks.types import RoadMask, TileData
+from tests.tasks.filter import ecsrc_oracle as oracle
 
 SIZE, SHARE = 250, 0.2
 
@@ -37,10 +36,6 @@ def best(function: Callable[[], object], repeats: int) -> float:
 
 
 def main() -> None:
-    path = Path(__file__).parent.parent / "tasks" / "ecsrc_oracle.py"
-    spec = importlib.util.spec_from_file_location("ecsrc_oracle", path)
-    oracle = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(oracle)
     options = Options()
     print(f"{'relief':>8} {'sets':>10} {'FlexRoad':>10} {'ratio':>7}  labels")
     for relief_m in (0.2, 1.0, 4.0):

@@ -425,13 +425,16 @@ def test_a_lock_is_given_back_on_a_full_disk(monkeypatch, tmp_path):
 
 def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
     """Numba refuses to be imported where it can keep nothing."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     for name in ("catalog", "tasks", "pipeline"):
         shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        root / "flexroad", tmp_path / "flexroad", symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+    )
     for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
         # Not to be written by root, either.
         (folder / "__pycache__").touch()
-    code = "import os, pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
+    code = "import os, flexroad.pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
     elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
     environment = {name: value for name, value in os.environ.items() if name not in elsewhere}
     environment |= {"HOME": "/dev/null"}

@@ -19,7 +19,7 @@ from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.pixels import segment
-from tests.pipeline.test_cli import flexroad
+from tests.pipeline.cli.test_main import flexroad
 
 QUICK = ("--set", "rounds=15", "--set", "cells=2000")
 

@@ -1,6 +1,3 @@
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,17 +8,8 @@ from scipy.ndimage import gaussian_filter
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.filter.ecsrc import Options, ecsrc
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+from tests.tasks.filter import ecsrc_oracle as oracle
 
-
-def _oracle():
-    path = Path(__file__).with_name("ecsrc_oracle.py")
-    spec = importlib.util.spec_from_file_location("ecsrc_oracle", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-oracle = _oracle()
 EVERYTHING = Options(min_area_m2=0, keep_largest=None)
 
 

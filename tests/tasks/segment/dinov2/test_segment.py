@@ -271,7 +271,7 @@ def test_where_the_photo_ends_there_is_no_road(heads, sample):
 
 
 def test_a_photo_off_the_heights_is_told_of(heads, sample, monkeypatch):
-    """Whether it is, is for tests/tasks/test_registration.py: tiles this small cannot tell."""
+    """Whether it is, is for tests/tasks/roads/test_coregistration.py: tiles this small cannot tell."""
     assert found(sample.data, heads[0]).notes == ()
     monkeypatch.setattr(coregistration, "note", lambda data, photo: f"{data.tile_id}: {photo.grid.cell:g} m")
     (note,) = found(sample.data, heads[0]).notes

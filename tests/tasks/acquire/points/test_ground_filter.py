@@ -1,6 +1,3 @@
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,17 +5,8 @@ from hypothesis import strategies as st
 
 from flexroad.tasks import TaskError
 from flexroad.tasks.acquire.points.ground_filter import Options, ground, ground_cells
+from tests.tasks.acquire.points import ground_oracle as oracle
 
-
-def _oracle():
-    path = Path(__file__).with_name("ground_oracle.py")
-    spec = importlib.util.spec_from_file_location("ground_oracle", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-oracle = _oracle()
 EXACT = Options(slope=0.3, noise_m=0, low_m=None)
 
 # Eighths of a metre are exact in binary: distances hit the radius, drops the limit, points each other.
