@@ -89,7 +89,7 @@ def test_the_causes_quote_the_figures_by_quarter():
 
     import pandas as pd
 
-    spec = importlib.util.spec_from_file_location("causes", ROOT / "tests" / "bench" / "bench_causes.py")
+    spec = importlib.util.spec_from_file_location("causes", ROOT / "experiments" / "causes.py")
     causes = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(causes)
     table = causes.by_spoilage(pd.read_parquet(RESULTS / FILE)).grid_55

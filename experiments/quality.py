@@ -1,6 +1,6 @@
 """Does a surface know how good it is? Its doubt beside the true road L2, and faults made on purpose.
 
-``PYTHONPATH=. python tests/bench/bench_quality.py 48 1`` for 48 tiles of seed 1, as in docs/quality.md;
+``PYTHONPATH=. python experiments/quality.py 48 1`` for 48 tiles of seed 1, as in docs/quality.md;
 12 without.
 """
 

@@ -31,7 +31,7 @@ from flexroad.tasks.types import RoadClusters, TileData
 
 TILES, SEED = 24, 1
 SOUND_M = 0.3
-RESULTS = Path(__file__).parents[2] / "docs" / "results" / "metrics.parquet"
+RESULTS = Path(__file__).parents[1] / "docs" / "results" / "metrics.parquet"
 
 
 def main() -> None:

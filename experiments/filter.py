@@ -1,6 +1,6 @@
 """The filters beside each other: what they keep of each kind of cell, and what the fit makes of it.
 
-``PYTHONPATH=. python tests/bench/bench_filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
+``PYTHONPATH=. python experiments/filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
 number; with a second word, the file of that page's figure is drawn instead. The default options of
 `tasks.filter.planar` were chosen on seeds 5 to 7; here is seed 1. With FLEXROAD_REAL_DATA two real towns
 follow, with their canopies laid over the surface model.

@@ -1,6 +1,6 @@
 """The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
 
-``PYTHONPATH=. python tests/bench/bench_production.py 240`` for docs/fit.md; 4 tiles of the benchmark without
+``PYTHONPATH=. python experiments/production.py 240`` for docs/fit.md; 4 tiles of the benchmark without
 a number. Stages and options are those of configs/paper.yaml and configs/nightly.yaml, tile by tile as a run
 does them; only the benchmark's tiles, which are islands, have no halo.
 
@@ -26,7 +26,7 @@ import laspy
 import numpy as np
 import pandas as pd
 import rasterio
-from bench_filter import NOISE_M, PAVED, Case, with_scars
+from filter import NOISE_M, PAVED, Case, with_scars
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
