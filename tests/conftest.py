@@ -2,16 +2,14 @@
 
 import os
 import shutil
-import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import yaml
 
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from tests import command_line
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},
@@ -24,31 +22,10 @@ QUICK = {
 """The paper's three variants with a light fit: tests of the machinery want no accuracy."""
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def errors(self) -> list[str]:
-        """The lines that tell of faults."""
-        return [line for line in self.err.splitlines() if line.startswith(("error: ", "failed "))]
-
-
-@pytest.fixture
-def flexroad(monkeypatch, capsys):
+@pytest.fixture(scope="session")
+def flexroad():
     """The command line, in this process; no traceback ever."""
-
-    def call(*words) -> Said:
-        monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = Said(int(end.value.code or 0), *capsys.readouterr())
-        assert "Traceback" not in said.err
-        return said
-
-    return call
+    return command_line.call
 
 
 @pytest.fixture(scope="session")

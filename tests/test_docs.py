@@ -2,11 +2,11 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.command_line import call
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -17,16 +17,16 @@ def console_lines(page: Path) -> list[str]:
     return [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
 
 
-def test_the_command_lines_of_the_docs_run(tmp_path):
+def test_the_command_lines_of_the_docs_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")
     lines = console_lines(ROOT / "docs" / "cli.md")
     assert len(lines) > 12
     for line in lines:
         command, *words = shlex.split(line)
         assert command == "flexroad"
-        call = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *words]
-        done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        said = call(*words)
+        assert said.code == 0, f"{line}\n{said.out}{said.err}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -1,21 +1,18 @@
 """Catalogs of known datasets, made by the command line and run as they stand."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from flexroad.catalog import Catalog
+from tests.command_line import call
 from tests.make_rasters import write
 
 
 def flexroad(*words, expect: int = 0) -> tuple[str, str]:
-    call = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *map(str, words)]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
-    assert done.returncode == expect, done.stdout + done.stderr
-    return done.stdout, done.stderr
+    said = call(*words).expected(expect)
+    return said.out, said.err
 
 
 def ground(north: float, west: float) -> np.ndarray:

@@ -1,9 +1,6 @@
-"""The command line as a user has it: a process, its output, its exit code."""
+"""The command line as a user has it: its output, its exit code."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +10,17 @@ import typer
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.cli.main import app
+from tests.command_line import call, process
 
 
 def flexroad(*words, expect: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "COLUMNS": "200"},
-    )
-    assert done.returncode == expect, done.stdout + done.stderr
-    return done.stdout if expect == 0 else done.stdout + done.stderr
+    said = call(*words).expected(expect)
+    return said.out if expect == 0 else said.out + said.err
 
 
 @pytest.fixture(scope="module")
 def finished(made_survey, tmp_path_factory) -> Path:
-    """A run of the whole survey, made by the command line."""
+    """A run of the whole survey, made as a user does it: by a process with workers of its own."""
     folder = tmp_path_factory.mktemp("cli")
     config = folder / "quick.yaml"
     config.write_text(
@@ -40,10 +31,9 @@ def finished(made_survey, tmp_path_factory) -> Path:
         "  flexroad: {}\n"
     )
     out = folder / "run"
-    said = flexroad(
-        "run", "--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, "--workers", 2
-    )
-    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said
+    words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, "--workers", 2]
+    said = process("run", *words).expected(0)
+    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
     return out
 
 
@@ -251,6 +241,13 @@ def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_surv
     said = flexroad(*[places.get(word, word) for word in words], expect=2)
     assert message in said
     assert "Traceback" not in said
+
+
+def test_a_process_that_cannot_start_ends_in_one_line_and_exit_code_2():
+    said = process("config", "show", "papr").expected(2)
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert "did you mean paper?" in line
 
 
 def test_config_commands():

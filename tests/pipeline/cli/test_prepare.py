@@ -1,9 +1,7 @@
-"""``flexroad prepare`` as a user has it: a process, its output, its exit code, its folder."""
+"""``flexroad prepare`` as a user has it: its output, its exit code, its folder."""
 
-import os
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -11,22 +9,15 @@ import pytest
 from shapely import box
 
 from flexroad.catalog import Catalog
+from tests.command_line import PROCESS, call
 from tests.make_clouds import write_cloud
 
-CALL = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
 WEST, SOUTH = 356_000.0, 5_699_000.0
 
 
 def flexroad(*words, expect=0) -> str:
-    done = subprocess.run(
-        [*CALL, *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "COLUMNS": "200"},
-    )
-    assert done.returncode == expect, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    said = call(*words).expected(expect)
+    return said.out + said.err
 
 
 @pytest.fixture(scope="module")
@@ -112,10 +103,10 @@ def test_a_typo_is_answered_with_the_right_word(cloud, tmp_path):
 def test_interrupted_it_leaves_nothing(cloud, tmp_path, how):
     out = tmp_path / "out"
     with subprocess.Popen(
-        [*CALL, "prepare", "points", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
+        [*PROCESS, "prepare", "points", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
-        while not (out.exists() and any(out.iterdir())):
+        while not any(out.glob("*/*")):
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.05)
         process.send_signal(how)

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,17 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from flexroad.catalog import Catalog
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run.lock import held
+from tests.command_line import same_signals
 
 QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
-
-
-@pytest.fixture(autouse=True)
-def same_signals():
-    """A command takes some signals over; here it is no process of its own."""
-    before = {which: signal.getsignal(which) for which in (signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for which, handler in before.items():
-        signal.signal(which, handler)
 
 
 @pytest.fixture
@@ -35,7 +26,8 @@ def flexroad(monkeypatch, capfd):
         monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
         code = 0
         try:
-            main()
+            with same_signals():
+                main()
         except SystemExit as ended:
             code = ended.code or 0
         out, err = capfd.readouterr()

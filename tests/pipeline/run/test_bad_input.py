@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +22,8 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import execute
 from flexroad.pipeline.store.tables import read_metrics
-from tests.conftest import QUICK, Said
+from tests.command_line import PROCESS, Said, error_lines
+from tests.conftest import QUICK
 from tests.make_rasters import write
 
 
@@ -659,19 +659,17 @@ def test_a_damaged_run_is_said_and_mended(
 def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
     words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
     words += ["--store", tmp_path / "store"]
-    call = [
-        sys.executable,
-        "-c",
-        "from flexroad.pipeline.cli.main import main; main()",
-        "run",
-        *map(str, words),
-        "--out",
-    ]
+    call = [*PROCESS, "run", *map(str, words), "--out"]
     both = [
-        subprocess.Popen([*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        subprocess.Popen(
+            [*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        )
         for name in "ab"
     ]
-    assert [(process.communicate()[1], process.returncode) for process in both] == [(b"", 0)] * 2
+    said = [process.communicate()[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    # A slow one tells of its progress there, too.
+    assert [error_lines(text) for text in said] == [[], []]
     tables = [read_metrics(tmp_path / name).drop(columns="seconds") for name in "ab"]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
     assert not list(tmp_path.rglob("*.tmp"))
