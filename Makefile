@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test lint bench clean
+.PHONY: help setup reproduce run rerun test test-all lint bench clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -15,9 +15,10 @@ TILES ?= 24
 SEED ?= 1
 CONFIG ?= paper
 OUT ?= runs/run
+JOBS ?= 2
 
 help: ## Show this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
 
 setup: $(STAMP) ## Install everything into .venv
 
@@ -71,8 +72,14 @@ rerun: $(STAMP) ## Bring tiles of a run up to date: make rerun RUN=... [TILE=...
 	@test -n "$(RUN)" || { echo "error: name a run: make rerun RUN=runs/run [TILE=295500_5629250]" >&2; exit 2; }
 	$(BIN)/flexroad rerun $(RUN) $(foreach tile,$(TILE),--tile $(tile))
 
-test: $(STAMP) ## Run the tests
-	$(BIN)/python -m pytest
+# Each process has one thread, so that two of them use two cores.
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+
+test: $(STAMP) ## Run the tests but for the slow ones: minutes
+	$(PYTEST) -m "not slow"
+
+test-all: $(STAMP) ## Run all tests
+	$(PYTEST)
 
 lint: $(STAMP) ## Check style and types
 	$(BIN)/ruff check .

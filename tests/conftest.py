@@ -22,6 +22,14 @@ QUICK = {
 """The paper's three variants with a light fit: tests of the machinery want no accuracy."""
 
 
+def pytest_collection_modifyitems(items):
+    """Send to one process what shares fixtures: the tests of a file, and all that use the cluster."""
+    for item in items:
+        params = item.callspec.params if hasattr(item, "callspec") else {}
+        clustered = "cluster" in item.fixturenames or params.get("executor") == "dask"
+        item.add_marker(pytest.mark.xdist_group("cluster" if clustered else item.path.stem))
+
+
 @pytest.fixture(scope="session")
 def flexroad():
     """The command line, in this process; no traceback ever."""

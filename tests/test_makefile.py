@@ -1,4 +1,4 @@
-"""`make reproduce` does what README says of it, in made and in real data."""
+"""`make reproduce` does what README says of it; `make test` leaves out what is slow."""
 
 import shutil
 import subprocess
@@ -9,8 +9,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-def commands(tmp_path, *words: str) -> list[list[str]]:
-    """Return the flexroad commands that make would run in a fresh checkout that is set up."""
+def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "reproduce") -> list[list[str]]:
+    """Return the words of a program's calls that make would run in a fresh checkout that is set up."""
+    tmp_path.mkdir(exist_ok=True)
     shutil.copy(ROOT / "Makefile", tmp_path)
     (tmp_path / ".venv").mkdir()
     for name in ("pyproject.toml", "constraints.txt", ".venv/.installed"):
@@ -18,10 +19,10 @@ def commands(tmp_path, *words: str) -> list[list[str]]:
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "gerod.yaml").touch()
     done = subprocess.run(
-        ["make", "-n", "reproduce", *words], cwd=tmp_path, capture_output=True, text=True, check=True
+        ["make", "-n", target, *words], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     lines = [line.split() for line in done.stdout.splitlines()]
-    return [line[1:] for line in lines if line[0].endswith("flexroad")]
+    return [line[1:] for line in lines if line[0].endswith(program)]
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -61,3 +62,14 @@ def test_made_scenes_stand_in_for_dsc3d_by_both_references(tmp_path, words):
         assert run[run.index("--config") + 1] == "dsc3d"
         assert run[run.index("--catalog") + 1] == str(folder / name)
         assert tables[tables.index(option) + 1] == run[run.index("--out") + 1]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_tests_run_in_two_processes_and_only_make_test_leaves_slow_ones_out(tmp_path):
+    for target, chosen in (("test", ["-m", '"not', 'slow"']), ("test-all", [])):
+        (words,) = commands(tmp_path / target, program="python", target=target)
+        assert words == ["-m", "pytest", "-n", "2", "--dist", "loadgroup", *chosen]
+
+
+def test_ci_checks_style_and_runs_all_tests():
+    assert (ROOT / ".ci" / "run").read_text().splitlines()[-2:] == ["make lint", "make test-all"]
