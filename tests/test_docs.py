@@ -17,6 +17,7 @@ def console_lines(page: Path) -> list[str]:
     return [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
 
 
+@pytest.mark.slow
 def test_the_command_lines_of_the_docs_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")

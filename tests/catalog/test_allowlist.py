@@ -65,6 +65,7 @@ def test_folders_of_links_stay_usable(tmp_path):
     refuse_outside(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
 
 
+@pytest.mark.slow
 def test_a_catalog_in_a_bucket_has_its_folder_there(bucket):
     refuse_outside(catalog("dsm/a.tif", root=bucket), bucket)
     for file in ("../a.tif", "../../other/a.tif", "/data/a.tif", f"{bucket}-more/a.tif"):

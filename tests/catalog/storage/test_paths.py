@@ -51,6 +51,7 @@ def test_what_is_missing_is_named(folder):
     assert paths.listing(folder) == {}
 
 
+@pytest.mark.slow
 def test_a_place_says_what_it_was_called(tmp_path, bucket):
     assert place(str(tmp_path)) == tmp_path
     assert type(place(str(tmp_path))) is type(tmp_path)
@@ -78,6 +79,7 @@ def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):
     assert paths.normal("s3://one/a/../../../two/c") == "s3://two/c"
 
 
+@pytest.mark.slow
 def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
     for i in range(20):
         paths.write(bucket / "data" / f"{i}.tif", b"x")
@@ -87,6 +89,7 @@ def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
     assert len(storage.requests()) == 1
 
 
+@pytest.mark.slow
 def test_a_write_is_one_request(bucket, storage):
     storage.requests()
     paths.write(bucket / "a", b"x" * 1_000_000)
@@ -95,6 +98,7 @@ def test_a_write_is_one_request(bucket, storage):
     assert [method for method, _ in storage.requests()] == ["GET"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["slow", "error", "cut"])
 def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
     storage.fail(Fault(answer, first=2))
@@ -104,6 +108,7 @@ def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
     assert list(paths.listing(bucket)) == ["a/b"]
 
 
+@pytest.mark.slow
 def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
     data = bytes(range(256)) * 1000
     paths.write(bucket / "a", data)
@@ -111,6 +116,7 @@ def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
     assert paths.read(bucket / "a") == data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["slow", "denied"])
 def test_storage_that_never_answers_is_named(bucket, storage, answer):
     storage.fail(Fault(answer))

@@ -10,6 +10,7 @@ import typer
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.cli.main import app
+from flexroad.pipeline.store.tables import read_metrics
 from tests.command_line import call, process
 
 
@@ -19,10 +20,9 @@ def flexroad(*words, expect: int = 0) -> str:
 
 
 @pytest.fixture(scope="module")
-def finished(made_survey, tmp_path_factory) -> Path:
-    """A run of the whole survey, made as a user does it: by a process with workers of its own."""
-    folder = tmp_path_factory.mktemp("cli")
-    config = folder / "quick.yaml"
+def words(made_survey, tmp_path_factory) -> list:
+    """The words of a run of the whole survey, but for where to and by whom."""
+    config = tmp_path_factory.mktemp("cli") / "quick.yaml"
     config.write_text(
         "fit: {control_points: [12, 12], iterations: 30}\n"
         "variants:\n"
@@ -30,11 +30,24 @@ def finished(made_survey, tmp_path_factory) -> Path:
         "  rgt: {fit: raster, sample: uniform}\n"
         "  flexroad: {}\n"
     )
-    out = folder / "run"
-    words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out, "--workers", 2]
-    said = process("run", *words).expected(0)
-    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
+    return ["run", "--config", config, "--catalog", made_survey / "catalog.parquet"]
+
+
+@pytest.fixture(scope="module")
+def finished(words, tmp_path_factory) -> Path:
+    """A run of the whole survey, made by the command line."""
+    out = tmp_path_factory.mktemp("cli") / "run"
+    said = flexroad(*words, "--out", out, "--executor", "serial")
+    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said
     return out
+
+
+@pytest.mark.slow
+def test_a_process_with_workers_of_its_own_makes_the_same_run(words, finished, tmp_path):
+    said = process(*words, "--out", tmp_path / "run", "--workers", 2).expected(0)
+    assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
+    tables = [read_metrics(run).drop(columns="seconds") for run in (finished, tmp_path / "run")]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
 def parsed(*words) -> dict:
@@ -55,6 +68,7 @@ def test_an_option_takes_several_values():
     assert (rerun["tile"], rerun["path"]) == (["a"], Path("RUN"))
 
 
+@pytest.mark.slow
 def test_figures(finished, tmp_path):
     tile = Catalog.read(finished / "catalog.parquet").tiles[1].id
     said = flexroad("figures", "--tile", tile, finished, "-o", tmp_path)
@@ -123,7 +137,7 @@ def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
     assert answer.height == pytest.approx([dsm[7, 5], dsm[50, 40]], abs=1e-5)
 
 
-@pytest.mark.parametrize("form", ["md", "csv", "html"])
+@pytest.mark.parametrize("form", ["md", "csv", pytest.param("html", marks=pytest.mark.slow)])
 def test_report(finished, form):
     said = flexroad("report", finished, "--format", form)
     text = (finished / f"report.{form}").read_text()
@@ -230,7 +244,8 @@ def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
         (["config", "show", "nope"], "no configuration 'nope'"),
     ],
 )
-def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_survey, tmp_path):
+def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_survey, tmp_path, monkeypatch):
+    monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
     (tmp_path / "file").write_text("")
     places = {
         "CAT": made_survey / "catalog.parquet",

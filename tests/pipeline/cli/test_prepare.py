@@ -99,6 +99,7 @@ def test_a_typo_is_answered_with_the_right_word(cloud, tmp_path):
     assert "--cell" in flexroad("prepare", "points", cloud, "-o", tmp_path, "--cel", 2, expect=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_it_leaves_nothing(cloud, tmp_path, how):
     out = tmp_path / "out"

@@ -17,6 +17,8 @@ from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import kubernetes_options, opened, slurm_options
 from tests.dask_processes import Processes, until, wait_for
 
+pytestmark = pytest.mark.slow
+
 # Workers have no tests to import.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 

@@ -16,6 +16,8 @@ from flexroad.tasks.acquire.photos import mvs_cpu, sfm
 from flexroad.tasks.acquire.points import to_rasters
 from tests import make_photos
 
+pytestmark = pytest.mark.slow
+
 ASKED = PhotosAsked(
     sfm=sfm.Options(image_size=640, features=1500, threads=2, calibrate="held"),
     stereo=mvs_cpu.Options(size=480, partners=3),

@@ -23,6 +23,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import execute
 from flexroad.pipeline.store.tables import read_metrics
 
+pytestmark = pytest.mark.slow
+
 PLATES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
 BASE = {"fit": {"method": "nurbs", "control_points": [10, 10], "iterations": 30}}
 ABLATION = {

@@ -656,6 +656,7 @@ def test_a_damaged_run_is_said_and_mended(
     assert flexroad("report", out).code == 0
 
 
+@pytest.mark.slow
 def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
     words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
     words += ["--store", tmp_path / "store"]

@@ -36,6 +36,8 @@ from flexroad.pipeline.run.runner import execute
 from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import wait_for
 
+pytestmark = pytest.mark.slow
+
 LIGHT = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
     "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},

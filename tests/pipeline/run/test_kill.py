@@ -18,6 +18,8 @@ from flexroad.pipeline.run.runner import execute
 from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import until
 
+pytestmark = pytest.mark.slow
+
 CONFIG = """
 fit: {control_points: [20, 20], iterations: 3000}
 variants: {plane: {fit: plane, sample: corners}, flexroad: {}}

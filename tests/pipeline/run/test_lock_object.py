@@ -10,6 +10,8 @@ from flexroad.catalog.storage.paths import place, read, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import Holder, Pace, held, holder
 
+pytestmark = pytest.mark.slow
+
 ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 QUICK = Pace(beat_s=0.05, stale_s=0.5)
 
