@@ -21,7 +21,7 @@ ROADS = Path(__file__).parent / "roads"
 FOOT = 0.3048
 ZERO = (552_208.0, 4_114_742.0)
 """The DeepScenario crop's zero: easting and northing."""
-pytestmark = pytest.mark.real
+pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

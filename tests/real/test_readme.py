@@ -9,7 +9,7 @@ import pytest
 from tests.real.shown import flexroad, measured, table_after
 
 README = Path(__file__).parents[2] / "README.md"
-pytestmark = pytest.mark.real
+pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", ["barbican", "gothenburg"])
