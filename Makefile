@@ -72,8 +72,8 @@ rerun: $(STAMP) ## Bring tiles of a run up to date: make rerun RUN=... [TILE=...
 	@test -n "$(RUN)" || { echo "error: name a run: make rerun RUN=runs/run [TILE=295500_5629250]" >&2; exit 2; }
 	$(BIN)/flexroad rerun $(RUN) $(foreach tile,$(TILE),--tile $(tile))
 
-# Each process has one thread, so that two of them use two cores.
-PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+# Each process has one thread, so that two of them use two cores. A file's tests share fixtures, so they stay together.
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP) ## Run the tests but for the slow ones: minutes
 	$(PYTEST) -m "not slow"

@@ -22,12 +22,11 @@ QUICK = {
 """The paper's three variants with a light fit: tests of the machinery want no accuracy."""
 
 
-def pytest_collection_modifyitems(items):
-    """Send to one process what shares fixtures: the tests of a file, and all that use the cluster."""
-    for item in items:
-        params = item.callspec.params if hasattr(item, "callspec") else {}
-        clustered = "cluster" in item.fixturenames or params.get("executor") == "dask"
-        item.add_marker(pytest.mark.xdist_group("cluster" if clustered else item.path.stem))
+def pytest_collection_modifyitems(config, items):
+    """Begin with the files of slow tests, so that the last of several processes does not end alone."""
+    if hasattr(config, "workerinput"):
+        slow = {item.path for item in items if item.get_closest_marker("slow")}
+        items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session")

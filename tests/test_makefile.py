@@ -70,7 +70,7 @@ def test_made_scenes_stand_in_for_dsc3d_by_both_references(tmp_path, words):
 def test_tests_run_in_two_processes_and_only_make_test_leaves_slow_ones_out(tmp_path):
     for target, chosen in (("test", ["-m", '"not', 'slow"']), ("test-all", [])):
         (words,) = commands(tmp_path / target, program="python", target=target)
-        assert words == ["-m", "pytest", "-n", "2", "--dist", "loadgroup", *chosen]
+        assert words == ["-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *chosen]
 
 
 def test_ci_checks_style_and_runs_all_tests():

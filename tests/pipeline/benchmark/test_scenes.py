@@ -77,6 +77,7 @@ def read(tile, name):
         return file.read(1)
 
 
+@pytest.mark.slow
 def test_a_scene_is_what_prepare_mesh_makes_of_its_mesh(scene):
     circular, true = scene
     assert circular.id == true.id == survey_of_scenes(1, 4)[0].site.name
@@ -89,6 +90,7 @@ def test_a_scene_is_what_prepare_mesh_makes_of_its_mesh(scene):
         assert circular.paths(circular.layer(name)) == true.paths(true.layer(name))
 
 
+@pytest.mark.slow
 def test_both_references_are_what_they_are_called(scene):
     circular, true = scene
     place = survey_of_scenes(1, 4)[0]
@@ -107,6 +109,7 @@ def test_both_references_are_what_they_are_called(scene):
     assert np.isfinite(dsm).mean() > 0.97
 
 
+@pytest.mark.slow
 def test_a_scene_s_mesh_can_be_prepared_by_hand(scene, tmp_path):
     from flexroad.pipeline.execute import SerialExecutor
     from flexroad.pipeline.prepare.asked import Asked

@@ -168,6 +168,7 @@ def opengl():
         pytest.skip("no OpenGL library on this machine")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_meshes_are_drawn_the_right_way_round():
     whole = sheet()
@@ -187,6 +188,7 @@ def test_meshes_are_drawn_the_right_way_round():
     assert (dark.sum(0) * columns).sum() / dark.sum() < (drawn.sum(0) * columns).sum() / drawn.sum() - 50
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_a_part_of_a_mesh_is_drawn_in_given_colours():
     whole = sheet()

@@ -66,6 +66,7 @@ def test_one_line_of_the_config_chooses_dinov2(place):
     assert anew.computed["segment"] == 1
 
 
+@pytest.mark.slow
 def test_the_head_names_its_backbone(place):
     """It need not be given again; what the file says can be read without this program."""
     from safetensors import safe_open

@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -23,6 +25,7 @@ from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.artefacts import Store
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
+from tests.conftest import QUICK
 
 FIXED = (
     "tile_id variant method stratum status l2_road_m l2_terrain_m rmse_road_m rmse_terrain_m nmad_road_m "
@@ -35,6 +38,22 @@ EACH = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 
 @pytest.fixture
 def run(survey, quick_config, tmp_path):
     return Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
+
+
+@pytest.fixture(scope="module")
+def made(made_survey, tmp_path_factory) -> Path:
+    """The folder of a finished run, to be copied."""
+    folder = tmp_path_factory.mktemp("made") / "run"
+    run = Run.create(folder, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
+    execute(run, SerialExecutor())
+    return folder
+
+
+@pytest.fixture
+def finished(made, run):
+    """A finished run of one's own, of a survey of one's own."""
+    shutil.copytree(made, run.path, dirs_exist_ok=True)
+    return Run.create(run.path, run.config, run.catalog)
 
 
 def computed(results) -> Counter:
@@ -93,53 +112,48 @@ def test_executors_agree(survey, quick_config, tmp_path, cluster):
     pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
-def test_the_same_again_computes_nothing(run, executor):
-    execute(run, executor)
-    before = read_metrics(run.path)
-    results = results_of(Run.open(run.path), executor)
+def test_the_same_again_computes_nothing(finished, executor):
+    before = read_metrics(finished.path)
+    results = results_of(Run.open(finished.path), executor)
     assert {result.status for result in results} == {"cached"}
     assert computed(results) == Counter()
-    pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
-    how = summary(run)
+    pd.testing.assert_frame_equal(before, read_metrics(finished.path), check_exact=True)
+    how = summary(finished)
     assert (how.tiles, how.done, how.cached, how.failed, how.pending) == (4, 4, 4, 0, 0)
 
 
-def test_a_changed_option_computes_what_hangs_on_it(run, executor):
-    execute(run, executor)
-    again = results_of(changed(run, evaluate={"nearest": True}), executor)
+def test_a_changed_option_computes_what_hangs_on_it(finished, executor):
+    again = results_of(changed(finished, evaluate={"nearest": True}), executor)
     # What load reads is not kept, nor are meshes that are not exported: they are made again on the way.
     assert computed(again) == times(4, {"load": 1, "sample": 2, "fit": 1, "evaluate": 3, "export": 1})
-    assert read_metrics(run.path).nearest_road_m.notna().all()
-    back = results_of(changed(run), executor)
+    assert read_metrics(finished.path).nearest_road_m.notna().all()
+    back = results_of(changed(finished), executor)
     assert computed(back) == times(4, {"export": 1})
 
 
-def test_a_changed_filter_leaves_the_segmentation_alone(run, executor):
-    execute(run, executor)
-    again = results_of(changed(run, ecsrc={"theta_z_m": 0.1}), executor)
+def test_a_changed_filter_leaves_the_segmentation_alone(finished, executor):
+    again = results_of(changed(finished, ecsrc={"theta_z_m": 0.1}), executor)
     assert computed(again) == times(4, EACH) - times(4, {"segment": 1})
 
 
-def test_a_changed_source_costs_its_own_tile(run, executor):
-    execute(run, executor)
-    tile = run.catalog.tiles[1]
+def test_a_changed_source_costs_its_own_tile(finished, executor):
+    tile = finished.catalog.tiles[1]
     path = tile.paths(tile.layer("dsm"))[0]
     with rasterio.open(path, "r+") as raster:
         heights = raster.read(1)
         raster.write(heights + 0.5, 1)
-    results = results_of(Run.open(run.path), executor)
+    results = results_of(Run.open(finished.path), executor)
     assert {r.tile_id: r.status for r in results if r.status != "cached"} == {tile.id: "done"}
     assert computed(results) == times(1)
 
 
-def test_a_shared_store_serves_another_run(run, executor, tmp_path):
-    execute(run, executor)
-    other = Run.create(tmp_path / "other", run.config, run.catalog, run.store)
+def test_a_shared_store_serves_another_run(finished, executor, tmp_path):
+    other = Run.create(tmp_path / "other", finished.config, finished.catalog, finished.store)
     assert computed(results_of(other, executor)) == times(4, {"export": 1})
     assert not (tmp_path / "other" / "store").exists()
-    left, right = (read_metrics(r.path) for r in (run, other))
+    left, right = (read_metrics(r.path) for r in (finished, other))
     pd.testing.assert_frame_equal(left, right, check_exact=True)
-    assert Run.open(other.path).store == run.store.resolve()
+    assert Run.open(other.path).store == finished.store.resolve()
 
 
 def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
@@ -179,37 +193,34 @@ def test_rerun_means_the_tiles_named_or_failed(run, executor):
     assert len(read_metrics(run.path)) == 12
 
 
-def test_from_a_stage_on_computes_it_and_what_follows(run, executor):
-    execute(run, executor)
-    one = run.catalog.tiles[3].id
+def test_from_a_stage_on_computes_it_and_what_follows(finished, executor):
+    one = finished.catalog.tiles[3].id
     anew = frozenset({"fit", "sample", "evaluate"})
-    results = results_of(run, executor, select(run, (one,), failed=False), anew)
+    results = results_of(finished, executor, select(finished, (one,), failed=False), anew)
     assert computed(results) == times(1, {"load": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1})
 
 
-def test_a_damaged_artefact_is_made_again(run, executor):
-    execute(run, executor)
-    before = read_metrics(run.path)
-    tile = run.catalog.tiles[0].id
-    for path in (run.path / "store" / "evaluate").rglob("*.npz"):
+def test_a_damaged_artefact_is_made_again(finished, executor):
+    before = read_metrics(finished.path)
+    tile = finished.catalog.tiles[0].id
+    for path in (finished.path / "store" / "evaluate").rglob("*.npz"):
         path.write_bytes(path.read_bytes()[:-40])
-    for folder in (run.path / "tiles").iterdir():
+    for folder in (finished.path / "tiles").iterdir():
         (folder / "item.json").unlink()
-    results = results_of(run, executor)
+    results = results_of(finished, executor)
     assert computed(results)["evaluate"] == 12
     assert computed(results)["ecsrc"] == 0
-    after = read_metrics(run.path)
+    after = read_metrics(finished.path)
     pd.testing.assert_frame_equal(before.drop(columns="seconds"), after.drop(columns="seconds"))
-    assert run.folder(tile).path.exists()
+    assert finished.folder(tile).path.exists()
 
 
-def test_a_lost_product_is_written_again(run, executor):
-    execute(run, executor)
-    folder = run.folder(run.catalog.tiles[0].id).path
+def test_a_lost_product_is_written_again(finished, executor):
+    folder = finished.folder(finished.catalog.tiles[0].id).path
     (mesh,) = folder.glob("*.glb")
     whole = mesh.read_bytes()
     mesh.unlink()
-    assert computed(results_of(run, executor)) == times(1, {"export": 1})
+    assert computed(results_of(finished, executor)) == times(1, {"export": 1})
     assert mesh.read_bytes() == whole
 
 
@@ -284,8 +295,7 @@ def nothing_to_do(run) -> Summary:
     return how
 
 
-def test_a_resume_makes_each_graph_once_and_reads_no_marker(run, monkeypatch):
-    execute(run, SerialExecutor())
+def test_a_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatch):
     made = Counter()
     graph = Pattern.graph
 
@@ -297,16 +307,15 @@ def test_a_resume_makes_each_graph_once_and_reads_no_marker(run, monkeypatch):
     monkeypatch.setattr(
         "flexroad.pipeline.run.status._from_marker", lambda *_: pytest.fail("a marker was read")
     )
-    nothing_to_do(Run.open(run.path))
-    assert made == {tile.id: 1 for tile in run.catalog.tiles}
+    nothing_to_do(Run.open(finished.path))
+    assert made == {tile.id: 1 for tile in finished.catalog.tiles}
 
 
 @pytest.mark.parametrize("how", ["lost", "damaged", "of before"])
-def test_the_markers_are_the_truth(how, run):
-    execute(run, SerialExecutor())
-    ledger = run.path / "ledger.sqlite"
+def test_the_markers_are_the_truth(how, finished):
+    ledger = finished.path / "ledger.sqlite"
     before = ledger.read_bytes()
-    run = changed(run, evaluate={"nearest": True})
+    run = changed(finished, evaluate={"nearest": True})
     execute(run, SerialExecutor())
     if how == "lost":
         ledger.unlink()
@@ -353,41 +362,38 @@ def test_an_interruption_leaves_tables_and_a_summary(run):
     assert (how.done, how.cached, how.interrupted, how.exit_code) == (4, 2, False, 0)
 
 
-def test_an_interrupted_run_keeps_no_rows_of_another_configuration(run):
+def test_an_interrupted_run_keeps_no_rows_of_another_configuration(finished):
     def interrupt():
         raise KeyboardInterrupt
 
-    execute(run, SerialExecutor())
-    other = changed(run, evaluate={"nearest": True})
+    other = changed(finished, evaluate={"nearest": True})
     with pytest.raises(KeyboardInterrupt):
         execute(other, Meddling(1, interrupt))
-    rows = read_metrics(run.path)
-    assert list(rows.tile_id.unique()) == [run.catalog.tiles[0].id]
+    rows = read_metrics(finished.path)
+    assert list(rows.tile_id.unique()) == [finished.catalog.tiles[0].id]
     assert rows.nearest_road_m.notna().all()
 
 
-def test_products_are_compared_byte_for_byte_on_demand(run):
-    execute(run, SerialExecutor())
-    folder = run.folder(run.catalog.tiles[0].id).path
+def test_products_are_compared_byte_for_byte_on_demand(finished):
+    folder = finished.folder(finished.catalog.tiles[0].id).path
     (mesh,) = folder.glob("*.glb")
     whole = mesh.read_bytes()
     mesh.write_bytes(bytes(len(whole)))
-    nothing_to_do(run)
+    nothing_to_do(finished)
     results = []
-    execute(run, SerialExecutor(), watch=results.append, verify=True)
+    execute(finished, SerialExecutor(), watch=results.append, verify=True)
     assert computed(results) == times(1, {"export": 1})
     assert mesh.read_bytes() == whole
 
 
-def test_gone_sources_count_as_they_were_until_the_tile_is_asked_for(run):
-    execute(run, SerialExecutor())
-    tile = run.catalog.tiles[1]
+def test_gone_sources_count_as_they_were_until_the_tile_is_asked_for(finished):
+    tile = finished.catalog.tiles[1]
     tile.paths(tile.layer("dsm"))[0].unlink()
-    assert (summary(run).done, summary(run).pending) == (4, 0)
-    other = run.catalog.tiles[0].id
-    how = execute(run, SerialExecutor(), select(run, (other,), failed=False))
+    assert (summary(finished).done, summary(finished).pending) == (4, 0)
+    other = finished.catalog.tiles[0].id
+    how = execute(finished, SerialExecutor(), select(finished, (other,), failed=False))
     assert (how.done, how.cached, how.failed) == (4, 1, 0)
-    how = execute(run, SerialExecutor())
+    how = execute(finished, SerialExecutor())
     assert (how.done, how.cached, how.failed) == (3, 3, 1)
     assert how.failures[0].tile_id == tile.id
 
@@ -438,10 +444,9 @@ def test_products_open_as_they_are(run, executor):
         assert raster.crs.to_epsg() == 25832
 
 
-def test_a_large_run_is_judged_by_a_part_of_its_steps(run):
-    execute(run, SerialExecutor())
-    whole, note = edge_steps(run)
-    part, told = edge_steps(run, most=2)
+def test_a_large_run_is_judged_by_a_part_of_its_steps(finished):
+    whole, note = edge_steps(finished)
+    part, told = edge_steps(finished, most=2)
     pairs = ["tile", "neighbour"]
     assert (len(whole), note) == (4, "")
     assert 0 < len(part) < len(whole)

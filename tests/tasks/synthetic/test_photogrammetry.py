@@ -49,12 +49,14 @@ def test_scenes_rise_as_their_site_says(seed):
     assert survey(2, seed) == places[:2]
 
 
+@pytest.mark.slow
 def test_the_mesh_fills_its_square_with_so_many_triangles(scene, place):
     assert scene.mesh.bounds == pytest.approx(place.grid.bounds, abs=1e-6)
     assert place.grid.bounds[2] - place.grid.bounds[0] == SIZE_M
     assert 0.99 * place.site.triangles < len(scene.mesh.faces) <= place.site.triangles
 
 
+@pytest.mark.slow
 def test_away_from_faults_the_mesh_is_the_surface_but_for_bumps(scene, place, height):
     faults, surface, made = place.site.faults, scene.surface.dsm, scene.reconstruction
     far = round(4 * faults.melt_m / scene.surface.grid.cell)
@@ -72,6 +74,7 @@ def test_away_from_faults_the_mesh_is_the_surface_but_for_bumps(scene, place, he
     assert np.corrcoef(bumps[:, 1:][both], bumps[:, :-1][both])[0, 1] > 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Kind.BUILDING, Kind.PARKED_CAR, Kind.CROWN])
 def test_things_stand_on_the_ground_like_drops_of_wax(scene, height, kind):
     truth, cell = scene.surface, scene.surface.grid.cell
@@ -87,6 +90,7 @@ def test_things_stand_on_the_ground_like_drops_of_wax(scene, height, kind):
     assert np.median(after[walls]) < 0.8 * np.median(before[walls])
 
 
+@pytest.mark.slow
 def test_what_moved_leaves_a_ghost(scene):
     truth, made = scene.surface, scene.reconstruction.height
     moved = truth.kind == Kind.MOVING_CAR
@@ -94,6 +98,7 @@ def test_what_moved_leaves_a_ghost(scene):
     assert np.mean((made - truth.reference)[moved]) < 0.5 * np.mean((truth.dsm - truth.reference)[moved])
 
 
+@pytest.mark.slow
 def test_holes_are_left_open_or_bridged(scene, height):
     made = scene.reconstruction
     assert 0.001 < made.open.mean() < 0.1
@@ -115,6 +120,7 @@ def test_holes_are_left_open_or_bridged(scene, height):
         assert low - 0.01 <= z.min() <= z.max() <= high + 0.01
 
 
+@pytest.mark.slow
 def test_fragments_float_above_the_surface(scene, place):
     pieces = place.site.faults.fragments
     count = 8 * pieces
@@ -123,6 +129,7 @@ def test_fragments_float_above_the_surface(scene, place):
     assert (floating[:, 0, 2] > scene.reconstruction.height[cells] + 1.9).all()
 
 
+@pytest.mark.slow
 def test_the_texture_lies_the_right_way_round(scene, place):
     photo = seen_from_above(scene.mesh, Grid.covering(place.grid.crs, place.grid.bounds, GSD_M))
     made = orthophoto(place.grid, SEED, place.site.stratum, place.options, GSD_M).astype(float)
@@ -134,6 +141,7 @@ def test_the_texture_lies_the_right_way_round(scene, place):
     assert max(alike[1:]) < 0.7
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_scenes(scene, place):
     again = photogrammetry(place, SEED)
     for name in ("vertices", "faces", "uv"):

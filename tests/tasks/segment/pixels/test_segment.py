@@ -88,6 +88,7 @@ def test_roads_of_a_tile_never_seen(samples, model, trained):
     assert trained.history[-1].validation_loss < trained.history[0].validation_loss
 
 
+@pytest.mark.slow
 def test_heights_alone(samples, tmp_path, model):
     bare = [without_photo(sample) for sample in samples]
     path = written(training.train(bare[:4], bare[4:5], QUICK), tmp_path)
@@ -101,6 +102,7 @@ def test_heights_alone(samples, tmp_path, model):
     assert 0.2 < iou(found.mask, samples[5].road) < iou(with_colours.mask, samples[5].road)
 
 
+@pytest.mark.slow
 def test_training_comes_out_the_same_again_whatever_the_validation_tiles(samples, trained):
     again = training.train(samples[:4], samples[4:5], QUICK)
     assert (content(again), again.history) == (content(trained), trained.history)
