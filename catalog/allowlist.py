@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.index import Catalog
-from flexroad.catalog.storage.paths import Place, absolute, joined, normal, place
+from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 from flexroad.catalog.tile import LAYERS
 
 MOST = 4
@@ -23,8 +23,8 @@ ADDRESS = re.compile(r"(?!s3:)[a-zA-Z][a-zA-Z0-9+.-]*:/")
 TOPS = ("/", "s3:/", "s3:")
 
 
-def refuse_outside(
-    catalog: Catalog, folder: Place | str, allowed: Sequence[str] = (), layers: Collection[str] = LAYERS
+def check_allowed(
+    catalog: Catalog, folder: Location | str, allowed: Sequence[str] = (), layers: Collection[str] = LAYERS
 ) -> None:
     """Refuse a catalog that names files elsewhere.
 
@@ -50,7 +50,7 @@ def refuse_outside(
         raise CatalogError(f"{where}, outside the catalog's folder {folder}; if that is meant, add {option}")
 
 
-def needed(catalog: Catalog, folder: Place | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
+def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
     """Return what has to be allowed for a catalog in such a folder if such layers are read: few folders."""
     names = (name for *_, name in _outside(catalog, folder, (), layers) if not ADDRESS.match(name))
     found = _outermost(map(posixpath.dirname, names))
@@ -63,17 +63,21 @@ def needed(catalog: Catalog, folder: Place | str, layers: Collection[str] = LAYE
 
 
 def _outside(
-    catalog: Catalog, folder: Place | str, allowed: Sequence[str], layers: Collection[str]
+    catalog: Catalog, folder: Location | str, allowed: Sequence[str], layers: Collection[str]
 ) -> Iterator[tuple[str, str, str]]:
     """Yield tile, layer and file of all in the layers that lie elsewhere."""
     # The folder by the name it was given, and as it is without links.
-    grounds = {normal(str(folder)), normal(str(absolute(place(folder)))), *map(normal, allowed)}
+    grounds = {
+        normalise(str(folder)),
+        normalise(str(absolute(parse_location(folder)))),
+        *map(normalise, allowed),
+    }
     starts = tuple(ground.rstrip("/") + "/" for ground in grounds)
     for tile in catalog.tiles:
         for layer in (layer for layer in tile.layers if layer.name in layers):
             for file in layer.files:
                 named = next((text for text in (file, tile.root) if ADDRESS.match(text)), None)
-                name = named or normal(joined(tile.root, file))
+                name = named or normalise(join(tile.root, file))
                 if named or not name.startswith(starts):
                     yield tile.id, layer.name, name
 

@@ -24,7 +24,7 @@ from pyproj.exceptions import CRSError
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Place, absolute, joined, normal, place
+from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 
 Item = dict[str, Any]
@@ -47,7 +47,7 @@ class Catalog:
             raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} stand more than once")
 
     @classmethod
-    def read(cls, path: Place | str) -> Catalog:
+    def read(cls, path: Location | str) -> Catalog:
         """Read a catalog that `write` wrote, on disk or in a bucket.
 
         Raises
@@ -74,7 +74,7 @@ class Catalog:
                 f"{path} is not a FlexRoad catalog: {error!r}; make one with `flexroad catalog`"
             ) from error
 
-    def write(self, path: Place | str, movable: bool = True) -> None:
+    def write(self, path: Location | str, movable: bool = True) -> None:
         """Write the catalog.
 
         Parameters
@@ -126,20 +126,20 @@ def _overlap(a: Bounds, b: Bounds) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _at(path: Place | str) -> Place:
+def _at(path: Location | str) -> Location:
     try:
-        return place(path)
+        return parse_location(path)
     except OSError as error:
         raise CatalogError(f"catalog {path}: {error.strerror or error}") from error
 
 
-def _rooted(tile: Tile, root: Place) -> Tile:
+def _rooted(tile: Tile, root: Location) -> Tile:
     """Return the tile with its files relative to ``root`` where they lie below it, else absolute."""
     above = str(root).rstrip("/") + "/"
     layers = tuple(
         # A folder of links should stay a folder of links.
         replace(
-            layer, files=tuple(normal(joined(tile.root, file)).removeprefix(above) for file in layer.files)
+            layer, files=tuple(normalise(join(tile.root, file)).removeprefix(above) for file in layer.files)
         )
         for layer in tile.layers
     )
@@ -197,7 +197,7 @@ def item(tile: Tile, root: str = "") -> Item:
 
 def _asset(layer: Layer, root: str) -> Item:
     return {
-        "href": joined(root, layer.files[0]) if root else layer.files[0],
+        "href": join(root, layer.files[0]) if root else layer.files[0],
         "roles": ["data"],
         "flexroad:files": list(layer.files),
         "flexroad:values": list(layer.values),

@@ -18,7 +18,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
-from flexroad.catalog.tiling import MASKS, Indexed, assumed, taken
+from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
 
 NEEDED = ("dsm", "dtm")
 PLACEHOLDER = re.compile(r"\{(.*?)\}")
@@ -82,7 +82,7 @@ class _Found:
     stratum: str
 
 
-def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = None) -> Indexed:
+def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = None) -> TilingResult:
     """Return the tiles of a folder; the cells of a tile are those of its DSM file.
 
     Parameters
@@ -124,7 +124,7 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
         )
         for tile_id in sorted(by_layer["dsm"])
     )
-    return Indexed(tiles, (*notes, *_lacking(tiles, layout), *assumed(tiles)))
+    return TilingResult(tiles, (*notes, *_lacking(tiles, layout), *assumed(tiles)))
 
 
 def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _Found], list[str]]:

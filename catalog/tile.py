@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.storage.paths import Place, joined, place
+from flexroad.catalog.storage.paths import Location, join, parse_location
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true road and
@@ -58,6 +58,6 @@ class Tile:
         """Return the named layer, or None if the tile has none."""
         return next((layer for layer in self.layers if layer.name == name), None)
 
-    def paths(self, layer: Layer) -> tuple[Place, ...]:
+    def paths(self, layer: Layer) -> tuple[Location, ...]:
         """Return the layer's files as places that can be opened."""
-        return tuple(place(joined(self.root, file)) for file in layer.files)
+        return tuple(parse_location(join(self.root, file)) for file in layer.files)

@@ -28,7 +28,7 @@ MASKS = ("road_mask", "reference_road")
 
 
 @dataclass(frozen=True)
-class Indexed:
+class TilingResult:
     """The tiles of a folder."""
 
     tiles: tuple[Tile, ...]
@@ -64,7 +64,7 @@ def cut(
     crs: str | None = None,
     min_cover: float = 0.25,
     dataset: str = "",
-) -> Indexed:
+) -> TilingResult:
     """Cut the ground that the DSM files cover into tiles.
 
     Parameters
@@ -111,7 +111,7 @@ def cut(
         )
         when = taken(near["dsm"][tile_id].in_core, date)
         tiles.append(Tile(tile_id, grid, layers, str(root), *when, dataset=dataset))
-    return Indexed(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
+    return TilingResult(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
 
 
 def _place(files: Sequence[RasterFile], crs: str) -> list[_Placed]:

@@ -32,7 +32,7 @@ SAME_UNIT = 1e-9
 
 
 @dataclass(frozen=True)
-class Frame:
+class MetricTransform:
     """How coordinates of a source become eastings, northings and heights in metres."""
 
     source: str
@@ -53,7 +53,7 @@ class Frame:
         place: tuple[float, float],
         to_crs: str | None = None,
         unit: str | None = None,
-    ) -> Frame:
+    ) -> MetricTransform:
         """Return the way from a CRS to metres.
 
         Parameters

@@ -18,8 +18,8 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.graph import tile_graph
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs as fit
@@ -37,7 +37,9 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results" / "metrics.parquet"
 def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         catalog = Catalog.read(write_scenes(Path(scratch), TILES, SEED, preset="gerod"))
-        rows = [row for tile in catalog.tiles for row in experiment(tile, Store(Path(scratch) / "store"))]
+        rows = [
+            row for tile in catalog.tiles for row in experiment(tile, ArtefactStore(Path(scratch) / "store"))
+        ]
     table = pd.DataFrame(rows).groupby(["fit", "roads"], sort=False).mean(numeric_only=True)
     print(f"{TILES} tiles of the benchmark, seed {SEED}; classes by the segmented mask; means over tiles")
     print(table.round(3).to_string())
@@ -46,10 +48,10 @@ def main() -> None:
         print(by_spoilage(pd.read_parquet(RESULTS)).round(3).to_string())
 
 
-def experiment(tile, store: Store) -> list[dict[str, float | str]]:
+def experiment(tile, store: ArtefactStore) -> list[dict[str, float | str]]:
     config = load_config("ablation")
     graph = tile_graph(tile, config)
-    pull, made = Pull(graph, store), graph.variants["flexroad"]
+    pull, made = Evaluator(graph, store), graph.variants["flexroad"]
     data, road, clusters = (pull(made[stage]) for stage in ("load", "segment", "ecsrc"))
     options = config.chains["flexroad"]
     sound = road.mask & (np.abs(data.dsm - data.reference) <= SOUND_M)

@@ -16,7 +16,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.quality.assess import Options, assess
-from flexroad.tasks.roads.dtm_validity import unsound, without_unsound
+from flexroad.tasks.roads.dtm_validity import invalid_dtm, without_invalid_dtm
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.synthetic.gerod import survey
@@ -49,8 +49,8 @@ def chains(data: TileData, road: RoadMask) -> Iterator[tuple[str, RoadClusters, 
     yield "paper", paper, nurbs.fit(data, paper, FREE)
     yield "paper, unit weights", paper, nurbs.fit(data, paper, UNIT)
     yield "near the DTM", near, nurbs.fit(data, near, UNIT)
-    judged = replace(near, unsound=unsound(data, road, near.mask))
-    yield "near the DTM, unsound left out", judged, nurbs.fit(without_unsound(data, judged), judged, UNIT)
+    judged = replace(near, dtm_invalid=invalid_dtm(data, road, near.mask))
+    yield "near the DTM, unsound left out", judged, nurbs.fit(without_invalid_dtm(data, judged), judged, UNIT)
 
 
 def faults(
@@ -125,7 +125,7 @@ def _spoiled(surface: Surface, data: TileData, road: RoadMask) -> bool:
     assert data.reference is not None
     off = np.abs(surface.lattice(data.grid.eastings, data.grid.northings) - data.reference)
     patches, _ = label(road.mask & (off > SPOILED_M))
-    return bool(np.bincount(patches[patches > 0], minlength=1).max() > Options().doubted_m2)
+    return bool(np.bincount(patches[patches > 0], minlength=1).max() > Options().suspect_m2)
 
 
 def _parts(rows: list[dict[str, object]]) -> Iterator[tuple[object, pd.DataFrame]]:
@@ -134,7 +134,7 @@ def _parts(rows: list[dict[str, object]]) -> Iterator[tuple[object, pd.DataFrame
 
 def _agreement(key: object, part: pd.DataFrame) -> dict[str, object]:
     """Return rank correlations of the doubt with the truth, and how many of the ten worst it names."""
-    worst = set(part.l2.nlargest(10).index) & set(part.doubt_m.nlargest(10).index)
+    worst = set(part.l2.nlargest(10).index) & set(part.error_estimate_m.nlargest(10).index)
     figures = {
         name: part[name].corr(part.l2, method="spearman") for name in ("residual_p95_m", "off_dtm_road")
     }
@@ -142,9 +142,9 @@ def _agreement(key: object, part: pd.DataFrame) -> dict[str, object]:
         "dtm, chain": key,
         "L2": part.l2.mean(),
         "under crowns": part.hidden.mean(),
-        "doubt": part.doubt_m.mean(),
-        "rho L2": part.doubt_m.corr(part.l2, method="spearman"),
-        "rho spoiled": part.doubt_m.corr(part.spoiled, method="spearman"),
+        "error-estimate": part.error_estimate_m.mean(),
+        "rho L2": part.error_estimate_m.corr(part.l2, method="spearman"),
+        "rho spoiled": part.error_estimate_m.corr(part.spoiled, method="spearman"),
         "of ten worst": len(worst),
     } | figures
 

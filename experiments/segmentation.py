@@ -28,8 +28,8 @@ from flexroad.tasks.acquire.points import to_rasters
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.extent import outside
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup
 from flexroad.tasks.segment import vector
 from flexroad.tasks.segment.pixels import segment
 from flexroad.tasks.segment.pixels import train as training
@@ -45,7 +45,7 @@ BAND_M = 1.0
 """Cells this near to the edge of a label are not learnt: the drawing is no better. All are scored."""
 ABOVE_M, GREENNESS = np.arange(0.1, 1.05, 0.1), np.arange(-0.05, 0.125, 0.005)
 WIDTHS_M = np.arange(4.0, 20.0, 0.5)
-TIDY = Hygiene()
+TIDY = Cleanup()
 SHOWN = ("height and greenness", "pixels")
 SURE = "class = 'road' AND certainty <> 'low'"
 
@@ -111,12 +111,12 @@ def case(data: TileData) -> Case:
         asked = rasterise.Options(
             layer="road_polygons", where=f"({where}) AND visible_in <> 'rgb'", left_out=()
         )
-        return rasterise.burn(data, asked)
+        return rasterise.rasterise_roads(data, asked)
 
     road, unsure = areas(SURE), areas("certainty = 'low'")
     scored = np.zeros(data.grid.shape, bool)
     scored[data.grid.window(data.core)] = True
-    scored &= ~outside(data) & (road | ~unsure)
+    scored &= ~beyond_extent(data) & (road | ~unsure)
     known = scored & ~edge(road, BAND_M / data.grid.cell)
     return Case(data, road, areas("class = 'parking'"), scored, Sample(data, road, known))
 
@@ -137,7 +137,7 @@ def methods(scratch: Path) -> dict[str, Method]:
         "centre lines, their own widths": lambda _, score: lines(score),
         "pixels, heights alone": lambda *halves: learnt(*halves, scratch, photo=False),
         "pixels": lambda *halves: learnt(*halves, scratch),
-        "pixels, not tidied": lambda *halves: learnt(*halves, scratch, hygiene=NOTHING),
+        "pixels, not tidied": lambda *halves: learnt(*halves, scratch, cleanup=NOTHING),
     }
 
 
@@ -160,7 +160,7 @@ def plain(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
 def lines(cases: Sequence[Case], width: float | None = None) -> Maps:
     one = {} if width is None else {"width_columns": (), "class_columns": (), "default_width_m": width}
     options = vector.Options(layer="road_centerlines", where=SURE, **one)
-    return [rasterise.burn(case.data, options) for case in cases]
+    return [rasterise.rasterise_roads(case.data, options) for case in cases]
 
 
 def one_width(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
@@ -172,7 +172,7 @@ def learnt(
     score: Sequence[Case],
     scratch: Path,
     photo: bool | None = None,
-    hygiene: Hygiene = TIDY,
+    cleanup: Cleanup = TIDY,
 ) -> Maps:
     samples = [case.sample for case in learn]
     began = time.perf_counter()
@@ -182,7 +182,7 @@ def learnt(
     model = scratch / f"model{made.suffix}"
     model.write_bytes(made.model)
     about = read_model(model).about
-    found = [mask(case.data, segment.Options(model=model, hygiene=hygiene)) for case in score]
+    found = [mask(case.data, segment.Options(model=model, cleanup=cleanup)) for case in score]
     ended = time.perf_counter()
     print(
         f"  {len(made.history)} rounds, {len(made.model) / 1e6:.1f} MB, threshold {about.threshold:.2f}, "

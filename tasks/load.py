@@ -21,7 +21,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 if TYPE_CHECKING:
-    from flexroad.tasks.io.raster import Patch
+    from flexroad.tasks.io.raster import RasterWindow
 
 VERSION = 1
 
@@ -65,7 +65,7 @@ class _Mosaic:
 
     values: Floats
     """``(H, W)``, heights in m or class values; NaN where no file has a value."""
-    patches: tuple[Patch, ...]
+    patches: tuple[RasterWindow, ...]
     """What was read, in the order of the files."""
     notes: tuple[str, ...]
 
@@ -127,17 +127,17 @@ def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:
 def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     from rasterio.enums import Resampling
 
-    from flexroad.tasks.io.raster import Unreadable, misfit, onto, read
+    from flexroad.tasks.io.raster import Unreadable, misalignment, read_window, resample_to
 
     values = np.full(grid.shape, np.nan)
     reached = np.zeros(grid.shape, bool)
     broken: list[Unreadable] = []
     resampling = Resampling.bilinear if layer.name in HEIGHTS else Resampling.nearest
-    patches: list[Patch] = []
+    patches: list[RasterWindow] = []
     cut = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            patch = read(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
+            patch = read_window(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
         except Unreadable as error:
             broken.append(error)
             continue
@@ -148,7 +148,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
             patch, absurd = _metres(patch)
             cut += absurd
         patches.append(patch)
-        np.copyto(values, onto(patch, grid, resampling), where=np.isnan(values))
+        np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
         if not np.isnan(values).any():
             break
     # Files are named for the ground around a tile, too: a broken one costs the tiles it lies on.
@@ -163,7 +163,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         )
     notes = [
         f"{layer.name} resampled: {why}"
-        for why in dict.fromkeys(misfit(p.lattice, grid) for p in patches)
+        for why in dict.fromkeys(misalignment(p.lattice, grid) for p in patches)
         if why
     ]
     notes += [f"the tile is whole without it: {error}" for error in broken]
@@ -173,7 +173,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     return _Mosaic(values, tuple(patches), tuple(notes))
 
 
-def _reached(patch: Patch, grid: Grid) -> Bools:
+def _reached(patch: RasterWindow, grid: Grid) -> Bools:
     """Return the cells of the grid whose centres lie within the patch, with a value or not, ``(H, W)``."""
     west, south, east, north = patch.lattice.bounds
     inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
@@ -182,7 +182,7 @@ def _reached(patch: Patch, grid: Grid) -> Bools:
     return inside
 
 
-def _metres(patch: Patch) -> tuple[Patch, int]:
+def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
     """Return the patch with heights in metres, and how many were no heights at all."""
     values = patch.values * _unit(patch)[1]
     absurd = (values < LOWEST_M) | (values > HIGHEST_M)
@@ -190,7 +190,7 @@ def _metres(patch: Patch) -> tuple[Patch, int]:
     return replace(patch, values=values), int(np.count_nonzero(absurd))
 
 
-def _unit(patch: Patch) -> Unit:
+def _unit(patch: RasterWindow) -> Unit:
     """Return the unit of heights: as the band declares it, else the CRS, else metres."""
     if not patch.unit:
         return (height_unit(patch.crs) if patch.crs else None) or METRE
@@ -204,7 +204,7 @@ def _unit(patch: Patch) -> Unit:
     return patch.unit, metres
 
 
-def _check_units(patches: Sequence[Patch]) -> None:
+def _check_units(patches: Sequence[RasterWindow]) -> None:
     """Refuse heights in feet beside heights in metres: more likely a missing tag than a mixed survey."""
     first = patches[0]
     for patch in patches[1:]:

@@ -11,7 +11,7 @@ from rasterio.enums import Resampling
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.raster import Lattice, Patch, misfit, onto
+from flexroad.tasks.io.raster import RasterGrid, RasterWindow, misalignment, resample_to
 from flexroad.tasks.load import HIGHEST_M, LOWEST_M, UNITS, Options
 from flexroad.tasks.types import Floats, TileData
 
@@ -68,7 +68,7 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     )
 
 
-def _patch(name: str, array: xr.DataArray) -> Patch:
+def _patch(name: str, array: xr.DataArray) -> RasterWindow:
     """Return an array's values, rows from the north, and where they lie; refuse what has no such place."""
     array = _plane(name, array)
     crs = _crs(name, array)
@@ -76,7 +76,7 @@ def _patch(name: str, array: xr.DataArray) -> Patch:
     lattice, west_first = _lattice(name, array)
     values = _values(name, array)
     values = values if west_first else values[:, ::-1]
-    return Patch(name, "", values[::-1] if lattice.northward else values, lattice, "", crs)
+    return RasterWindow(name, "", values[::-1] if lattice.northward else values, lattice, "", crs)
 
 
 def _plane(name: str, array: xr.DataArray) -> xr.DataArray:
@@ -129,7 +129,7 @@ def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:
         )
 
 
-def _lattice(name: str, array: xr.DataArray) -> tuple[Lattice, bool]:
+def _lattice(name: str, array: xr.DataArray) -> tuple[RasterGrid, bool]:
     """Return where the cells lie, and whether the first column is in the west."""
     y, x = array.dims
     transform = array.rio.transform()
@@ -151,7 +151,7 @@ def _lattice(name: str, array: xr.DataArray) -> tuple[Lattice, bool]:
         )
     rows, columns = array.shape
     north = round(south + rows * abs(dy), 6)
-    return Lattice(west, north, abs(dx), abs(dy), columns, rows, northward=dy > 0), dx > 0
+    return RasterGrid(west, north, abs(dx), abs(dy), columns, rows, northward=dy > 0), dx > 0
 
 
 def _axis(name: str, centres: xr.DataArray) -> tuple[float, float]:
@@ -185,12 +185,12 @@ def _values(name: str, array: xr.DataArray) -> Floats:
     return values
 
 
-def _grid(dsm: Patch) -> Grid:
+def _grid(dsm: RasterWindow) -> Grid:
     at = dsm.lattice
     return Grid(in_plan(dsm.crs or ""), at.west, at.north, at.dx, at.width, at.height)
 
 
-def _absurd(patch: Patch) -> str:
+def _absurd(patch: RasterWindow) -> str:
     """Make heights that can be none NaN, as `load` does; return a note if there were any."""
     absurd = (patch.values < LOWEST_M) | (patch.values > HIGHEST_M)
     patch.values[absurd] = np.nan
@@ -199,23 +199,23 @@ def _absurd(patch: Patch) -> str:
     return f"{patch.name}: {absurd.sum()} cells outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
 
 
-def _misfit(patch: Patch, core: Grid) -> str:
+def _misfit(patch: RasterWindow, core: Grid) -> str:
     """Refuse another CRS than the DSM's; return a note if cells do not coincide with the DSM's."""
     if not same(patch.crs or "", core.crs):
         raise TaskError(
             f"{patch.name} is in {short(patch.crs or '')}, the dsm in {short(core.crs)}; "
             f"reproject it, e.g. {patch.name}.rio.reproject_match(dsm)"
         )
-    why = misfit(patch.lattice, core).replace("the tile's", "the dsm's")
+    why = misalignment(patch.lattice, core).replace("the tile's", "the dsm's")
     return f"{patch.name} resampled to the grid of the dsm: {why}" if why else ""
 
 
-def _onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
-    slices = patch.lattice.under(grid)
+def _onto(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
+    slices = patch.lattice.window_for(grid)
     if slices is None:
         bounds = " ".join(f"{edge:.10g}" for edge in patch.lattice.bounds)
         raise TaskError(f"{patch.name} ({bounds}) does not overlap the dsm; give arrays of the same place")
-    cut = Patch(
+    cut = RasterWindow(
         patch.name,
         "",
         patch.values[slices],
@@ -223,7 +223,7 @@ def _onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
         "",
         patch.crs,
     )
-    return onto(cut, grid, resampling)
+    return resample_to(cut, grid, resampling)
 
 
 def _check_valid(name: str, values: Floats, min_valid: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Location
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -21,7 +21,7 @@ class Source:
 
     name: str
     """One of `catalog.LAYERS`."""
-    paths: tuple[Place, ...]
+    paths: tuple[Location, ...]
     """Files that reach the tile; of those that overlap, the first with a value wins."""
     crs: str | None = None
     """CRS of files that carry none."""
@@ -80,7 +80,7 @@ class RoadClusters:
     grid: Grid
     labels: NDArray[np.int32]
     """``(H, W)``; 0 is no road, clusters count from 1 in the order of their first cell."""
-    unsound: Bools | None = None
+    dtm_invalid: Bools | None = None
     """Cells, none of them kept, whose DTM does not count: under what hides a road it may be another ground's,
     and beside a road it is rounded off, ``(H, W)``; None: nobody asked."""
 
@@ -186,9 +186,9 @@ class Quality:
     """Share of the road, where there is a DTM, that is farther from it than two heights of one ground."""
     bounded_weights: float
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
-    doubt_m: float
+    error_estimate_m: float
     """Mean distance of the surface to the nearer witness, scan or DTM: what its error may be."""
-    doubted_m2: float
+    suspect_m2: float
     """Largest patch of road farther from its witness than two heights of one ground may be (m2), or 0."""
     flags: tuple[str, ...]
     """What stands out, by `tasks.quality.assess.FLAGS`."""
@@ -197,7 +197,7 @@ class Quality:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class Orthophoto:
     """An orthophoto of a piece of ground."""
 
     grid: Grid

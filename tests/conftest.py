@@ -122,8 +122,8 @@ def storage(storage_server, monkeypatch):
 @pytest.fixture
 def bucket(storage, request):
     """A folder in a bucket of one's own."""
-    from flexroad.catalog.storage.paths import place
+    from flexroad.catalog.storage.paths import parse_location
 
-    made = place(f"s3://{abs(hash(request.node.nodeid)):x}/area")
+    made = parse_location(f"s3://{abs(hash(request.node.nodeid)):x}/area")
     made.fs.mkdir(made.parent.path)
     return made

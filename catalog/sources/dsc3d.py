@@ -15,12 +15,12 @@ from typing import Any
 
 from flexroad.catalog.headers.rasters import some
 from flexroad.catalog.path_templates import Layout, read
-from flexroad.catalog.tiling import Indexed
+from flexroad.catalog.tiling import TilingResult
 
 DATASET = "DSC3D"
 
 
-def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None) -> Indexed:
+def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None) -> TilingResult:
     """Return the scenes of a folder, one tile each.
 
     Parameters

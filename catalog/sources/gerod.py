@@ -17,7 +17,7 @@ from typing import Any
 from flexroad.catalog.headers.rasters import some
 from flexroad.catalog.path_templates import Layout, read
 from flexroad.catalog.tile import Tile
-from flexroad.catalog.tiling import Indexed
+from flexroad.catalog.tiling import TilingResult
 
 DATASET = "GeRoD"
 TILES = 240
@@ -25,7 +25,7 @@ CORNER = re.compile(r"(\d+)_(\d+)")
 """Ids are the south-west corner in whole metres: the paper's ``295500_5629250``."""
 
 
-def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None) -> Indexed:
+def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None) -> TilingResult:
     """Return the tiles of the dataset's folder.
 
     Parameters

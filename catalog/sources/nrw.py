@@ -21,7 +21,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import Tile
-from flexroad.catalog.tiling import Indexed, cut
+from flexroad.catalog.tiling import TilingResult, cut
 
 CRS = "EPSG:25832"
 """The state's own, which its XYZ files do not carry."""
@@ -69,7 +69,7 @@ def index(
     min_cover: float = 0.25,
     derived: Path | None = None,
     roads: str | None = None,
-) -> Indexed:
+) -> TilingResult:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one counts.
 
     Parameters

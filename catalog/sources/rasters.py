@@ -11,7 +11,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import LAYERS
-from flexroad.catalog.tiling import Indexed, cut
+from flexroad.catalog.tiling import TilingResult, cut
 
 
 def index(
@@ -23,7 +23,7 @@ def index(
     date: datetime | None = None,
     crs: str | None = None,
     min_cover: float = 0.25,
-) -> Indexed:
+) -> TilingResult:
     """Cut the ground that the DSM files cover into tiles.
 
     Parameters

@@ -23,7 +23,7 @@ from uuid import uuid4
 
 from upath import UPath
 
-Place = Path | UPath
+Location = Path | UPath
 
 TRIES = 5
 """How often a request is sent before it counts as failed, unless AWS_MAX_ATTEMPTS says otherwise."""
@@ -41,7 +41,7 @@ _YES = ("YES", "TRUE", "ON", "1")
 
 
 @dataclass(frozen=True)
-class Seen:
+class FileStat:
     """How a file looked."""
 
     size: int
@@ -49,7 +49,7 @@ class Seen:
     """What changes with its bytes: the time (ns) on disk, the ETag in a bucket."""
 
 
-def place(where: str | Place) -> Place:
+def parse_location(where: str | Location) -> Location:
     """Return where a file is, by what an operator or a record calls it: a path, or s3://BUCKET/NAME.
 
     Raises
@@ -70,27 +70,27 @@ def place(where: str | Place) -> Place:
         raise OSError(
             errno.ENOTSUP,
             "object storage needs s3fs; install it with pip install 'flexroad[s3]'",
-            normal(text),
+            normalise(text),
         ) from error
     return remote
 
 
-def is_remote(where: Place) -> bool:
+def is_remote(where: Location) -> bool:
     """Tell whether a file is in object storage."""
     return not isinstance(where, Path)
 
 
-def absolute(where: Place) -> Place:
+def absolute(where: Location) -> Location:
     """Return a place that means the same to every process."""
     return where.resolve() if isinstance(where, Path) else where
 
 
-def joined(folder: str, name: str) -> str:
+def join(folder: str, name: str) -> str:
     """Return what a file is called whose name is relative to a folder, a whole path or an address."""
     return name if _BUCKET.match(name) else os.path.join(folder, name)  # noqa: PTH118 (places are slow)
 
 
-def normal(name: str) -> str:
+def normalise(name: str) -> str:
     """Return an absolute path or address without ``..``, by the name alone: links are not followed."""
     bucket = _BUCKET.match(name)
     if bucket is None:
@@ -98,7 +98,7 @@ def normal(name: str) -> str:
     return "s3:/" + os.path.normpath("/" + name[bucket.end() :])
 
 
-def gdal_name(where: Place) -> str:
+def gdal_name(where: Location) -> str:
     """Return what GDAL calls a file."""
     return str(where) if isinstance(where, Path) else f"/vsis3/{where.path}"
 
@@ -126,7 +126,7 @@ def gdal_options() -> dict[str, str]:
     return {name: value for name, value in options.items() if name not in os.environ}
 
 
-def stat(where: Place) -> Seen | None:
+def stat(where: Location) -> FileStat | None:
     """Return how a file looks, or None if it is not there.
 
     Raises
@@ -139,7 +139,7 @@ def stat(where: Place) -> Seen | None:
             found = where.stat()
         except OSError:
             return None
-        return Seen(found.st_size, found.st_mtime_ns)
+        return FileStat(found.st_size, found.st_mtime_ns)
     try:
         with named(where):
             return _seen(where.fs.info(where.path))
@@ -147,7 +147,7 @@ def stat(where: Place) -> Seen | None:
         return None
 
 
-def listing(folder: Place) -> dict[str, Seen]:
+def listing(folder: Location) -> dict[str, FileStat]:
     """Return every file below a folder by its name relative to it: one sweep, or one paged list of a bucket.
 
     A folder that is not there has none.
@@ -159,17 +159,17 @@ def listing(folder: Place) -> dict[str, Seen]:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class StatCache:
     """How files looked, each looked at once: the files of a bucket by one list of the folder they lie in.
 
     Make one for each sweep over a catalog, and call it for each source: ``look = Sightings(); look(path)``
     gives the same as ``stat(path)``. What changes while it lives is not noticed.
     """
 
-    _files: dict[Place, Seen | None] = field(default_factory=dict)
-    _folders: dict[str, dict[str, Seen]] = field(default_factory=dict)
+    _files: dict[Location, FileStat | None] = field(default_factory=dict)
+    _folders: dict[str, dict[str, FileStat]] = field(default_factory=dict)
 
-    def __call__(self, where: Place) -> Seen | None:
+    def __call__(self, where: Location) -> FileStat | None:
         """Return how a file looks, or None if it is not there.
 
         Raises
@@ -188,7 +188,7 @@ class Sightings:
         return self._files[where]
 
 
-def _listed(folder: UPath) -> dict[str, Seen]:
+def _listed(folder: UPath) -> dict[str, FileStat]:
     """Return the files in a folder of a bucket, but not those in folders within."""
     try:
         with named(folder):
@@ -198,7 +198,7 @@ def _listed(folder: UPath) -> dict[str, Seen]:
     return _files(folder, there)
 
 
-def namesakes(where: UPath) -> set[str]:
+def sidecars(where: UPath) -> set[str]:
     """Return the names of a file in a bucket and of those that differ in what follows its stem: one list.
 
     Asked before GDAL opens a file, it saves a dozen requests for files beside it that are seldom there.
@@ -213,7 +213,7 @@ def namesakes(where: UPath) -> set[str]:
         return set(_files(folder, folder.fs.find(folder.path, prefix=f"{where.stem}.", detail=True)))
 
 
-def exists(where: Place) -> bool:
+def exists(where: Location) -> bool:
     """Tell whether there is such a file, or in a bucket anything below such a name."""
     if isinstance(where, Path):
         return where.exists()
@@ -221,7 +221,7 @@ def exists(where: Place) -> bool:
         return bool(where.fs.exists(where.path))
 
 
-def read(where: Place) -> bytes:
+def read(where: Location) -> bytes:
     """Return a file's bytes, by one request.
 
     Raises
@@ -244,14 +244,14 @@ def fetch(where: UPath, folder: Path) -> Path:
     OSError
         If it is not there, or the storage does not answer.
     """
-    for name in {where.name, *namesakes(where)}:
+    for name in {where.name, *sidecars(where)}:
         source = where.parent / name
         with named(source):
             source.fs.get_file(source.path, str(folder / name))
     return folder / where.name
 
 
-def write(where: Place, data: bytes) -> None:
+def write(where: Location, data: bytes) -> None:
     """Write a file whole or not at all: renamed when it is whole, or by one request.
 
     Raises
@@ -264,13 +264,13 @@ def write(where: Place, data: bytes) -> None:
         with named(where):
             where.fs.pipe_file(where.path, data)
         return
-    with aside(where) as temporary:
+    with atomic_path(where) as temporary:
         where.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
-def aside(where: Path) -> Iterator[Path]:
+def atomic_path(where: Path) -> Iterator[Path]:
     """Give another file to write beside one, whose place it takes when it is whole.
 
     Raises
@@ -291,7 +291,7 @@ def aside(where: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def remove(where: Place) -> None:
+def remove(where: Location) -> None:
     """Remove a file; one that is not there is no error."""
     if isinstance(where, Path):
         where.unlink(missing_ok=True)
@@ -300,7 +300,7 @@ def remove(where: Place) -> None:
         where.fs.rm_file(where.path)
 
 
-def _swept(folder: Path, above: str) -> Iterator[tuple[str, Seen]]:
+def _swept(folder: Path, above: str) -> Iterator[tuple[str, FileStat]]:
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         for entry in entries:
             name = above + entry.name
@@ -309,20 +309,20 @@ def _swept(folder: Path, above: str) -> Iterator[tuple[str, Seen]]:
             else:
                 with contextlib.suppress(FileNotFoundError):
                     found = entry.stat()
-                    yield name, Seen(found.st_size, found.st_mtime_ns)
+                    yield name, FileStat(found.st_size, found.st_mtime_ns)
 
 
-def _files(folder: UPath, found: dict[str, Any]) -> dict[str, Seen]:
+def _files(folder: UPath, found: dict[str, Any]) -> dict[str, FileStat]:
     """Return the files among what a list of a bucket holds, by their names relative to the folder."""
     start = len(folder.path.rstrip("/")) + 1
     named = {name[start:]: _seen(entry) for name, entry in found.items()}
     return {name: seen for name, seen in named.items() if name and seen}
 
 
-def _seen(entry: dict[str, Any]) -> Seen | None:
+def _seen(entry: dict[str, Any]) -> FileStat | None:
     if entry["type"] != "file":
         return None
-    return Seen(int(entry["size"]), str(entry["ETag"]).strip('"'))
+    return FileStat(int(entry["size"]), str(entry["ETag"]).strip('"'))
 
 
 def _endpoint() -> str:

@@ -11,20 +11,20 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flexroad.catalog.storage.paths import Place, aside, read, write
+from flexroad.catalog.storage.paths import Location, atomic_path, read, write
 
 PUT_S = 60.0
 """How often a mirror is put back."""
 
 
-class Mirror:
+class StagedFile:
     """A local file that stands for one in a bucket, and is put back now and then.
 
     Parameters
     ----------
     where : Place
         The file.
-    mine : bool
+    writable : bool
         Whether to put it back, or only to read it.
 
     Attributes
@@ -33,9 +33,9 @@ class Mirror:
         What to read and write.
     """
 
-    def __init__(self, where: Place, mine: bool = True) -> None:
+    def __init__(self, where: Location, writable: bool = True) -> None:
         self.where = where
-        self.mine = mine
+        self.writable = writable
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         if isinstance(where, Path):
             self.path = where
@@ -57,7 +57,7 @@ class Mirror:
             with contextlib.suppress(FileNotFoundError):
                 self.path.write_bytes(read(self.where))
 
-    def tick(self) -> None:
+    def sync_if_due(self) -> None:
         """Put the file back if that is due.
 
         Raises
@@ -76,11 +76,11 @@ class Mirror:
         OSError
             If the storage does not answer.
         """
-        if self.mine and self._folder and self.path.exists():
+        if self.writable and self._folder and self.path.exists():
             start = time.monotonic()
             write(self.where, self.path.read_bytes())
             self._put = time.monotonic()
-            # The ledger of a state is large: no more than a twentieth of the time is spent on it.
+            # The database of a state is large: no more than a twentieth of the time is spent on it.
             self._pause = max(PUT_S, 20 * (self._put - start))
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class Mirror:
 
 
 @contextlib.contextmanager
-def whole(where: Place) -> Iterator[Path]:
+def atomic_file(where: Location) -> Iterator[Path]:
     """Give a local file to write; it takes its place when all of it is there.
 
     Raises
@@ -104,5 +104,5 @@ def whole(where: Place) -> Iterator[Path]:
             yield local
             write(where, local.read_bytes())
         return
-    with aside(where) as temporary:
+    with atomic_path(where) as temporary:
         yield temporary

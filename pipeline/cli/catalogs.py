@@ -12,7 +12,7 @@ from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.run import next_run
 
 if TYPE_CHECKING:
-    from flexroad.catalog.tiling import Indexed
+    from flexroad.catalog.tiling import TilingResult
 
 catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
 
@@ -128,7 +128,7 @@ def catalog_dsc3d(
     _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
 
 
-def _write_catalog(found: Indexed, output: Path) -> None:
+def _write_catalog(found: TilingResult, output: Path) -> None:
     from flexroad.catalog import Catalog
 
     for note in found.notes:

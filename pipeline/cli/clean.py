@@ -20,28 +20,28 @@ def clean(
     ] = None,
 ) -> None:
     """Drop what no run needs: artefacts, tiles and products that are gone, leftovers of killed writers."""
-    from flexroad.catalog.storage.paths import absolute, place
-    from flexroad.pipeline.run.garbage import MEANING, alone, drop, waste
-    from flexroad.pipeline.run.lock import held
+    from flexroad.catalog.storage.paths import absolute, parse_location
+    from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
+    from flexroad.pipeline.run.lock import run_lock
     from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.store_users import forget as strike
-    from flexroad.pipeline.run.store_users import users
+    from flexroad.pipeline.run.store_users import runs_using
+    from flexroad.pipeline.run.store_users import unregister as strike
 
     def say(line: str) -> None:
         typer.echo(f"note: {line}", err=True)
 
-    where, gone = place(path), [absolute(place(text)) for text in forget or ()]
-    with held(where, say):
+    where, gone = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
+    with run_lock(where, say):
         run = Run.open(where)
-        known = {str(known) for known in users(run.store)}
+        known = {str(known) for known in runs_using(run.store)}
         for user in gone:
             if str(user) not in known:
                 there = ", ".join(sorted(known)) or "none"
                 raise ConfigError(f"--forget {user}: no run of the store {run.store}; there are {there}")
         files, sizes = Counter[str](), Counter[str]()
-        with alone(run, gone, say) as runs:
-            found = waste(runs)
-            for file in found if dry_run else drop(found):
+        with exclusive(run, gone, say) as runs:
+            found = find_garbage(runs)
+            for file in found if dry_run else delete(found):
                 files[file.kind] += 1
                 sizes[file.kind] += file.size
                 if dry_run:

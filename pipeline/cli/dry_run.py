@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.store.products import TileFolder
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.store.products import TileProducts
 
 
-def plan(graphs: Iterable[TileGraph], store: Place, run: Place) -> Iterator[str]:
+def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterator[str]:
     """Yield one line per tile and stage node, then the totals.
 
     A node is ``stored`` if the store has it, ``to do`` if not; nodes that are never stored (what `load`
     reads) are done again whenever a node after them is.
     """
-    artefacts, totals, tiles = Store(store), Counter[tuple[str, str]](), 0
+    artefacts, totals, tiles = ArtefactStore(store), Counter[tuple[str, str]](), 0
     for graph in graphs:
         tiles += 1
-        done = TileFolder.of(run, graph.tile.id).done(graph) is not None
+        done = TileProducts.of(run, graph.tile.id).done(graph) is not None
         yield f"{graph.tile.id}: {'done' if done else 'to do'}"
         users = _users(graph)
         for node in graph.nodes.values():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.storage.paths import Place, absolute
+from flexroad.catalog.storage.paths import Location, absolute
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ ON_FAILURE = "FLEXROAD_ON_FAILURE"
 
 
 @dataclass
-class Ending:
+class Outcome:
     """How it ends; whoever does the work fills it in."""
 
     exit_code: int = 0
@@ -39,7 +39,7 @@ class Ending:
     """Told of every tile, if it is wanted."""
 
 
-def line(how: Summary) -> str:
+def format_summary(how: Summary) -> str:
     """Return how a run stands in one line."""
     now = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
     since = f"{how.new} new, {how.changed} changed, {how.vanished} vanished"
@@ -52,7 +52,7 @@ def warn(line: str, kind: str = "warning") -> None:
 
 
 @contextlib.contextmanager
-def overseen(run: Place, on_failure: str | None, prometheus: Path | None) -> Iterator[Ending]:
+def supervised(run: Location, on_failure: str | None, prometheus: Path | None) -> Iterator[Outcome]:
     """See to it that whatever ends the work inside is told to those who asked to be.
 
     An interruption ends here; everything else goes on.
@@ -65,7 +65,7 @@ def overseen(run: Place, on_failure: str | None, prometheus: Path | None) -> Ite
     from flexroad.pipeline.run.summary import read_summary
 
     before = read_summary(run)
-    ending = Ending()
+    ending = Outcome()
     with _end_as_ctrl_c(), contextlib.ExitStack() as stack:
         # Leaves in the opposite order: the alarm rings when the file is written.
         stack.callback(_alarm, ending, run, before, on_failure)
@@ -86,7 +86,7 @@ def overseen(run: Place, on_failure: str | None, prometheus: Path | None) -> Ite
 def unread(run: Path | None, target: str) -> None:
     """Tell the alarm that the command line of a run could not be read."""
     text = "the command line could not be read; `flexroad run --help` shows it"
-    _alarm(Ending(CANNOT_START, text), run or Path(), {}, target)
+    _alarm(Outcome(CANNOT_START, text), run or Path(), {}, target)
 
 
 @contextlib.contextmanager
@@ -115,7 +115,7 @@ def _end_as_ctrl_c() -> Iterator[None]:
             signal.signal(which, signal.SIG_IGN if heard else handler)
 
 
-def _textfile(stack: contextlib.ExitStack, run: Place, path: Path | None) -> Textfile | None:
+def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
     if path is None:
         return None
     from flexroad.pipeline.monitor.prometheus import Textfile
@@ -132,7 +132,7 @@ def _told_by(error: BaseException) -> tuple[int, str]:
     return 1, f"{type(error).__name__}: {error}"
 
 
-def _alarm(ending: Ending, run: Place, before: dict[str, Any], target: str | None) -> None:
+def _alarm(ending: Outcome, run: Location, before: dict[str, Any], target: str | None) -> None:
     if not target or not ending.exit_code:
         return
     from flexroad.pipeline.monitor.alerts import notify

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Ending, line, overseen, warn
+from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Outcome, format_summary, supervised, warn
 from flexroad.pipeline.cli.stdio import patient
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 
 if TYPE_CHECKING:
     from flexroad.catalog import Catalog, Tile
-    from flexroad.catalog.storage.paths import Place
+    from flexroad.catalog.storage.paths import Location
     from flexroad.pipeline.config.cluster import Cluster
     from flexroad.pipeline.config.models import Config
     from flexroad.pipeline.execute import Executor
@@ -72,20 +72,24 @@ def run(
 ) -> None:
     """Bring every tile up to date; the same command resumes after whatever stopped it."""
     from flexroad.catalog import Catalog
-    from flexroad.catalog.allowlist import refuse_outside
-    from flexroad.catalog.storage.paths import absolute, normal, place
+    from flexroad.catalog.allowlist import check_allowed
+    from flexroad.catalog.storage.paths import absolute, normalise, parse_location
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.graph import layers_read
     from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.selection import asked, select
+    from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
 
-    path, listed, root = place(out), place(catalog), place(store) if store else None
+    path, listed, root = (
+        parse_location(out),
+        parse_location(catalog),
+        parse_location(store) if store else None,
+    )
     # What its own folder holds is a catalog's to name.
-    allowed = [str(absolute(listed).parent), *(normal(text) for text in allow or ())]
+    allowed = [str(absolute(listed).parent), *(normalise(text) for text in allow or ())]
 
     def wanted(chosen: Config) -> tuple[Catalog, Catalog]:
         whole = Catalog.read(listed)
-        refuse_outside(whole, listed.parent, allowed, layers_read(chosen))
+        check_allowed(whole, listed.parent, allowed, layers_read(chosen))
         found = whole.select(tile or (), bbox)
         if not found.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
@@ -100,14 +104,14 @@ def run(
         for line in plan(graphs, root or path / "store", path):
             typer.echo(line)
         return
-    with overseen(path, on_failure, prometheus) as ending:
+    with supervised(path, on_failure, prometheus) as ending:
         chosen = load_config(config)
         whole, tiles = wanted(chosen)
         some = bool(tile) or bbox is not None
         with _alone(path, make=True):
-            about = asked(path, whole, tiles) if some else whole
+            about = merged_catalog(path, whole, tiles) if some else whole
             opened = Run.create(path, chosen, about, root, checksum, allowed)
-            only = select(opened, [tile.id for tile in tiles.tiles], failed=False)
+            only = rerun_filter(opened, [tile.id for tile in tiles.tiles], failed=False)
             with_whom = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
             _carry_out(opened, with_whom, only, frozenset(), verify, ending)
     _leave(ending)
@@ -130,40 +134,40 @@ def rerun(
     prometheus: Prometheus = None,
 ) -> None:
     """Bring tiles of a run up to date: what changed in files or RUN/config.yaml, and what hangs on it."""
-    from flexroad.catalog.allowlist import refuse_outside
-    from flexroad.catalog.storage.paths import place
+    from flexroad.catalog.allowlist import check_allowed
+    from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.graph.graph import layers_read
     from flexroad.pipeline.graph.stages import STAGE_NAMES
     from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.selection import select
+    from flexroad.pipeline.run.selection import rerun_filter
 
-    where = place(path)
-    with overseen(where, on_failure, prometheus) as ending:
+    where = parse_location(path)
+    with supervised(where, on_failure, prometheus) as ending:
         if from_stage is not None and from_stage not in STAGE_NAMES:
             raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
-        anew = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
+        force = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
         with _alone(where):
             opened = Run.open(where)
             if opened.allowed:
                 # A run of old does not know.
-                refuse_outside(opened.catalog, where, opened.allowed, layers_read(opened.config))
-            only = select(opened, tile or (), failed)
+                check_allowed(opened.catalog, where, opened.allowed, layers_read(opened.config))
+            only = rerun_filter(opened, tile or (), failed)
             with_whom = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
-            _carry_out(opened, with_whom, only, anew, verify, ending)
+            _carry_out(opened, with_whom, only, force, verify, ending)
     _leave(ending)
 
 
 @contextlib.contextmanager
-def _alone(path: Place, make: bool = False) -> Iterator[None]:
+def _alone(path: Location, make: bool = False) -> Iterator[None]:
     """Keep other runs out of the folder; ``make`` it if it is not there."""
-    from flexroad.pipeline.run.lock import held
+    from flexroad.pipeline.run.lock import run_lock
 
     try:
         if make and isinstance(path, Path):
             path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
-    with held(path, lambda line: warn(line, "note")):
+    with run_lock(path, lambda line: warn(line, "note")):
         yield
 
 
@@ -188,20 +192,20 @@ def _carry_out(
     run: Run,
     with_whom: Callable[[Callable[[str], None]], Executor],
     only: Callable[[Tile], bool],
-    anew: frozenset[str],
+    force: frozenset[str],
     verify: bool,
-    ending: Ending,
+    ending: Outcome,
 ) -> None:
     """Do the tiles, and fill in how that ended."""
     from rich.console import Console
 
-    from flexroad.pipeline.monitor.progress import Watch
-    from flexroad.pipeline.run.runner import execute
+    from flexroad.pipeline.monitor.progress import ProgressDisplay
+    from flexroad.pipeline.run.runner import run_tiles
 
     folder = shlex.quote(str(run.path))
     console = Console(stderr=True)
     executor = with_whom(partial(console.print, markup=False, highlight=False, soft_wrap=True))
-    watch = Watch(sum(map(only, run.catalog.tiles)), console)
+    watch = ProgressDisplay(sum(map(only, run.catalog.tiles)), console)
     if ending.textfile is not None:
         ending.textfile.total = len(run.catalog.tiles)
 
@@ -212,7 +216,7 @@ def _carry_out(
 
     try:
         with watch:
-            how = ending.how = execute(run, executor, only, anew, told, verify)
+            how = ending.how = run_tiles(run, executor, only, force, told, verify)
     except ClusterLost as error:
         ending.exit_code, ending.text = 1, f"{error}; the same command goes on from here"
         return
@@ -222,7 +226,7 @@ def _carry_out(
         return
     finally:
         _draw(run)
-    ending.exit_code, ending.text = how.exit_code, line(how)
+    ending.exit_code, ending.text = how.exit_code, format_summary(how)
     typer.echo(f"{ending.text}; results in {run.path}")
     if set(watch.status) == {"cached"}:
         typer.echo("nothing had changed; `flexroad rerun RUN --from load` computes all anew")
@@ -242,7 +246,7 @@ def _draw(run: Run) -> None:
         warn(f"no map of the tiles: {error}")
 
 
-def _leave(ending: Ending) -> None:
+def _leave(ending: Outcome) -> None:
     """End the command with its exit code; what went wrong as a whole is said in one line."""
     if ending.exit_code and ending.how is None:
         typer.echo(ending.text if ending.exit_code == 130 else f"error: {ending.text}", err=True)
@@ -270,14 +274,14 @@ def status(
     ] = None,
 ) -> None:
     """Tell how a run stands, and what failed why."""
-    from flexroad.catalog.storage.paths import place
+    from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.run.record import Run
 
-    opened = Run.open(place(path))
+    opened = Run.open(parse_location(path))
     if geojson is not None:
         from flexroad.pipeline.monitor.geojson import write_states
 
-        write_states(opened, place(geojson))
+        write_states(opened, parse_location(geojson))
         typer.echo(str(geojson))
         return
     _tell(opened, as_json)
@@ -287,11 +291,11 @@ def _tell(run: Run, as_json: bool) -> None:
     import json
     from dataclasses import asdict
 
-    from flexroad.pipeline.run.lock import at_work, dead, holder
+    from flexroad.pipeline.run.lock import at_work, death_of, owner
     from flexroad.pipeline.run.status import progress, summary
 
-    who = holder(run.path)
-    alive = who if who and not dead(who) else None
+    who = owner(run.path)
+    alive = who if who and not death_of(who) else None
     if as_json:
         found = asdict(summary(run))
         found["failures"] = [{k: v for k, v in one.items() if k != "trace"} for one in found["failures"]]
@@ -299,7 +303,7 @@ def _tell(run: Run, as_json: bool) -> None:
         typer.echo(json.dumps(found, indent=1))
         return
     how, pace = progress(run, alive) if alive else (summary(run), "")
-    typer.echo(line(how))
+    typer.echo(format_summary(how))
     if who:
         typer.echo(at_work(who) + pace)
     for failure in how.failures:

@@ -46,10 +46,10 @@ def train(
     from flexroad.pipeline.errors import ConfigError
     from flexroad.pipeline.report.training import summary, write_model
     from flexroad.pipeline.store.artefacts import check_writable
-    from flexroad.pipeline.training.train import Asked, train
+    from flexroad.pipeline.training.train import TrainOptions, train
     from flexroad.tasks.errors import TaskError
 
-    asked = Asked(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
+    asked = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
     found, chosen = Catalog.read(catalog), load_config(config)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)

@@ -19,6 +19,9 @@ SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
 RENAMED = {
     "variant": "; it is called method",
     "grounded": "; it is called planar",
+    "hygiene": "; it is called cleanup",
+    "doubt_m": "; it is called error_estimate_m",
+    "doubted_m2": "; it is called suspect_m2",
     "solver": SPLINE,
     "smoothness": SPLINE,
     "huber_m": SPLINE,

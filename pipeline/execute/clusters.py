@@ -39,7 +39,7 @@ ASKED_FOR = {
 
 
 @dataclass(frozen=True)
-class Workplace:
+class ClusterTarget:
     """Where a client connects to."""
 
     target: Any
@@ -52,9 +52,9 @@ class Workplace:
 
 
 @contextlib.contextmanager
-def opened(
+def open_cluster(
     cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
-) -> Iterator[Workplace]:
+) -> Iterator[ClusterTarget]:
     """Start, ask for or find a cluster, and end what was started.
 
     Raises
@@ -63,7 +63,7 @@ def opened(
         If something is not installed, or the cluster cannot be had.
     """
     if scheduler:
-        yield Workplace(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
+        yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
@@ -76,7 +76,7 @@ def opened(
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
         made = stack.enter_context(make(cluster, scratch, dashboard))
         start_s = 0 if cluster.kind == "local" else cluster.start_s
-        yield Workplace(made, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
+        yield ClusterTarget(made, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
 
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
-from flexroad.pipeline.execute.clusters import Workplace, opened
+from flexroad.pipeline.execute.clusters import ClusterTarget, open_cluster
 from flexroad.pipeline.execute.executor import J, R
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class DaskExecutor:
 
         with (
             _quiet(),
-            opened(self.cluster, self.workers, self.scheduler, self.dashboard) as place,
+            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as place,
             self._connected(place) as client,
         ):
             guard = _guard(client, place, probe)
@@ -89,7 +89,7 @@ class DaskExecutor:
             yield from session.results()
 
     @contextlib.contextmanager
-    def _connected(self, place: Workplace) -> Iterator[Client]:
+    def _connected(self, place: ClusterTarget) -> Iterator[Client]:
         from distributed import Client
 
         try:
@@ -116,7 +116,7 @@ def _any_worker(client: Client, end: float) -> bool:
     return False
 
 
-def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -> str:
+def _guard(client: Client, place: ClusterTarget, probe: Callable[[], None] | None) -> str:
     """Compare versions, put plugins on scheduler and workers, and probe; return the guard's name.
 
     Raises
@@ -134,7 +134,7 @@ def _guard(client: Client, place: Workplace, probe: Callable[[], None] | None) -
     try:
         _compare(client, here)
         client.register_plugin(no_second_try(client.id, name), name=f"flexroad-{name}")
-        _post(client, workers.Guard(here, probe, deaf=place.own), name)
+        _post(client, workers.WorkerCheck(here, probe, ignore_sigint=place.own), name)
     except ConfigError:
         raise
     except OSError as error:

@@ -30,7 +30,7 @@ TICK_S = 1.0
 
 
 @dataclass(frozen=True)
-class Flight(Generic[J]):
+class InFlight(Generic[J]):
     """A job on its way."""
 
     job: J
@@ -69,19 +69,19 @@ class Session(Generic[J, R]):
         self.guard = guard
         self.function = function
         self.jobs = jobs
-        self.suspects: deque[J] = deque()
+        self.quarantined: deque[J] = deque()
         """Jobs that were on a worker that died."""
         self.lost = lost
         self.patience_s = patience_s
         self.say = say
-        self.flying: dict[Future, Flight[J]] = {}
+        self.flying: dict[Future, InFlight[J]] = {}
         self.landed: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self.numbers = count(1)
         self.carry = carrier()
-        self.crew: dict[str, int] = {}
+        self.workers: dict[str, int] = {}
         """Threads by worker, as they were at ``looked``."""
         self.looked = 0.0
-        self.deserted: float | None = None
+        self.idle_since: float | None = None
         """Since when there has been no worker."""
 
     def results(self) -> Iterator[R]:
@@ -97,7 +97,7 @@ class Session(Generic[J, R]):
         while True:
             self._look()
             self._send()
-            if not (self.flying or self.suspects):
+            if not (self.flying or self.quarantined):
                 return
             for future in self._landed():
                 yield from self._outcome(future, self.flying.pop(future))
@@ -107,15 +107,15 @@ class Session(Generic[J, R]):
         apart = {flight.alone for flight in self.flying.values() if flight.alone}
         if not apart:
             # Twice the threads keeps every worker busy while constant memory holds the rest back.
-            room = max(2, 2 * sum(self.crew.values())) - len(self.flying)
+            room = max(2, 2 * sum(self.workers.values())) - len(self.flying)
             for job in islice(self.jobs, max(0, room)):
-                self._fly(Flight(job))
+                self._fly(InFlight(job))
         if len(self.flying) == len(apart):
-            for address in [address for address in self.crew if address not in apart]:
-                if self.suspects:
-                    self._fly(Flight(self.suspects.popleft(), address))
+            for address in [address for address in self.workers if address not in apart]:
+                if self.quarantined:
+                    self._fly(InFlight(self.quarantined.popleft(), address))
 
-    def _fly(self, flight: Flight[J]) -> None:
+    def _fly(self, flight: InFlight[J]) -> None:
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
         # Numbered: a key that failed must not come back. Not pure: the store knows what is done already.
         future = self.client.submit(
@@ -140,40 +140,40 @@ class Session(Generic[J, R]):
 
     def _look(self) -> None:
         """See, but not more often than every second, who is there."""
-        if self.crew and time.monotonic() < self.looked + TICK_S:
+        if self.workers and time.monotonic() < self.looked + TICK_S:
             return
         if self.client.status != "running":
             # Asked now, it would not answer for long.
             raise self._gone()
         try:
-            self.crew = self.client.nthreads()
+            self.workers = self.client.nthreads()
         except OSError as error:
             raise self._gone() from error
         self.looked = time.monotonic()
         self._wait_for_workers()
         for future, flight in list(self.flying.items()):
-            if flight.alone and flight.alone not in self.crew and not future.done():
+            if flight.alone and flight.alone not in self.workers and not future.done():
                 # Its worker went before it got there.
-                self.suspects.append(self.flying.pop(future).job)
+                self.quarantined.append(self.flying.pop(future).job)
                 future.release()
 
     def _wait_for_workers(self) -> None:
-        if self.crew:
-            self.deserted = None
-        elif self.deserted is None:
-            self.deserted = self.looked
+        if self.workers:
+            self.idle_since = None
+        elif self.idle_since is None:
+            self.idle_since = self.looked
             self.say(f"no worker is left; waiting up to {self.patience_s:g} s for one")
-        elif self.looked > self.deserted + self.patience_s:
+        elif self.looked > self.idle_since + self.patience_s:
             raise ClusterLost(f"no worker was left for {self.patience_s:g} s")
 
-    def _outcome(self, future: Future, flight: Flight[J]) -> Iterator[R]:
+    def _outcome(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         error = future.exception() if future.status == "error" else None
         if isinstance(error, KilledWorker):
             yield from self._died(flight, error)
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be set to give up what waits for workers; patience is this side's.
             if flight.alone:
-                self.suspects.append(flight.job)
+                self.quarantined.append(flight.job)
             else:
                 self._fly(flight)
         elif future.status == "error":
@@ -183,7 +183,7 @@ class Session(Generic[J, R]):
         else:
             raise self._gone()
 
-    def _fetched(self, future: Future, flight: Flight[J]) -> Iterator[R]:
+    def _fetched(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
             fault, result = future.result()
         except KilledWorker as error:
@@ -196,11 +196,11 @@ class Session(Generic[J, R]):
                 raise ConfigError(fault)
             yield result
 
-    def _died(self, flight: Flight[J], error: KilledWorker) -> Iterator[R]:
+    def _died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
         if flight.alone:
             yield self.lost(flight.job, self._why(error))
         else:
-            self.suspects.append(flight.job)
+            self.quarantined.append(flight.job)
 
     def _gone(self) -> ClusterLost:
         return ClusterLost(f"{self.name} is gone")

@@ -26,7 +26,7 @@ _here = local()
 """What is known of the thread that does a job."""
 
 
-class Guard(WorkerPlugin):  # type: ignore[misc]
+class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
     """Pins a worker's threads and, before its first tile, compares versions and tries the store.
 
     Parameters
@@ -41,18 +41,21 @@ class Guard(WorkerPlugin):  # type: ignore[misc]
     """
 
     def __init__(
-        self, versions: Mapping[str, str], probe: Callable[[], None] | None = None, deaf: bool = False
+        self,
+        versions: Mapping[str, str],
+        probe: Callable[[], None] | None = None,
+        ignore_sigint: bool = False,
     ) -> None:
         self.versions = dict(versions)
         self.probe = probe
-        self.deaf = deaf
+        self.ignore_sigint = ignore_sigint
 
     def setup(self, worker: Any) -> None:
         """Prepare a worker of now, or one that joins later."""
         self.address: str = worker.address
         self._lock = Lock()
         self._fault: str | None = None
-        if self.deaf:
+        if self.ignore_sigint:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         pin_threads()
 
@@ -91,7 +94,7 @@ def work(function: Callable[[J], R], job: J) -> R:
 
 async def find_fault(guard: str, dask_worker: Any) -> str:
     """Return why a worker must not work, or nothing."""
-    watch: Guard = dask_worker.plugins[guard]
+    watch: WorkerCheck = dask_worker.plugins[guard]
     return await asyncio.to_thread(lambda: watch.fault)
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Catalog, Layer, Tile
-from flexroad.catalog.storage.paths import Place, Seen, read, stat
+from flexroad.catalog.storage.paths import FileStat, Location, read, stat
 from flexroad.pipeline.config.models import Config, Export
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
@@ -37,7 +37,7 @@ from flexroad.pipeline.graph.stages import (
 )
 from flexroad.tasks.options import Options
 
-Look = Callable[[Place], Seen | None]
+Stat = Callable[[Location], FileStat | None]
 
 
 Recorded = Sequence[Any]
@@ -73,7 +73,7 @@ class TileGraph:
     export: Export
     sources: list[Any]
     """The source layers as they are named in fingerprints, or were."""
-    seen: dict[str, Seen | None]
+    seen: dict[str, FileStat | None]
     """How each file looked when the graph was made, by its path; None if it was not there."""
     fingerprint: str
     """Of everything asked for; the tile is done when its item carries it."""
@@ -139,7 +139,7 @@ class Pattern:
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported)
 
     def graph(
-        self, tile: Tile, checksum: bool = False, look: Look = stat, recorded: Recorded = ()
+        self, tile: Tile, checksum: bool = False, look: Stat = stat, recorded: Recorded = ()
     ) -> TileGraph:
         """Return the graph of one tile.
 
@@ -206,7 +206,7 @@ def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
     return Pattern.of(config).graph(tile, checksum)
 
 
-def files_read(graph: TileGraph, node: Node) -> list[Place]:
+def files_read(graph: TileGraph, node: Node) -> list[Location]:
     """Return the files that a stage reads: those of its source layers, and those its options name."""
     reads = getattr(stage_module(node.options), "READS", ())
     paths = [path for layer in graph.tile.layers if layer.name in reads for path in graph.tile.paths(layer)]
@@ -224,7 +224,7 @@ def any_gone(graph: TileGraph) -> bool:
     return None in graph.seen.values()
 
 
-def _layer(tile: Tile, layer: Layer, seen: Mapping[str, Seen | None], checksum: bool) -> list[Any]:
+def _layer(tile: Tile, layer: Layer, seen: Mapping[str, FileStat | None], checksum: bool) -> list[Any]:
     """Return name, files, values and CRS of a layer; a file is told by name, size and time, or its bytes."""
     files: list[list[str | int | None]] = []
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
@@ -246,7 +246,7 @@ def _as_they_were(sources: list[Any], recorded: Recorded) -> list[Any]:
     ]
 
 
-def _bytes(path: Place, seen: Seen | None) -> str | None:
+def _bytes(path: Location, seen: FileStat | None) -> str | None:
     if seen is None:
         return None
     try:
@@ -256,7 +256,7 @@ def _bytes(path: Place, seen: Seen | None) -> str | None:
 
 
 @lru_cache(maxsize=65536)
-def _digest_of(path: Place, size: int, version: int | str) -> str:
+def _digest_of(path: Location, size: int, version: int | str) -> str:
     if not isinstance(path, Path):
         return hashlib.sha256(read(path)).hexdigest()
     with path.open("rb") as file:

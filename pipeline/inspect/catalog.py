@@ -9,7 +9,7 @@ from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.crs import short
-from flexroad.catalog.storage.paths import Place, Sightings
+from flexroad.catalog.storage.paths import Location, StatCache
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
@@ -22,7 +22,7 @@ SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Remark:
+class Finding:
     """One line about a catalog."""
 
     text: str
@@ -30,34 +30,34 @@ class Remark:
     """Whether something should be mended before a run."""
 
 
-def check(catalog: Catalog) -> Iterator[Remark]:
+def check(catalog: Catalog) -> Iterator[Finding]:
     """Tell what a catalog has and what is amiss, the quick things first."""
     tiles = catalog.tiles
     sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
     systems = sorted({short(tile.grid.crs) for tile in tiles})
-    yield Remark(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
+    yield Finding(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
     had = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
-    yield Remark("tiles with " + ", ".join(f"{name}: {count}" for name, count in had.items() if count))
+    yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in had.items() if count))
     for name in ("dsm", "dtm"):
         if had[name] < len(tiles):
-            yield Remark(f"{len(tiles) - had[name]} tiles have no {name}: they will fail", fault=True)
+            yield Finding(f"{len(tiles) - had[name]} tiles have no {name}: they will fail", fault=True)
     yield from _missing(tiles)
     yield from _photos([tile for tile in tiles if tile.layer("dop")])
 
 
-def _missing(tiles: Sequence[Tile]) -> Iterator[Remark]:
-    wanted: Counter[Place] = Counter(
+def _missing(tiles: Sequence[Tile]) -> Iterator[Finding]:
+    wanted: Counter[Location] = Counter(
         path for tile in tiles for layer in tile.layers for path in tile.paths(layer)
     )
-    look = Sightings()
+    look = StatCache()
     gone = [(path, count) for path, count in wanted.items() if look(path) is None]
     for path, count in gone[:SHOWN]:
-        yield Remark(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
+        yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
     if len(gone) > SHOWN:
-        yield Remark(f"missing: {len(gone) - SHOWN} files more", fault=True)
+        yield Finding(f"missing: {len(gone) - SHOWN} files more", fault=True)
 
 
-def _photos(tiles: Sequence[Tile]) -> Iterator[Remark]:
+def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
     """Compare photo and heights on some tiles, first by cell: only like lattices can be taken together."""
     tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
     cells = Counter(tile.grid.cell for tile in tiles)
@@ -68,7 +68,7 @@ def _photos(tiles: Sequence[Tile]) -> Iterator[Remark]:
         try:
             pairs.append(_pair(tile))
         except TaskError as error:
-            yield Remark(f"{tile.id}: {error}", fault=True)
+            yield Finding(f"{tile.id}: {error}", fault=True)
     if pairs:
         yield _shift(pairs, some[0].grid.cell)
 
@@ -79,7 +79,7 @@ def _pair(tile: Tile) -> coregistration.Pair:
     return coregistration.pair(data, read_photo(data.dop, data.grid))
 
 
-def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Remark:
+def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
     found = coregistration.shift(pairs)
     each = [coregistration.shift([pair], found.sun) for pair in pairs]
     scatter = median(
@@ -91,8 +91,8 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Remark:
         f"confidence {found.confidence:.2f})"
     )
     if not coregistration.matters(found, cell, scatter):
-        return Remark(f"dop: {measured}: not clearly off")
-    return Remark(
+        return Finding(f"dop: {measured}: not clearly off")
+    return Finding(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",
         fault=True,
     )

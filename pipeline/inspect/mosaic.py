@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid, Tile
 from flexroad.catalog.crs import same
 from flexroad.catalog.grid import LATTICE_TOLERANCE
-from flexroad.catalog.storage.paths import absolute, place
+from flexroad.catalog.storage.paths import absolute, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.lazy import lazy_raster
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.products import plain_name
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.products import safe_name
 from flexroad.tasks.export import cog
 from flexroad.tasks.io.raster import opened
 
@@ -75,14 +75,14 @@ class Mosaic:
         tiles = run.catalog.tiles
         grid = _grid(tiles, bounds)
         near = [tile for tile in tiles if _meet(tile.grid, grid)]
-        spans = [(*_span(tile, grid), now) for tile, now in zip(near, look_at(run, near), strict=True)]
+        spans = [(*_span(tile, grid), now) for tile, now in zip(near, peek_statuses(run, near), strict=True)]
         rows = _edges([(top, bottom) for top, bottom, *_ in spans], grid.height)
         columns = _edges([(left, right) for _, _, left, right, _ in spans], grid.width)
         windows: dict[tuple[int, int], Window] = {}
         for (top, bottom, left, right, now), tile in zip(spans, near, strict=True):
             if not now.done:
                 continue
-            stem = str(absolute(run.folder(tile.id).path) / f"{plain_name(tile.id)}_{variant}")
+            stem = str(absolute(run.folder(tile.id).path) / f"{safe_name(tile.id)}_{variant}")
             for i in _between(rows, top, bottom):
                 for j in _between(columns, left, right):
                     size = rows[i + 1] - rows[i], columns[j + 1] - columns[j]
@@ -149,7 +149,7 @@ def _read(source: tuple[Window, str]) -> NDArray[Any]:
     from rasterio import windows
 
     window, suffix = source
-    path = place(window.stem + suffix)
+    path = parse_location(window.stem + suffix)
     with opened(path, path.name) as raster:
         part = windows.Window(window.column, window.row, window.width, window.height)
         values: NDArray[Any] = raster.read(1, window=part)

@@ -17,13 +17,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
-from flexroad.catalog.storage.paths import Place, place
+from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull, StageError
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 
@@ -53,7 +53,7 @@ class Ground:
     variant: str
 
     @classmethod
-    def open(cls, path: Place | str, variant: str | None = None) -> Ground:
+    def open(cls, path: Location | str, variant: str | None = None) -> Ground:
         """Open a run.
 
         Raises
@@ -61,11 +61,11 @@ class Ground:
         ConfigError
             If it is no run, has no such variant, or no tile is done.
         """
-        run = Run.open(place(path))
+        run = Run.open(parse_location(path))
         variant = variant or run.config.export.variants[0]
         if variant not in run.config.chains:
             raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-        if not any(found.done for found in look_at(run, run.catalog.tiles)):
+        if not any(found.done for found in peek_statuses(run, run.catalog.tiles)):
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
         return cls(run, variant)
 
@@ -101,7 +101,7 @@ class Ground:
         order = np.argsort(number, kind="stable")
         under, starts = np.unique(number[order], return_index=True)
         free = np.ones(easting.shape, dtype=bool)
-        stands = look_at(self.run, [tiles[i] for i in under])
+        stands = peek_statuses(self.run, [tiles[i] for i in under])
         for found, here in zip(stands, np.split(point[order], starts[1:]), strict=True):
             here = here[free[here]]
             if found.done and here.size:
@@ -109,7 +109,7 @@ class Ground:
                 yield found.graph, here
 
     def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
-        pull = Pull(graph, Store(self.run.store))
+        pull = Evaluator(graph, ArtefactStore(self.run.store))
         made = graph.variants[self.variant]
         try:
             return pull(made["fit"]), pull(made["segment"])
@@ -117,7 +117,7 @@ class Ground:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
 
 
-def query_csv(run: Place, csv: Path, variant: str | None, out: TextIO) -> int:
+def query_csv(run: Location, csv: Path, variant: str | None, out: TextIO) -> int:
     """Answer a CSV of points with a CSV: its columns, then height_m, nx, ny, nz, tile, class.
 
     Returns

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds
-from flexroad.catalog.storage.paths import exists, place, read
+from flexroad.catalog.storage.paths import exists, parse_location, read
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
 from flexroad.pipeline.inspect.points import Answer, Ground
 from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
+from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks.types import Floats
 
@@ -71,7 +71,8 @@ class RunView:
 
         tiles = self.run.catalog.tiles
         states = [
-            "done" if now.done else "failed" if now.failed else "pending" for now in look_at(self.run, tiles)
+            "done" if now.done else "failed" if now.failed else "pending"
+            for now in peek_statuses(self.run, tiles)
         ]
         bounds = np.array([tile.grid.bounds for tile in tiles]).reshape(-1, 4)
         return geopandas.GeoDataFrame(
@@ -294,7 +295,7 @@ def open_run(path: str | Path, variant: str | None = None) -> RunView:
     config nightly, variant flexroad
     2 tiles: 1 done, 1 pending
     """
-    run = Run.open(place(path))
+    run = Run.open(parse_location(path))
     variant = variant or run.config.export.variants[0]
     if variant not in run.config.chains:
         raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flexroad.catalog.storage.paths import Place, place
+from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull, StageError
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HEIGHTS = {"units": "m"}
 
 
-def open_tile(run: Place | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
+def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
     """Return what went into a tile and what came out of it, on the tile's core.
 
     Parameters
@@ -52,13 +52,13 @@ def open_tile(run: Place | str, tile_id: str, variant: str | None = None) -> xr.
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
 
-    opened = Run.open(place(run))
+    opened = Run.open(parse_location(run))
     variant = variant or opened.config.export.variants[0]
     if variant not in opened.config.chains:
         raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")
     (tile,) = opened.catalog.select([tile_id]).tiles
-    (stand,) = look_at(opened, [tile])
-    pull, made = Pull(stand.graph, Store(opened.store)), stand.graph.variants[variant]
+    (stand,) = peek_statuses(opened, [tile])
+    pull, made = Evaluator(stand.graph, ArtefactStore(opened.store)), stand.graph.variants[variant]
     try:
         data, road, clusters, surface = (pull(made[stage]) for stage in ("load", "segment", "ecsrc", "fit"))
     except StageError as error:

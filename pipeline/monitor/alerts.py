@@ -18,7 +18,7 @@ BUSY = (429, 500, 502, 503, 504)
 
 
 @dataclass(frozen=True)
-class Patience:
+class RetryPolicy:
     """How long an alarm may take."""
 
     command_s: float = 120
@@ -28,7 +28,7 @@ class Patience:
     """Before the second try; twice as long before each following one."""
 
 
-def notify(target: str, told: Mapping[str, Any], patience: Patience | None = None) -> str | None:
+def notify(target: str, told: Mapping[str, Any], patience: RetryPolicy | None = None) -> str | None:
     """Tell the target; return why that did not succeed, or None: an alarm that fails is no fault of the run.
 
     Parameters
@@ -39,13 +39,13 @@ def notify(target: str, told: Mapping[str, Any], patience: Patience | None = Non
         lasts as long as the command.
     """
     text = json.dumps(told, indent=1)
-    patience = patience or Patience()
+    patience = patience or RetryPolicy()
     if target.startswith(("http://", "https://")):
         return _post(target, text, patience)
     return _call(target, text, patience)
 
 
-def _post(url: str, text: str, patience: Patience) -> str | None:
+def _post(url: str, text: str, patience: RetryPolicy) -> str | None:
     import requests
     from requests.adapters import HTTPAdapter
     from urllib3 import Retry
@@ -76,7 +76,7 @@ def _post(url: str, text: str, patience: Patience) -> str | None:
     return None if answer.status_code // 100 == 2 else f"{place} answered {answer.status_code}"
 
 
-def _call(command: str, text: str, patience: Patience) -> str | None:
+def _call(command: str, text: str, patience: RetryPolicy) -> str | None:
     try:
         with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
             path = Path(folder) / "summary.json"
@@ -95,7 +95,7 @@ def _call(command: str, text: str, patience: Patience) -> str | None:
         return f"`{command}` cannot be run: {error}"
 
 
-def _wait(process: subprocess.Popen[bytes], text: str, patience: Patience) -> str | None:
+def _wait(process: subprocess.Popen[bytes], text: str, patience: RetryPolicy) -> str | None:
     try:
         process.communicate(text.encode(), patience.command_s)
     except subprocess.TimeoutExpired:

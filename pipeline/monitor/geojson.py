@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import Place, write
+from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.database import NAME as LEDGER
-from flexroad.pipeline.store.database import Ledger, Standing
-from flexroad.pipeline.store.records import Entry
+from flexroad.pipeline.store.database import NAME as DATABASE
+from flexroad.pipeline.store.database import RunDatabase, TileState
+from flexroad.pipeline.store.records import TileRecord
 
 NAME = "tiles.geojson"
-COLUMNS = ("id", "state", "error", "seconds", "doubt_m", "finished")
+COLUMNS = ("id", "state", "error", "seconds", "error_estimate_m", "finished")
 
 
-def write_states(run: Run, where: Place) -> None:
+def write_states(run: Run, where: Location) -> None:
     """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
 
     Each has its id, its ``state`` (done: by the last run; cached: found done by it; failed; pending), why it
@@ -32,10 +32,10 @@ def write_states(run: Run, where: Place) -> None:
     from geopandas import GeoDataFrame
 
     left = {tile.id: tile for tile in run.catalog.tiles}
-    with Ledger.peek(run.path / LEDGER) as ledger:
+    with RunDatabase.peek(run.path / DATABASE) as database:
         rows = [
             _row(left.pop(name), standing, entry, run.config.export.variants[0])
-            for name, standing, entry in ledger.entries()
+            for name, standing, entry in database.entries()
             if name in left
         ]
     # Tiles that are new since the last run.
@@ -62,7 +62,9 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     return transform(shapes, lambda degrees: degrees.round(7))
 
 
-def _row(tile: Tile, standing: Standing, entry: Entry | None, variant: str) -> tuple[Tile, dict[str, Any]]:
+def _row(
+    tile: Tile, standing: TileState, entry: TileRecord | None, variant: str
+) -> tuple[Tile, dict[str, Any]]:
     row: dict[str, Any] = {"id": tile.id, "state": standing}
     # The entry of a pending tile describes files or options that are no longer there.
     if entry is not None and standing != "pending":
@@ -71,5 +73,5 @@ def _row(tile: Tile, standing: Standing, entry: Entry | None, variant: str) -> t
             row["error"] = entry.failures[0].line
         for one in entry.rows:
             if one["variant"] == variant:
-                row["doubt_m"] = one.get("doubt_m")
+                row["error_estimate_m"] = one.get("error_estimate_m")
     return tile, row

@@ -24,7 +24,7 @@ from flexroad.pipeline.worker.tile import TileResult
 PLAIN_EVERY_S = 10.0
 
 
-class Watch:
+class ProgressDisplay:
     """Told of every tile; shows counts by status and stage, and when it will be over."""
 
     def __init__(self, total: int, console: Console) -> None:
@@ -49,7 +49,7 @@ class Watch:
         self.below = Text("  starting", overflow="ellipsis", no_wrap=True)
         self.live = Live(Group(self.progress, self.below), console=console) if console.is_terminal else None
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> ProgressDisplay:
         if self.live:
             self.live.start()
         return self

@@ -20,7 +20,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.sheet import GROUND, Sheet
 from flexroad.pipeline.prepare.spool import Blocks, Place, Spooled, room
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m
-from flexroad.tasks.types import Photo
+from flexroad.tasks.types import Orthophoto
 
 
 @dataclass(frozen=True)
@@ -123,5 +123,5 @@ def _enter(sheet: Sheet, job: BlockJob) -> None:
                 sheet.write(layer, job.grid, made[layer])
         if "colour" in made and job.dop_cell:
             pixels = Grid.covering(job.grid.crs, job.grid.bounds, job.dop_cell)
-            sheet.write_photo(Photo(pixels, made["colour"], made["known"]))
+            sheet.write_photo(Orthophoto(pixels, made["colour"], made["known"]))
     job.target.unlink()

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
-from flexroad.catalog.to_metres import Frame
+from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.blocks import fill, sheet_grid
@@ -95,7 +95,7 @@ def publish_mesh(
     say: Callable[[str], None],
 ) -> Published:
     """Make rasters and catalog of a mesh in memory, called by its source's name; see `prepare_mesh`."""
-    frame = Frame.of(mesh.crs, mesh.bounds[:2], asked.to_crs, asked.height_unit)
+    frame = MetricTransform.of(mesh.crs, mesh.bounds[:2], asked.to_crs, asked.height_unit)
     mesh = in_metres(mesh, frame)
     grid = sheet_grid(mesh.bounds, frame.target, asked.cell_m, asked.step_m)
     dop_cell = asked.dop_cell_m if mesh_asked.dop else None

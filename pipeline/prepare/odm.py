@@ -18,7 +18,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
-from flexroad.catalog.to_metres import Frame
+from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked
@@ -28,7 +28,7 @@ from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.roads import add_roads
 from flexroad.pipeline.prepare.sheet import Published, Sheet
 from flexroad.tasks.acquire.points import fill_voids, ground_filter, to_rasters
-from flexroad.tasks.types import Floats, Photo
+from flexroad.tasks.types import Floats, Orthophoto
 
 DSM, DTM, PHOTO = "odm_dem/dsm.tif", "odm_dem/dtm.tif", "odm_orthophoto/odm_orthophoto.tif"
 MESHES = tuple(
@@ -113,18 +113,18 @@ def _rasters(
     return published.noting(*frame.notes, *missing)
 
 
-def _frame(dsm: Path, asked: Asked) -> tuple[Frame, Grid]:
+def _frame(dsm: Path, asked: Asked) -> tuple[MetricTransform, Grid]:
     """Return the way to metres and the cells that cover the surface model."""
     with _opened(dsm) as source:
         crs = source.crs.to_wkt() if source.crs else asked.crs
         if crs is None:
             raise CatalogError(f"{dsm} carries no CRS; give it with --crs, such as --crs EPSG:32632")
-        frame = Frame.of(crs, source.bounds[:2], asked.to_crs, asked.height_unit)
+        frame = MetricTransform.of(crs, source.bounds[:2], asked.to_crs, asked.height_unit)
         bounds = rasterio.warp.transform_bounds(crs, frame.target, *source.bounds)
     return frame, sheet_grid(bounds, frame.target, asked.cell_m, asked.step_m)
 
 
-def _heights(sheet: Sheet, layer: str, path: Path, frame: Frame, finer: Resampling) -> None:
+def _heights(sheet: Sheet, layer: str, path: Path, frame: MetricTransform, finer: Resampling) -> None:
     """Bring a raster of heights to the sheet's cells."""
     with _opened(path) as source, _warped(source, frame, sheet.grid, finer) as warped:
         for where, window in _windows(sheet.grid):
@@ -132,7 +132,7 @@ def _heights(sheet: Sheet, layer: str, path: Path, frame: Frame, finer: Resampli
             sheet.write(layer, where, heights * frame.height_m)
 
 
-def _photo(sheet: Sheet, path: Path, frame: Frame) -> None:
+def _photo(sheet: Sheet, path: Path, frame: MetricTransform) -> None:
     grid = sheet.photo_grid
     assert grid is not None
     with _opened(path) as source:
@@ -143,7 +143,7 @@ def _photo(sheet: Sheet, path: Path, frame: Frame) -> None:
         with _warped(source, frame, grid, Resampling.average) as warped:
             for where, window in _windows(grid):
                 known = warped.dataset_mask(window=window) > 0
-                sheet.write_photo(Photo(where, warped.read((1, 2, 3), window=window), known))
+                sheet.write_photo(Orthophoto(where, warped.read((1, 2, 3), window=window), known))
 
 
 def _filter(sheet: Sheet, options: to_rasters.Options) -> None:
@@ -170,7 +170,7 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
 
 
-def _warped(source: Any, frame: Frame, grid: Grid, finer: Resampling) -> WarpedVRT:
+def _warped(source: Any, frame: MetricTransform, grid: Grid, finer: Resampling) -> WarpedVRT:
     """Return a raster on a grid: ``finer`` says how where its own cells are smaller, else bilinear."""
     cell = max(abs(source.transform.a), abs(source.transform.e)) * (frame.plan_m or 1.0)
     return WarpedVRT(

@@ -10,7 +10,7 @@ from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.point_clouds import Cloud, find, inspect
 from flexroad.catalog.headers.rasters import some
-from flexroad.catalog.to_metres import Frame, agreed
+from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.blocks import fill, sheet_grid
@@ -89,10 +89,10 @@ def prepare_points(
             return sheet.publish(asked.tile_size_m, asked.date, dataset).noting(*notes)
 
 
-def _frame(clouds: Sequence[Cloud], asked: Asked) -> Frame:
+def _frame(clouds: Sequence[Cloud], asked: Asked) -> MetricTransform:
     crs = agreed([(str(cloud.path), cloud.crs) for cloud in clouds], asked.crs)
     west, south, east, north = clouds[0].bounds
-    return Frame.of(crs, ((west + east) / 2, (south + north) / 2), asked.to_crs, asked.height_unit)
+    return MetricTransform.of(crs, ((west + east) / 2, (south + north) / 2), asked.to_crs, asked.height_unit)
 
 
 def _with(options: Options, method: str) -> Options:
@@ -166,7 +166,9 @@ def _astray(clouds: Sequence[Cloud]) -> str:
     )
 
 
-def _tags(clouds: Sequence[Cloud], frame: Frame, spooled: Spooled, options: Options) -> dict[str, str]:
+def _tags(
+    clouds: Sequence[Cloud], frame: MetricTransform, spooled: Spooled, options: Options
+) -> dict[str, str]:
     """Return the tags that tell how the rasters were made."""
     return {
         "SOURCE": some([cloud.path.name for cloud in clouds]),

@@ -18,7 +18,7 @@ from rasterio.warp import Resampling, reproject
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.vectors import VectorFile, opened
-from flexroad.catalog.to_metres import Frame
+from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.asked import Asked
 from flexroad.pipeline.prepare.sheet import Sheet
@@ -115,7 +115,7 @@ def _mesh(path: Path, grid: Grid) -> Bools:
     from flexroad.tasks.acquire.mesh.sample import cover, in_metres
 
     mesh = read_mesh(path, colours=False)
-    return cover(in_metres(mesh, Frame.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
+    return cover(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
 
 
 def _raster(path: Path, grid: Grid) -> Bools | None:

@@ -29,7 +29,7 @@ from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
-from flexroad.tasks.types import Photo
+from flexroad.tasks.types import Orthophoto
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"
@@ -127,7 +127,7 @@ class Sheet:
             cells = values.astype(np.float32 if heights else np.uint8)
             raster.write(cells, 1, window=_window(self.grid, where))
 
-    def write_photo(self, photo: Photo) -> None:
+    def write_photo(self, photo: Orthophoto) -> None:
         """Write a window of the orthophoto; pixels without a colour are masked.
 
         Raises

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError, Grid
 from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks
-from flexroad.catalog.to_metres import Frame
+from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.acquire.types import Points
 
@@ -41,7 +41,7 @@ Place = tuple[int, int]
 """Column and row of a block: its south-west corner lies at these multiples of the edge."""
 
 
-def edge_m(clouds: Sequence[Cloud], frame: Frame, reach_m: float, step: float) -> float:
+def edge_m(clouds: Sequence[Cloud], frame: MetricTransform, reach_m: float, step: float) -> float:
     """Return the edge of blocks that hold about `POINTS_PER_BLOCK` with their rim, in whole steps (m)."""
     points, area = sum(cloud.points for cloud in clouds), 0.0
     for cloud in clouds:
@@ -169,7 +169,7 @@ class Spooled:
 
 
 def spool(
-    clouds: Sequence[Cloud], frame: Frame, folder: Path, edge: float, say: Callable[[str], None]
+    clouds: Sequence[Cloud], frame: MetricTransform, folder: Path, edge: float, say: Callable[[str], None]
 ) -> Spooled:
     """Move the points of all files to metres and into blocks; noise and withheld points stay out.
 
@@ -236,7 +236,7 @@ class _Colours:
         return scaled.astype(np.uint8)
 
 
-def _records(chunk: Chunk, frame: Frame, colours: _Colours) -> tuple[Integers, NDArray[np.void]]:
+def _records(chunk: Chunk, frame: MetricTransform, colours: _Colours) -> tuple[Integers, NDArray[np.void]]:
     """Return eastings and northings in stored units, ``(2, n)``, and records that lack but these."""
     easting, northing, height = frame.metres(chunk.x, chunk.y, chunk.z)
     kept = (height >= LOWEST_M) & (height <= HIGHEST_M)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flexroad.catalog.storage.paths import Place, write
+from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
 from flexroad.pipeline.run.record import Run
@@ -10,7 +10,7 @@ from flexroad.pipeline.run.record import Run
 FORMATS = ("md", "csv", "html")
 
 
-def write_report(run: Run, form: str) -> Place:
+def write_report(run: Run, form: str) -> Location:
     """Write RUN/report.<form> and return its path.
 
     Parameters

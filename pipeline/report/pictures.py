@@ -8,9 +8,9 @@ from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
 from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull, StageError
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
@@ -26,9 +26,9 @@ def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
     maps: dict[str, TilePictures] = {}
     meshes: dict[str, Mesh] = {}
     known = {tile.id: tile for tile in run.catalog.tiles}
-    for found in look_at(run, [known[tile_id] for tile_id in shown]):
+    for found in peek_statuses(run, [known[tile_id] for tile_id in shown]):
         graph = found.graph
-        pull = Pull(graph, Store(run.store))
+        pull = Evaluator(graph, ArtefactStore(run.store))
         try:
             meshes[graph.tile.id] = pull(graph.variants[variant]["sample"])
             maps[graph.tile.id] = _maps(graph, variant, pull)
@@ -45,7 +45,7 @@ def _shown(content: Content) -> list[str]:
     return list(dict.fromkeys([*content.worst["tile"], *content.doubtful["tile"]]))
 
 
-def _maps(graph: TileGraph, variant: str, pull: Pull) -> TilePictures:
+def _maps(graph: TileGraph, variant: str, pull: Evaluator) -> TilePictures:
     made = graph.variants[variant]
     data: TileData = pull(made["load"])
     road: RoadMask = pull(made["segment"])

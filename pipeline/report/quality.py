@@ -5,8 +5,8 @@ from __future__ import annotations
 import pandas as pd
 
 FIGURES = {
-    "doubt_m": "doubt (m)",
-    "doubted_m2": "largest doubted patch (m²)",
+    "error_estimate_m": "doubt (m)",
+    "suspect_m2": "largest doubted patch (m²)",
     "residual_p95_m": "p95 to own points (m)",
     "curvature_per_m": "curvature (1/m)",
     "edge_step_m": "edge step (m)",
@@ -26,7 +26,7 @@ MEANING = (
 
 def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     """Return the figures of each variant, mean over tiles, and how many tiles have a flag."""
-    if not done["doubt_m"].notna().any():
+    if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
     table = done.groupby("variant")[[*FIGURES, *SUPPORT]].mean().reindex(variants)
     flagged = (done["flags"].fillna("") != "").groupby(done.variant).sum()
@@ -37,7 +37,9 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
 
 def most_doubtful(done: pd.DataFrame, variant: str, most: int) -> pd.DataFrame:
     """Return the tiles of a variant with the greatest doubt, the worst first, and their flags."""
-    table = done[(done.variant == variant) & done["doubt_m"].notna()].nlargest(most, "doubt_m")
+    table = done[(done.variant == variant) & done["error_estimate_m"].notna()].nlargest(
+        most, "error_estimate_m"
+    )
     shown = _printed(table[[*FIGURES, *SUPPORT]])
     shown.insert(0, "tile", table.tile_id)
     return shown.assign(flags=table["flags"].replace("", "–"))

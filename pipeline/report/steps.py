@@ -15,8 +15,8 @@ import pandas as pd
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.graph import Node, TileGraph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
@@ -38,7 +38,11 @@ def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
     every = math.ceil(len(tiles) / most)
     pairs = list(_pairs(tiles, every))
     wanted = {tile.id: tile for pair in pairs for tile in pair}
-    done = {found.graph.tile.id: _nodes(found.graph) for found in look_at(run, wanted.values()) if found.done}
+    done = {
+        found.graph.tile.id: _nodes(found.graph)
+        for found in peek_statuses(run, wanted.values())
+        if found.done
+    }
     rows = [row for variant in run.config.export.variants for row in _rows(run, pairs, done, variant)]
     table = pd.DataFrame(rows, columns=COLUMNS)
     note = f"Of one tile in {every}, against its neighbours in the east and north." if every > 1 else ""
@@ -62,7 +66,7 @@ def _nodes(graph: TileGraph) -> dict[str, Nodes]:
 def _rows(
     run: Run, pairs: Sequence[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float]]:
-    store = Store(run.store)
+    store = ArtefactStore(run.store)
 
     @lru_cache(KEPT)
     def results(tile_id: str) -> tuple[Surface, RoadMask] | None:

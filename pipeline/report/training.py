@@ -19,7 +19,7 @@ from flexroad.pipeline.report.pages import template
 from flexroad.pipeline.report.render import curves, found_map
 from flexroad.pipeline.run.record import versions
 from flexroad.pipeline.store.products import no_nan
-from flexroad.pipeline.training.train import Judged, Outcome
+from flexroad.pipeline.training.train import Evaluation, Outcome
 from flexroad.tasks.roads.mask_metrics import Quality
 
 SHOWN = 3
@@ -108,7 +108,7 @@ def _lines(outcome: Outcome, count: str) -> list[str]:
 
 def _meaning(outcome: Outcome) -> str:
     return (
-        "Of the mask as the model gives it, before hygiene, on all surveyed cells. Edges: from each piece of "
+        "Of the mask as the model gives it, before cleanup, on all surveyed cells. Edges: from each piece of "
         "the found outline to the nearest of the labels' and the other way round; a false road far from any "
         "true one counts with its whole distance."
     )
@@ -145,7 +145,7 @@ def _pictures(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
             yield caption, _picture(outcome, one)
 
 
-def _picture(outcome: Outcome, one: Judged) -> bytes:
+def _picture(outcome: Outcome, one: Evaluation) -> bytes:
     seen = outcome.look(one)
     return found_map(seen.ground, seen.truth, seen.found, seen.grid)
 

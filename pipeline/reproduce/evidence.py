@@ -9,7 +9,7 @@ from typing import Final
 
 import pandas as pd
 
-from flexroad.catalog.storage.paths import Place, write
+from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.run.record import Run
@@ -170,7 +170,7 @@ def _rows(run: Run) -> pd.DataFrame:
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
 
 
-def _sound(rows: pd.DataFrame, run: Place, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
+def _sound(rows: pd.DataFrame, run: Location, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
     evidence = Evidence(rows, dsc3d)
     if not evidence.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")

@@ -16,31 +16,31 @@ import json
 from dataclasses import asdict
 from typing import IO, Any
 
-from flexroad.catalog.storage.paths import Place, is_remote
-from flexroad.catalog.storage.staging import Mirror
+from flexroad.catalog.storage.paths import Location, is_remote
+from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.worker.profiling import now
 from flexroad.pipeline.worker.tile import TileResult
 
 
-class Journal:
+class EventLog:
     """Appends events; use it as a context. A disk too full for the log is no reason to stop the tiles."""
 
-    def __init__(self, run: Place) -> None:
+    def __init__(self, run: Location) -> None:
         start = now().replace(":", "").replace("+0000", "Z")
-        self._mirror = Mirror(run / "log" / f"{start}.jsonl" if is_remote(run) else run / "log.jsonl")
+        self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / "log.jsonl")
         self._file: IO[str] | None = None
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> EventLog:
         with contextlib.suppress(OSError):
-            self._file = self._mirror.path.open("a", buffering=1)
+            self._file = self._staged.path.open("a", buffering=1)
         return self
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):
             if self._file:
                 self._file.close()
-            self._mirror.put()
-        self._mirror.close()
+            self._staged.put()
+        self._staged.close()
 
     def note(self, event: str, time: str = "", **what: Any) -> None:
         """Append one event, of now unless ``time`` says when."""
@@ -48,7 +48,7 @@ class Journal:
         with contextlib.suppress(OSError):
             if self._file:
                 self._file.write(json.dumps(line) + "\n")
-            self._mirror.tick()
+            self._staged.sync_if_due()
 
     def tile(self, result: TileResult) -> None:
         """Append one event for every stage of a tile, and one for the tile."""

@@ -15,16 +15,16 @@ from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.storage.paths import Place, absolute, exists, listing, remove
+from flexroad.catalog.storage.paths import Location, absolute, exists, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.run.lock import held
+from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
-from flexroad.pipeline.run.status import stands
-from flexroad.pipeline.run.store_users import FOLDER, users
-from flexroad.pipeline.store.database import NAME as LEDGER
-from flexroad.pipeline.store.database import Ledger
-from flexroad.pipeline.store.products import plain_name
+from flexroad.pipeline.run.status import tile_statuses
+from flexroad.pipeline.run.store_users import FOLDER, runs_using
+from flexroad.pipeline.store.database import NAME as DATABASE
+from flexroad.pipeline.store.database import RunDatabase
+from flexroad.pipeline.store.products import safe_name
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import SUFFIXES
 
@@ -40,16 +40,16 @@ ARTEFACT = re.compile(r"([0-9a-f]{32})\.npz")
 
 
 @dataclass(frozen=True)
-class Waste:
+class Garbage:
     """A file that nobody needs."""
 
     kind: Kind
-    path: Place
+    path: Location
     size: int
 
 
 @contextlib.contextmanager
-def alone(run: Run, without: Sequence[Place], say: Callable[[str], None]) -> Iterator[list[Run]]:
+def exclusive(run: Run, without: Sequence[Location], say: Callable[[str], None]) -> Iterator[list[Run]]:
     """Keep every other run of this run's store from working meanwhile; give them all, this one first.
 
     Parameters
@@ -70,7 +70,7 @@ def alone(run: Run, without: Sequence[Place], say: Callable[[str], None]) -> Ite
             remedy = f"bring it back, or `flexroad clean {run.path} --forget {path}` if it is no more"
             if not exists(path / "run.json"):
                 raise ConfigError(f"{path} uses the store {run.store}, but is not there; {remedy}")
-            stack.enter_context(held(path, say))
+            stack.enter_context(run_lock(path, say))
             try:
                 runs.append(Run.open(path))
             except (CatalogError, ConfigError) as error:
@@ -80,7 +80,7 @@ def alone(run: Run, without: Sequence[Place], say: Callable[[str], None]) -> Ite
         yield [one for one in runs if _same(one.store, run.store)]
 
 
-def waste(runs: Sequence[Run]) -> Iterator[Waste]:
+def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
     """Yield what nobody needs in the store of these runs, and in the folder of the first one.
 
     Parameters
@@ -104,7 +104,7 @@ def waste(runs: Sequence[Run]) -> Iterator[Waste]:
             yield from _temporary(folder, {path.name: path.stat().st_size for path in files})
 
 
-def drop(found: Iterable[Waste]) -> Iterator[Waste]:
+def delete(found: Iterable[Garbage]) -> Iterator[Garbage]:
     """Remove the files, and folders that are empty then; yield each when it is gone."""
     for one in found:
         remove(one.path)
@@ -115,10 +115,10 @@ def drop(found: Iterable[Waste]) -> Iterator[Waste]:
                 one.path.parent.rmdir()
 
 
-def _others(run: Run, without: Sequence[Place]) -> list[Place]:
+def _others(run: Run, without: Sequence[Location]) -> list[Location]:
     """Return the other runs of the store."""
     try:
-        found = set(users(run.store))
+        found = set(runs_using(run.store))
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
             f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; mend or remove that file"
@@ -127,7 +127,7 @@ def _others(run: Run, without: Sequence[Place]) -> list[Place]:
     return sorted(left, key=str)
 
 
-def _same(one: Place, other: Place) -> bool:
+def _same(one: Location, other: Location) -> bool:
     return str(absolute(one)) == str(absolute(other))
 
 
@@ -136,27 +136,27 @@ def _needed(runs: Iterable[Run]) -> set[bytes]:
     needed: set[bytes] = set()
     for run in runs:
         check_models(run.config)
-        with Ledger.peek(run.path / LEDGER) as ledger:
-            for now in stands(run, ledger):
+        with RunDatabase.peek(run.path / DATABASE) as database:
+            for now in tile_statuses(run, database):
                 needed |= {bytes.fromhex(name) for name, node in now.graph.nodes.items() if node.stored}
     return needed
 
 
-def _in_store(store: Place, needed: set[bytes]) -> Iterator[Waste]:
+def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
     for stage in STAGE_NAMES:
         for folder, files in _folders(store / stage):
             yield from _temporary(folder, files)
             for name, size in files.items():
                 artefact = ARTEFACT.fullmatch(name)
                 if artefact and name[:2] == folder.name and bytes.fromhex(artefact[1]) not in needed:
-                    yield Waste("artefacts", folder / name, size)
+                    yield Garbage("artefacts", folder / name, size)
 
 
-def _in_tiles(run: Run) -> Iterator[Waste]:
-    known = {plain_name(tile.id): tile for tile in run.catalog.tiles}
+def _in_tiles(run: Run) -> Iterator[Garbage]:
+    known = {safe_name(tile.id): tile for tile in run.catalog.tiles}
     ends = _ends(run.config.export.variants, run.config.export.formats)
     ours = _ends(run.exported, SUFFIXES) | ends
-    with Ledger.peek(run.path / LEDGER) as ledger:
+    with RunDatabase.peek(run.path / DATABASE) as database:
         for folder, files in _folders(run.path / "tiles"):
             yield from _temporary(folder, files)
             made = [folder.name + end for end in sorted(ours) if folder.name + end in files]
@@ -164,11 +164,11 @@ def _in_tiles(run: Run) -> Iterator[Waste]:
             if tile is None:
                 # The markers last: a tile half dropped is found again.
                 markers = [name for name in (DONE, FAILED) if name in files]
-                yield from (Waste("tiles", folder / name, files[name]) for name in [*made, *markers])
-            elif entry := ledger.get(tile.id):
+                yield from (Garbage("tiles", folder / name, files[name]) for name in [*made, *markers])
+            elif entry := database.get(tile.id):
                 kept = {folder.name + end for end in ends} | entry.sizes.keys()
                 yield from (
-                    Waste("products", folder / name, files[name]) for name in made if name not in kept
+                    Garbage("products", folder / name, files[name]) for name in made if name not in kept
                 )
 
 
@@ -177,13 +177,13 @@ def _ends(variants: Iterable[str], formats: Iterable[str]) -> set[str]:
     return {f"_{variant}{end}" for variant in variants for kind in formats for end in SUFFIXES[kind]}
 
 
-def _temporary(folder: Place, files: dict[str, int]) -> Iterator[Waste]:
+def _temporary(folder: Location, files: dict[str, int]) -> Iterator[Garbage]:
     for name, size in files.items():
         if TEMPORARY.fullmatch(name):
-            yield Waste("temporary files", folder / name, size)
+            yield Garbage("temporary files", folder / name, size)
 
 
-def _folders(above: Place) -> Iterator[tuple[Place, dict[str, int]]]:
+def _folders(above: Location) -> Iterator[tuple[Location, dict[str, int]]]:
     """Yield the folders directly below one, with the sizes of their files; folder by folder on disk."""
     if isinstance(above, Path):
         names = sorted(path.name for path in above.iterdir() if path.is_dir()) if above.is_dir() else []

@@ -21,16 +21,16 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexroad.catalog.storage.paths import Place, read
+from flexroad.catalog.storage.paths import Location, read
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock_file import LockFile, OnDisk, Sight
+from flexroad.pipeline.run.lock_file import LockFile, LockStat, OnDisk
 
 NAME = "lock.json"
 TRIES = 20
 
 
 @dataclass(frozen=True)
-class Pace:
+class Heartbeat:
     """How often a holder gives a sign of life, and when others miss it."""
 
     beat_s: float = 30
@@ -38,7 +38,7 @@ class Pace:
 
 
 @dataclass(frozen=True)
-class Holder:
+class Owner:
     """A process that may hold a lock."""
 
     host: str
@@ -52,7 +52,7 @@ class Holder:
     token: str
 
     @classmethod
-    def me(cls) -> Holder:
+    def me(cls) -> Owner:
         """Return this process."""
         return cls(
             host=socket.gethostname(),
@@ -65,7 +65,7 @@ class Holder:
         )
 
     @classmethod
-    def of(cls, data: bytes) -> Holder | None:
+    def of(cls, data: bytes) -> Owner | None:
         """Return who wrote a lock, or None if it is damaged or half-written."""
         try:
             return cls(**json.loads(data))
@@ -77,7 +77,7 @@ class Holder:
         """The content of the lock."""
         return json.dumps(asdict(self), indent=1).encode()
 
-    def gone(self, here: Holder, started: Callable[[int], int | None]) -> str | None:
+    def gone(self, here: Owner, started: Callable[[int], int | None]) -> str | None:
         """Tell why this holder, on the machine of ``here``, no longer lives; None if it does."""
         if self.boot != here.boot:
             return f"{self.host} was restarted since"
@@ -89,22 +89,22 @@ class Holder:
         return None
 
 
-def dead(who: Holder) -> str | None:
+def death_of(who: Owner) -> str | None:
     """Tell why a holder is known to be dead: a process of this machine that is gone; None if it may live."""
-    here = Holder.me()
+    here = Owner.me()
     return who.gone(here, started) if (who.host, who.machine) == (here.host, here.machine) else None
 
 
-def at_work(who: Holder) -> str:
+def at_work(who: Owner) -> str:
     """Return a line about who holds a run's lock."""
-    why = dead(who)
+    why = death_of(who)
     name = f"pid {who.pid} on {who.host}"
     return f"{name} ended in the middle ({why})" if why else f"{name} at work since {who.since}"
 
 
 @contextlib.contextmanager
-def held(
-    run: Place, say: Callable[[str], None] = lambda line: None, pace: Pace | None = None
+def run_lock(
+    run: Location, say: Callable[[str], None] = lambda line: None, pace: Heartbeat | None = None
 ) -> Iterator[None]:
     """Hold a run folder's lock.
 
@@ -120,7 +120,7 @@ def held(
     ConfigError
         If another process holds it, or nothing can be written there.
     """
-    lock = _Lock(run, _file(run / NAME), Holder.me(), say, pace or Pace())
+    lock = _Lock(run, _file(run / NAME), Owner.me(), say, pace or Heartbeat())
     try:
         lock.take()
     except FileNotFoundError as error:
@@ -140,10 +140,10 @@ def held(
         lock.release()
 
 
-def holder(run: Place) -> Holder | None:
+def owner(run: Location) -> Owner | None:
     """Return who holds a run's lock, dead or alive, or None if nobody does; takes and writes nothing."""
     try:
-        return Holder.of(read(run / NAME))
+        return Owner.of(read(run / NAME))
     except OSError:
         return None
 
@@ -173,11 +173,11 @@ def _hidden(pid: int) -> int | None:
 
 @dataclass(frozen=True)
 class _Lock:
-    run: Place
+    run: Location
     file: LockFile
-    me: Holder
+    me: Owner
     say: Callable[[str], None]
-    pace: Pace
+    pace: Heartbeat
 
     def take(self) -> None:
         """Become the holder; of several that try at once, one does."""
@@ -190,7 +190,7 @@ class _Lock:
             if seen.data == self.me.data:
                 # The bucket's answer was lost, and what was asked again was refused.
                 return
-            who = Holder.of(seen.data)
+            who = Owner.of(seen.data)
             why = self._dead(who, seen)
             if why and self.file.replace(seen, self.me.data):
                 self.say(f"took over the lock of {_name(who)}: {why}")
@@ -212,7 +212,7 @@ class _Lock:
                 elif seen.data == self.me.data:
                     self.file.beat(seen)
                 else:
-                    self.say(f"{_name(Holder.of(seen.data))} took over the lock of {self.run}: this run ends")
+                    self.say(f"{_name(Owner.of(seen.data))} took over the lock of {self.run}: this run ends")
                     # Not the signal of Ctrl-C, to which background jobs are deaf.
                     os.kill(os.getpid(), signal.SIGTERM)
                     return
@@ -224,10 +224,10 @@ class _Lock:
             if seen is not None and seen.data == self.me.data:
                 self.file.remove(seen)
 
-    def _dead(self, who: Holder | None, seen: Sight) -> str | None:
+    def _dead(self, who: Owner | None, seen: LockStat) -> str | None:
         """Tell why a lock's holder counts as dead; None if it may live."""
         if who is not None and (who.host, who.machine) == (self.me.host, self.me.machine):
-            return dead(who)
+            return death_of(who)
         if abs(seen.age_s) <= self.pace.stale_s:
             return None
         watch_s = 1.5 * self.pace.beat_s
@@ -238,7 +238,7 @@ class _Lock:
             return None
         return f"no sign of life for {watch_s if seen.age_s < 0 else seen.age_s:.0f} s"
 
-    def _refusal(self, who: Holder | None, seen: Sight) -> str:
+    def _refusal(self, who: Owner | None, seen: LockStat) -> str:
         text = f"{self.run} is in use by {_name(who)}{f' since {who.since}' if who else ''}"
         if who is not None and (who.host, who.machine) == (self.me.host, self.me.machine):
             return f"{text}; wait for it, or end it with `kill {who.pid}`"
@@ -249,7 +249,7 @@ class _Lock:
         )
 
 
-def _file(path: Place) -> LockFile:
+def _file(path: Location) -> LockFile:
     if isinstance(path, Path):
         return OnDisk(path)
     from flexroad.pipeline.run.lock_object import InBucket
@@ -257,7 +257,7 @@ def _file(path: Place) -> LockFile:
     return InBucket(path)
 
 
-def _name(who: Holder | None) -> str:
+def _name(who: Owner | None) -> str:
     return f"pid {who.pid} on {who.host}" if who else "somebody unknown (it is damaged)"
 
 

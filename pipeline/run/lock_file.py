@@ -17,7 +17,7 @@ from flexroad.catalog.storage.paths import write
 
 
 @dataclass(frozen=True)
-class Sight:
+class LockStat:
     """A lock as it was seen."""
 
     data: bytes
@@ -35,16 +35,16 @@ class LockFile(Protocol):
     def create(self, data: bytes) -> bool:
         """Make it; False if there is one."""
 
-    def look(self) -> Sight | None:
+    def look(self) -> LockStat | None:
         """Return it, or None if there is none."""
 
-    def replace(self, seen: Sight, data: bytes) -> bool:
+    def replace(self, seen: LockStat, data: bytes) -> bool:
         """Put another in its place; False if it is no longer the one seen."""
 
-    def beat(self, seen: Sight) -> None:
+    def beat(self, seen: LockStat) -> None:
         """Renew its time."""
 
-    def remove(self, seen: Sight) -> None:
+    def remove(self, seen: LockStat) -> None:
         """Take it away if it is still the one seen."""
 
 
@@ -68,7 +68,7 @@ class OnDisk:
             raise
         return True
 
-    def look(self) -> Sight | None:
+    def look(self) -> LockStat | None:
         """Return it, or None if there is none."""
         try:
             with self.path.open("rb") as file:
@@ -79,9 +79,9 @@ class OnDisk:
         # On a full disk no age can be told: others' locks count as young, and one's own is given back.
         with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=self.path.parent) as probe:
             age_s = os.fstat(probe.fileno()).st_mtime - written
-        return Sight(data, written, age_s)
+        return LockStat(data, written, age_s)
 
-    def replace(self, seen: Sight, data: bytes) -> bool:
+    def replace(self, seen: LockStat, data: bytes) -> bool:
         """Put another in its place; False if it is no longer the one seen."""
         with contextlib.ExitStack() as stack:
             same = self._guarded(stack, seen)
@@ -89,18 +89,18 @@ class OnDisk:
                 write(self.path, data)
         return same
 
-    def beat(self, seen: Sight) -> None:
+    def beat(self, seen: LockStat) -> None:
         """Renew its time."""
         # Without a time of ours, a network's server takes its own.
         os.utime(self.path)
 
-    def remove(self, seen: Sight) -> None:
+    def remove(self, seen: LockStat) -> None:
         """Take it away if it is still the one seen."""
         with contextlib.ExitStack() as stack:
             if self._guarded(stack, seen):
                 self.path.unlink()
 
-    def _guarded(self, stack: contextlib.ExitStack, seen: Sight) -> bool:
+    def _guarded(self, stack: contextlib.ExitStack, seen: LockStat) -> bool:
         """Keep others from replacing this very file for a moment; tell whether it is the one seen."""
         try:
             file = stack.enter_context(self.path.open("rb+"))

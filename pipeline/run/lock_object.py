@@ -10,7 +10,7 @@ from typing import Any
 from upath import UPath
 
 from flexroad.catalog.storage.paths import named, read, remove
-from flexroad.pipeline.run.lock_file import Sight
+from flexroad.pipeline.run.lock_file import LockStat
 
 REFUSED = (409, 412)
 """Answers to a conditional request: another came in between, a condition not met."""
@@ -29,7 +29,7 @@ class InBucket:
         except FileNotFoundError as error:
             raise OSError(errno.EIO, "there is no such bucket", str(self.path)) from error
 
-    def look(self) -> Sight | None:
+    def look(self) -> LockStat | None:
         """Return it, or None if there is none."""
         bucket, key, _ = self.path.fs.split_path(self.path.path)
         try:
@@ -41,17 +41,17 @@ class InBucket:
         written = head["LastModified"].timestamp()
         # Every answer tells the server's own time.
         now = parsedate_to_datetime(head["ResponseMetadata"]["HTTPHeaders"]["date"]).timestamp()
-        return Sight(data, written, now - written, head["ETag"])
+        return LockStat(data, written, now - written, head["ETag"])
 
-    def replace(self, seen: Sight, data: bytes) -> bool:
+    def replace(self, seen: LockStat, data: bytes) -> bool:
         """Put another in its place; False if it is no longer the one seen."""
         return self._put(data, (404, *REFUSED), IfMatch=seen.version)
 
-    def beat(self, seen: Sight) -> None:
+    def beat(self, seen: LockStat) -> None:
         """Renew its time."""
         self.replace(seen, seen.data)
 
-    def remove(self, seen: Sight) -> None:
+    def remove(self, seen: LockStat) -> None:
         """Take it away, seen a moment ago."""
         # Not every storage knows conditions on that; only who was silent for minutes can have lost it since.
         remove(self.path)

@@ -27,11 +27,11 @@ import yaml
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.storage.paths import (
-    Place,
-    Sightings,
+    Location,
+    StatCache,
     absolute,
     is_remote,
-    place,
+    parse_location,
     read,
     stat,
     write,
@@ -39,13 +39,13 @@ from flexroad.catalog.storage.paths import (
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.graph import Look, Pattern, Recorded, TileGraph
+from flexroad.pipeline.graph.graph import Pattern, Recorded, Stat, TileGraph
 from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store.artefacts import check_writable
-from flexroad.pipeline.store.products import TileFolder
-from flexroad.pipeline.worker.tile import Job
+from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.worker.tile import TileJob
 
 PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "dask", "torch")
 
@@ -54,10 +54,10 @@ PACKAGES = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "das
 class Run:
     """An opened run folder."""
 
-    path: Place
+    path: Location
     config: Config
     catalog: Catalog
-    store: Place
+    store: Location
     origin: tuple[float, float]
     """Whole-metre (easting, northing) all meshes are placed against; fixed when the run is made."""
     checksum: bool
@@ -70,10 +70,10 @@ class Run:
     @classmethod
     def create(
         cls,
-        path: Place,
+        path: Location,
         config: Config,
         catalog: Catalog,
-        store: Place | None = None,
+        store: Location | None = None,
         checksum: bool = False,
         allowed: Sequence[str] = (),
     ) -> Run:
@@ -88,7 +88,7 @@ class Run:
         old = _record(path)
         # Meshes of before are placed against it: the last summary has it, too.
         origin = (old or read_summary(path)).get("origin") or _origin(catalog)
-        store = store or (place(old["store"]) if old and old["shared_store"] else path / "store")
+        store = store or (parse_location(old["store"]) if old and old["shared_store"] else path / "store")
         exported = _exported(old, config)
         place_of = (origin[0], origin[1])
         run = cls(path, config, catalog, store, place_of, checksum, versions(), tuple(allowed), exported)
@@ -104,7 +104,7 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, path: Place | str) -> Run:
+    def open(cls, path: Location | str) -> Run:
         """Open a run made before, with its configuration and catalog as they are now.
 
         Raises
@@ -114,13 +114,13 @@ class Run:
         CatalogError
             If its catalog is damaged.
         """
-        path = place(path)
+        path = parse_location(path)
         found = _record(path)
         if found is None:
             raise ConfigError(
                 f"{path} is no run: it has no sound run.json; make one with `flexroad run --out {path}`"
             )
-        store = place(found["store"]) if found["shared_store"] else path / "store"
+        store = parse_location(found["store"]) if found["shared_store"] else path / "store"
         config = _config(path / "config.yaml").model_copy(update={"name": found["config"]})
         catalog = Catalog.read(path / "catalog.parquet")
         origin = (found["origin"][0], found["origin"][1])
@@ -141,23 +141,23 @@ class Run:
         """What the graphs of all tiles have in common."""
         return Pattern.of(self.config)
 
-    def graph(self, tile: Tile, look: Look = stat, recorded: Recorded = ()) -> TileGraph:
+    def graph(self, tile: Tile, look: Stat = stat, recorded: Recorded = ()) -> TileGraph:
         """Return the graph of a tile, as configuration and sources are now (`Pattern.graph`)."""
         return self.pattern.graph(tile, self.checksum, look, recorded)
 
-    def sightings(self) -> Look:
+    def sightings(self) -> Stat:
         """Return what looks at many sources: those of a bucket by a list of each folder, once."""
-        many = Sightings()
+        many = StatCache()
         # On disk a look costs next to nothing, and late is better than early.
         return lambda file: many(file) if is_remote(file) else stat(file)
 
-    def job(self, graph: TileGraph, anew: frozenset[str] = frozenset()) -> Job:
+    def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return what a worker needs to do one tile."""
-        return Job(graph, str(absolute(self.path)), str(absolute(self.store)), self.origin, anew)
+        return TileJob(graph, str(absolute(self.path)), str(absolute(self.store)), self.origin, force)
 
-    def folder(self, tile_id: str) -> TileFolder:
+    def folder(self, tile_id: str) -> TileProducts:
         """Return where a tile's products are."""
-        return TileFolder.of(self.path, tile_id)
+        return TileProducts.of(self.path, tile_id)
 
     def _write(self) -> None:
         write(self.path / "config.yaml", yaml.safe_dump(self.config.raw, sort_keys=False).encode())
@@ -217,7 +217,7 @@ def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*before, *config.export.variants]))
 
 
-def _config(where: Place) -> Config:
+def _config(where: Location) -> Config:
     seen = stat(where)
     if seen is not None and not seen.size:
         # It would be read as one that changes no default.
@@ -227,7 +227,7 @@ def _config(where: Place) -> Config:
     return compose(yaml.safe_load(read(where)), str(where))
 
 
-def _record(run: Place) -> dict[str, Any] | None:
+def _record(run: Location) -> dict[str, Any] | None:
     """Return what run.json holds, or None if it is not there or damaged."""
     try:
         found: dict[str, Any] = json.loads(read(run / "run.json"))

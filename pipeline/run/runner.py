@@ -13,21 +13,21 @@ from flexroad.catalog import Tile
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.graph import TileGraph, any_gone
-from flexroad.pipeline.run.event_log import Journal
+from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_models
-from flexroad.pipeline.run.status import stands
+from flexroad.pipeline.run.status import tile_statuses
 from flexroad.pipeline.run.summary import Summary, summarise, write_summary
 from flexroad.pipeline.store.artefacts import check_writable
-from flexroad.pipeline.store.database import NAME as LEDGER
-from flexroad.pipeline.store.database import Ledger, Standing
+from flexroad.pipeline.store.database import NAME as DATABASE
+from flexroad.pipeline.store.database import RunDatabase, TileState
 from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.store.tables import write_tables
 from flexroad.pipeline.worker.profiling import now
-from flexroad.pipeline.worker.tile import Job, TileResult, do_tile, failed_row, give_up
+from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row, process_tile, record_failure
 
 
 @dataclass(frozen=True)
-class Stock:
+class Plan:
     """What a run has to do, and what became of its tiles since the last one."""
 
     todo: array[int]
@@ -37,11 +37,11 @@ class Stock:
     vanished: int
 
 
-def execute(
+def run_tiles(
     run: Run,
     executor: Executor,
     only: Callable[[Tile], bool] = lambda tile: True,
-    anew: frozenset[str] = frozenset(),
+    force: frozenset[str] = frozenset(),
     watch: Callable[[TileResult], None] = lambda result: None,
     verify: bool = False,
 ) -> Summary:
@@ -63,18 +63,18 @@ def execute(
     ConfigError
         If a model is missing, or each of several tiles lacks a file.
     OSError
-        If the ledger or the tables cannot be written, as on a full disk.
+        If the database or the tables cannot be written, as on a full disk.
     """
     check_models(run.config)
-    with Ledger.open(run.path / LEDGER) as ledger, Journal(run.path) as journal:
+    with RunDatabase.open(run.path / DATABASE) as database, EventLog(run.path) as journal:
         journal.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
-        close = partial(_close, run, ledger, journal, now(), time.perf_counter())
+        close = partial(_close, run, database, journal, now(), time.perf_counter())
         stock = None
         try:
-            stock = take_stock(run, ledger, only, anew, watch, verify)
-            with contextlib.closing(_results(run, executor, ledger, _jobs(run, stock, anew))) as results:
+            stock = plan_run(run, database, only, force, watch, verify)
+            with contextlib.closing(_results(run, executor, database, _jobs(run, stock, force))) as results:
                 for result in results:
-                    ledger.record(result.entry)
+                    database.record(result.entry)
                     journal.tile(result)
                     watch(result)
         except BaseException as error:
@@ -84,45 +84,45 @@ def execute(
         return close(stock)
 
 
-def take_stock(
+def plan_run(
     run: Run,
-    ledger: Ledger,
+    database: RunDatabase,
     only: Callable[[Tile], bool],
-    anew: frozenset[str],
+    force: frozenset[str],
     watch: Callable[[TileResult], None],
     verify: bool,
-) -> Stock:
-    """Look at every tile once, bring the ledger up to date, and tell what there is to do.
+) -> Plan:
+    """Look at every tile once, bring the database up to date, and tell what there is to do.
 
     Raises
     ------
     ConfigError
         If each of several tiles lacks a file.
     """
-    todo, standings, new, changed, gone = array("L"), list[Standing](), 0, 0, 0
-    for position, found in enumerate(stands(run, ledger)):
+    todo, standings, new, changed, gone = array("L"), list[TileState](), 0, 0, 0
+    for position, found in enumerate(tile_statuses(run, database)):
         gone += any_gone(found.graph)
         wanted = only(found.graph.tile)
         if wanted and verify and found.done and not run.folder(found.graph.tile.id).verified():
-            found = replace(found, current=False)
-        new += found.known is None
-        changed += found.known is not None and not found.current
-        standing: Standing = "done" if found.done else "failed" if found.failed else "pending"
-        if found.known and found.unknown:
-            ledger.record(found.known)
-        if found.known and wanted and found.done and found.fresh and not anew:
+            found = replace(found, up_to_date=False)
+        new += found.last_record is None
+        changed += found.last_record is not None and not found.up_to_date
+        standing: TileState = "done" if found.done else "failed" if found.failed else "pending"
+        if found.last_record and found.from_marker:
+            database.record(found.last_record)
+        if found.last_record and wanted and found.done and found.sources_present and not force:
             standing = "cached"
-            watch(TileResult(found.known, "cached"))
+            watch(TileResult(found.last_record, "cached"))
         elif wanted:
             todo.append(position)
         standings.append(standing)
     if gone == len(run.catalog.tiles) > 1:
         # Not to be told by each tile, whose results would be lost by it.
         raise ConfigError(_nothing_there(run, found.graph))
-    ledger.flush()
+    database.flush()
     names = (tile.id for tile in run.catalog.tiles)
-    vanished = ledger.ask(zip(names, standings, strict=True))
-    return Stock(todo, new, changed, vanished)
+    vanished = database.ask(zip(names, standings, strict=True))
+    return Plan(todo, new, changed, vanished)
 
 
 def _nothing_there(run: Run, graph: TileGraph) -> str:
@@ -133,25 +133,25 @@ def _nothing_there(run: Run, graph: TileGraph) -> str:
     )
 
 
-def _jobs(run: Run, stock: Stock, anew: frozenset[str]) -> Iterator[Job]:
+def _jobs(run: Run, stock: Plan, force: frozenset[str]) -> Iterator[TileJob]:
     look = run.sightings()
     for position in stock.todo:
         # Made a second time: thousands kept since the stocktaking would fill the memory, and be old by now.
-        yield run.job(run.graph(run.catalog.tiles[position], look), anew)
+        yield run.job(run.graph(run.catalog.tiles[position], look), force)
 
 
 def _results(
-    run: Run, executor: Executor, ledger: Ledger, jobs: Iterator[Job]
+    run: Run, executor: Executor, database: RunDatabase, jobs: Iterator[TileJob]
 ) -> Generator[TileResult, None, None]:
     """Yield what tiles come to; at the end record those that got done although nobody heard of it."""
     flying: dict[str, Tile] = {}
 
-    def noted() -> Iterator[Job]:
+    def noted() -> Iterator[TileJob]:
         for job in jobs:
             flying[job.graph.tile.id] = job.graph.tile
             yield job
 
-    found = executor.map(do_tile, noted(), _lost, partial(check_writable, run.store))
+    found = executor.map(process_tile, noted(), _lost, partial(check_writable, run.store))
     try:
         for result in found:
             flying.pop(result.tile_id)
@@ -159,27 +159,27 @@ def _results(
     finally:
         # Interrupted: first nobody works any more, then what lies there counts.
         found.close()
-        for stand in stands(run, ledger, flying.values()):
-            if stand.known and stand.unknown:
-                ledger.record(stand.known)
+        for stand in tile_statuses(run, database, flying.values()):
+            if stand.last_record and stand.from_marker:
+                database.record(stand.last_record)
 
 
 def _close(
     run: Run,
-    ledger: Ledger,
-    journal: Journal,
+    database: RunDatabase,
+    journal: EventLog,
     start: str,
     began: float,
-    stock: Stock | None,
+    stock: Plan | None,
     error: BaseException | None = None,
 ) -> Summary:
     """Write the tables and the summary, as far as the run came."""
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
-    how = replace(summarise(len(run.catalog.tiles), ledger), interrupted=interrupted, refused=refused)
+    how = replace(summarise(len(run.catalog.tiles), database), interrupted=interrupted, refused=refused)
     if stock:
         how = replace(how, new=stock.new, changed=stock.changed, vanished=stock.vanished)
-        write_tables(run.path, ledger.rows(), ledger.failures())
+        write_tables(run.path, database.rows(), database.failures())
     how = replace(how, seconds=round(time.perf_counter() - began, 3))
     journal.note("end", **{name: value for name, value in asdict(how).items() if name != "failures"})
     about = {"start": start, "end": now(), "config": run.config.name, "origin": list(run.origin)}
@@ -187,9 +187,9 @@ def _close(
     return how
 
 
-def _lost(job: Job, why: str) -> TileResult:
+def _lost(job: TileJob, why: str) -> TileResult:
     """Make the failed result of a tile whose worker died."""
     graph = job.graph
     failure = Failure(graph.tile.id, "worker", "WorkerDied", why)
     rows = [failed_row(graph, variant, failure.line) for variant in graph.variants]
-    return TileResult(give_up(job, rows, [failure]), "failed")
+    return TileResult(record_failure(job, rows, [failure]), "failed")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.storage.paths import (
-    Place,
+    Location,
     exists,
 )
 from flexroad.pipeline.run.record import Run
@@ -14,7 +14,7 @@ from flexroad.pipeline.run.status import Folders
 from flexroad.pipeline.store.records import FAILED
 
 
-def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
+def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
     """Return which tiles a rerun means: those named, those failed, both, or all.
 
     Raises
@@ -34,7 +34,7 @@ def select(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], boo
     return chosen
 
 
-def asked(path: Place, whole: Catalog, wanted: Catalog) -> Catalog:
+def merged_catalog(path: Location, whole: Catalog, wanted: Catalog) -> Catalog:
     """Return the tiles a run is about when some tiles of a catalog are asked for.
 
     Those, and those it was asked for before that the catalog still has: their results stay in the tables.

@@ -6,12 +6,21 @@ import hashlib
 import json
 from collections.abc import Iterator
 
-from flexroad.catalog.storage.paths import Place, absolute, exists, listing, place, read, remove, write
+from flexroad.catalog.storage.paths import (
+    Location,
+    absolute,
+    exists,
+    listing,
+    parse_location,
+    read,
+    remove,
+    write,
+)
 
 FOLDER = "runs"
 
 
-def register(store: Place, run: Place) -> None:
+def register(store: Location, run: Location) -> None:
     """Write down that a run uses its store; of a store in its own folder it goes without saying.
 
     Raises
@@ -25,7 +34,7 @@ def register(store: Place, run: Place) -> None:
             write(path, json.dumps({"run": str(absolute(run))}).encode())
 
 
-def users(store: Place) -> Iterator[Place]:
+def runs_using(store: Location) -> Iterator[Location]:
     """Yield the folders of the runs that use a store, as far as they were written down.
 
     Raises
@@ -38,10 +47,10 @@ def users(store: Place) -> Iterator[Place]:
         yield absolute(store.parent)
     for name in sorted(listing(store / FOLDER)):
         if name.endswith(".json") and not name.startswith("."):
-            yield place(json.loads(read(store / FOLDER / name))["run"])
+            yield parse_location(json.loads(read(store / FOLDER / name))["run"])
 
 
-def forget(store: Place, run: Place) -> bool:
+def unregister(store: Location, run: Location) -> bool:
     """Take a run from those that use a store; tell whether it was among them."""
     path = _entry(store, run)
     known = exists(path)
@@ -49,6 +58,6 @@ def forget(store: Place, run: Place) -> bool:
     return known
 
 
-def _entry(store: Place, run: Place) -> Place:
+def _entry(store: Location, run: Location) -> Location:
     name = hashlib.sha256(str(absolute(run)).encode()).hexdigest()[:16]
     return store / FOLDER / f"{name}.json"

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Any
 
-from flexroad.catalog.storage.paths import Place, read, write
-from flexroad.pipeline.store.database import Ledger
+from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.pipeline.store.database import RunDatabase
 from flexroad.pipeline.store.records import Failure
 
 NAME = "summary.json"
@@ -52,16 +52,16 @@ class Summary:
         return 2 if self.refused else int(self.failed + self.pending > 0)
 
 
-def summarise(tiles: int, ledger: Ledger) -> Summary:
-    """Return how the tiles stand by the ledger, without another look at them."""
-    counts = ledger.counts()
+def summarise(tiles: int, database: RunDatabase) -> Summary:
+    """Return how the tiles stand by the database, without another look at them."""
+    counts = database.counts()
     done = counts["done"] + counts["cached"]
-    failures = tuple(islice(ledger.failures(), MOST_TOLD))
+    failures = tuple(islice(database.failures(), MOST_TOLD))
     left = tiles - done - counts["failed"]
     return Summary(tiles, done, counts["failed"], counts["cached"], left, failures=failures)
 
 
-def write_summary(run: Place, how: Summary, **about: Any) -> None:
+def write_summary(run: Location, how: Summary, **about: Any) -> None:
     """Write summary.json: the figures, and what is given about the run beside them.
 
     Raises
@@ -79,7 +79,7 @@ def write_summary(run: Place, how: Summary, **about: Any) -> None:
     write(run / NAME, json.dumps(told, indent=1).encode())
 
 
-def read_summary(run: Place) -> dict[str, Any]:
+def read_summary(run: Location) -> dict[str, Any]:
     """Return what summary.json holds; nothing if there is no sound one."""
     with contextlib.suppress(OSError, ValueError):
         found = json.loads(read(run / NAME))

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
 
@@ -27,10 +27,10 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFil
 
 
 @dataclass(frozen=True)
-class Store:
+class ArtefactStore:
     """Results of stages by fingerprint; may be shared by runs."""
 
-    root: Place
+    root: Location
 
     def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
         """Return a result and what each stage up to it took, or None if it is not there or damaged."""
@@ -50,11 +50,11 @@ class Store:
         """Tell whether a result is there, unread."""
         return paths.exists(self._path(node))
 
-    def _path(self, node: Node) -> Place:
+    def _path(self, node: Node) -> Location:
         return self.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
 
 
-def check_writable(folder: Place) -> None:
+def check_writable(folder: Location) -> None:
     """Fail early if nothing can be written below ``folder``.
 
     Raises

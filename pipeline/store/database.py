@@ -1,11 +1,11 @@
-"""What is known of all tiles of a run, in one file that answers at once: ``RUN/ledger.sqlite``.
+"""What is known of all tiles of a run, in one file that answers at once: ``RUN/database.sqlite``.
 
-A cache of the tiles' markers, which stay the truth: a ledger that is missing, damaged or of another version
+A cache of the tiles' markers, which stay the truth: a database that is missing, damaged or of another version
 begins empty, and a tile without an entry, or whose marker is not the one the entry was read from, is looked
 up in its folder. One run writes; others may read meanwhile. Everything is read in pages, so that nobody holds
 the file for long, nor much of it in memory. ::
 
-    entry   one line per tile that was ever tried: `Entry`
+    entry   one line per tile that was ever tried: `TileRecord`
     asked   the tiles of the catalog, in its order, and how each stands
 """
 
@@ -23,13 +23,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-from flexroad.catalog.storage.paths import Place
-from flexroad.catalog.storage.staging import Mirror
-from flexroad.pipeline.store.records import Entry, Failure, Row
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.staging import StagedFile
+from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord
 
-NAME = "ledger.sqlite"
+NAME = "database.sqlite"
 VERSION = 1
-Standing = Literal["cached", "done", "failed", "pending"]
+TileState = Literal["cached", "done", "failed", "pending"]
 """Cached: found done by the last run. Pending: no result of the files and options as they are."""
 
 PAGE = 500
@@ -45,25 +45,25 @@ PRAGMA user_version = {VERSION};
 """
 
 
-class Ledger:
+class RunDatabase:
     """Entries by tile; use it as a context, so that what waits is written at the end."""
 
-    def __init__(self, connection: sqlite3.Connection, mirror: Mirror) -> None:
+    def __init__(self, connection: sqlite3.Connection, mirror: StagedFile) -> None:
         self._connection = connection
-        self._mirror = mirror
-        self._waiting: dict[str, Entry] = {}
+        self._staged = mirror
+        self._waiting: dict[str, TileRecord] = {}
         self._flushed = time.monotonic()
 
     @classmethod
-    def open(cls, where: Place) -> Ledger:
-        """Open a ledger to write, empty if there is no sound one.
+    def open(cls, where: Location) -> RunDatabase:
+        """Open a database to write, empty if there is no sound one.
 
         Raises
         ------
         OSError
             If it cannot be written.
         """
-        mirror = Mirror(where)
+        mirror = StagedFile(where)
         mirror.fetch()
         try:
             connection = _sound(mirror.path, "rwc")
@@ -76,9 +76,9 @@ class Ledger:
         return cls(connection, mirror)
 
     @classmethod
-    def peek(cls, where: Place) -> Ledger:
-        """Open a ledger to read only, also while a run writes it; an empty one if there is no sound one."""
-        mirror = Mirror(where, mine=False)
+    def peek(cls, where: Location) -> RunDatabase:
+        """Open a database to read only, also while a run writes it; an empty one if there is no sound one."""
+        mirror = StagedFile(where, writable=False)
         mirror.fetch()
         connection = None
         with contextlib.suppress(sqlite3.Error):
@@ -88,7 +88,7 @@ class Ledger:
             connection.executescript(SCHEMA)
         return cls(connection, mirror)
 
-    def __enter__(self) -> Ledger:
+    def __enter__(self) -> RunDatabase:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -105,12 +105,12 @@ class Ledger:
         try:
             self.flush()
             self._connection.close()
-            self._mirror.put()
+            self._staged.put()
         finally:
             self._connection.close()
-            self._mirror.close()
+            self._staged.close()
 
-    def ask(self, tiles: Iterable[tuple[str, Standing]]) -> int:
+    def ask(self, tiles: Iterable[tuple[str, TileState]]) -> int:
         """Set which tiles there are, in the catalog's order, and how each stands.
 
         Returns
@@ -132,14 +132,14 @@ class Ledger:
             gone = self._connection.execute("DELETE FROM entry WHERE tile NOT IN (SELECT tile FROM asked)")
         return gone.rowcount
 
-    def record(self, entry: Entry) -> None:
+    def record(self, entry: TileRecord) -> None:
         """Keep how a tile went; written within seconds, or as soon as there is room on the disk."""
         self._waiting[entry.tile_id] = entry
         if time.monotonic() - self._flushed > FLUSH_S:
             # On a full disk the tiles go on; what waits is tried again.
             with contextlib.suppress(OSError):
                 self.flush()
-                self._mirror.tick()
+                self._staged.sync_if_due()
 
     def flush(self) -> None:
         """Write what waits.
@@ -164,14 +164,14 @@ class Ledger:
             )
         self._waiting.clear()
 
-    def get(self, tile_id: str) -> Entry | None:
+    def get(self, tile_id: str) -> TileRecord | None:
         """Return what is known of a tile."""
         if tile_id in self._waiting:
             return self._waiting[tile_id]
         line = self._line(f"SELECT {FIELDS} FROM entry WHERE tile = ?", tile_id)
         return _from_line(line) if line else None
 
-    def counts(self) -> Counter[Standing]:
+    def counts(self) -> Counter[TileState]:
         """Return how many tiles of the catalog stand how, as the last run knows."""
         self.flush()
         return Counter(
@@ -184,12 +184,12 @@ class Ledger:
         line = self._line("SELECT count(*) FROM entry WHERE finished >= ?", when)
         return int(line[0]) if line else 0
 
-    def standing(self, tile_id: str) -> Standing | None:
+    def standing(self, tile_id: str) -> TileState | None:
         """Return how a tile stood when the last run looked at it, None if it was not asked for."""
         line = self._line("SELECT standing FROM asked WHERE tile = ?", tile_id)
         return line[0] if line else None
 
-    def entries(self) -> Iterator[tuple[str, Standing, Entry | None]]:
+    def entries(self) -> Iterator[tuple[str, TileState, TileRecord | None]]:
         """Yield every tile of the catalog in its order: id, how it stands, and what is known of it."""
         fields = ", ".join(f"entry.{name.strip()}" for name in FIELDS.split(","))
         for _, tile, standing, *line in self._pages(
@@ -198,7 +198,7 @@ class Ledger:
         ):
             yield tile, standing, _from_line(line) if line[0] else None
 
-    def rows(self) -> Iterator[Row]:
+    def rows(self) -> Iterator[MetricsRow]:
         """Yield the rows of all tiles that were tried as they are now, in the catalog's order."""
         for _, rows in self._pages(
             "SELECT position, rows FROM asked JOIN entry USING (tile)"
@@ -237,7 +237,7 @@ class Ledger:
             with self._connection:
                 yield
         except sqlite3.Error as error:
-            raise _os_error(error, self._mirror.where) from error
+            raise _os_error(error, self._staged.where) from error
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
@@ -245,7 +245,7 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
 
 
 def _sound(path: Path, mode: str, thorough: bool = True) -> sqlite3.Connection | None:
-    """Return a connection to a ledger that is there, of this version and, on a thorough look, whole."""
+    """Return a connection to a database that is there, of this version and, on a thorough look, whole."""
     if not path.exists():
         return None
     connection = _connect(path, mode)
@@ -268,13 +268,13 @@ def _damaged(connection: sqlite3.Connection) -> bool:
     return bool(check != "ok")
 
 
-def _os_error(error: sqlite3.Error, where: Place) -> OSError:
+def _os_error(error: sqlite3.Error, where: Location) -> OSError:
     full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
     number, why = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
     return OSError(number, why, str(where))
 
 
-def _to_line(entry: Entry) -> tuple[Any, ...]:
+def _to_line(entry: TileRecord) -> tuple[Any, ...]:
     return (
         entry.tile_id,
         entry.state,
@@ -289,10 +289,10 @@ def _to_line(entry: Entry) -> tuple[Any, ...]:
     )
 
 
-def _from_line(line: Sequence[Any]) -> Entry:
+def _from_line(line: Sequence[Any]) -> TileRecord:
     tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker = line
     found = json.loads(marker)
-    return Entry(
+    return TileRecord(
         tile,
         state,
         fingerprint,

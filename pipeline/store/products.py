@@ -10,20 +10,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import TileGraph
 
 
 @dataclass(frozen=True)
-class TileFolder:
+class TileProducts:
     """The products of one tile in a run, and the marker that says they are whole."""
 
-    path: Place
+    path: Location
 
     @classmethod
-    def of(cls, run: Place, tile_id: str) -> TileFolder:
+    def of(cls, run: Location, tile_id: str) -> TileProducts:
         """Return the tile's folder in a run."""
-        return cls(run / "tiles" / plain_name(tile_id))
+        return cls(run / "tiles" / safe_name(tile_id))
 
     def done(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return the tile's item if it is done as the graph asks and its products are there."""
@@ -74,7 +74,7 @@ class TileFolder:
         return found if isinstance(found, dict) else None
 
 
-def plain_name(tile_id: str) -> str:
+def safe_name(tile_id: str) -> str:
     """Return what folders and files of a tile are called: its id, or one like it that makes a file name."""
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
     return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-Row = dict[str, Any]
+MetricsRow = dict[str, Any]
 State = Literal["done", "failed"]
-Marker = tuple[str, int, int | str]
+MarkerStat = tuple[str, int, int | str]
 """Name, size and version (time or ETag) of the file that an entry was read from, or written to."""
 
 DONE, FAILED = "item.json", "failed.json"
@@ -38,14 +38,14 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Entry:
+class TileRecord:
     """How a tile went when it was last tried."""
 
     tile_id: str
     state: State
     fingerprint: str
     """Of the graph that was carried out."""
-    rows: tuple[Row, ...]
+    rows: tuple[MetricsRow, ...]
     failures: tuple[Failure, ...] = ()
     sources: list[Any] = field(default_factory=list)
     """The source layers as `TileGraph.sources` named them."""
@@ -55,11 +55,11 @@ class Entry:
     """When, as ISO 8601 in UTC."""
     seconds: float = 0.0
     """What computing it took, in the worker."""
-    marker: Marker | None = None
+    marker: MarkerStat | None = None
     """None where none could be written, as on a full disk."""
 
 
-def from_item(item: dict[str, Any], marker: Marker | None) -> Entry:
+def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
     """Return what a STAC item of a finished tile says.
 
     Raises
@@ -68,7 +68,7 @@ def from_item(item: dict[str, Any], marker: Marker | None) -> Entry:
         If it is damaged: a marker without its rows is, whatever else it holds.
     """
     told = item["properties"]
-    return Entry(
+    return TileRecord(
         item["id"],
         "done",
         told["flexroad:fingerprint"],
@@ -81,7 +81,7 @@ def from_item(item: dict[str, Any], marker: Marker | None) -> Entry:
     )
 
 
-def to_failed(entry: Entry) -> dict[str, Any]:
+def to_failed(entry: TileRecord) -> dict[str, Any]:
     """Return what failed.json holds."""
     return {
         "tile": entry.tile_id,
@@ -93,7 +93,7 @@ def to_failed(entry: Entry) -> dict[str, Any]:
     }
 
 
-def from_failed(found: dict[str, Any], marker: Marker | None) -> Entry:
+def from_failed(found: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
     """Return what failed.json says.
 
     Raises
@@ -101,7 +101,7 @@ def from_failed(found: dict[str, Any], marker: Marker | None) -> Entry:
     KeyError, TypeError
         If it is damaged.
     """
-    return Entry(
+    return TileRecord(
         found["tile"],
         "failed",
         found["fingerprint"],

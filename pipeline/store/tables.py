@@ -9,10 +9,10 @@ from itertools import islice
 
 import pandas as pd
 
-from flexroad.catalog.storage.paths import Place, exists, read
-from flexroad.catalog.storage.staging import whole
+from flexroad.catalog.storage.paths import Location, exists, read
+from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.store.records import Failure, Row
+from flexroad.pipeline.store.records import Failure, MetricsRow
 
 PIECE = 10_000
 """Rows held at a time; also the table's row groups."""
@@ -50,20 +50,20 @@ COLUMNS: dict[str, str] = {
     "off_dtm_m": "float64",
     "off_dtm_road": "float64",
     "bounded_weights": "float64",
-    "doubt_m": "float64",
-    "doubted_m2": "float64",
+    "error_estimate_m": "float64",
+    "suspect_m2": "float64",
     "flags": "str",
 }
 """Columns of metrics.parquet and their types; the fixed ones first."""
 
 
-def metrics_frame(rows: Sequence[Row]) -> pd.DataFrame:
+def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
     """Return the rows as a table with the fixed columns."""
     frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
     return frame.astype(COLUMNS)
 
 
-def write_tables(run: Place, rows: Iterable[Row], failures: Iterable[Failure]) -> None:
+def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure]) -> None:
     """Write metrics.parquet and failures.csv, piece by piece.
 
     Raises
@@ -75,23 +75,23 @@ def write_tables(run: Place, rows: Iterable[Row], failures: Iterable[Failure]) -
     import pyarrow.parquet as pq
 
     schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
-    with whole(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
+    with atomic_file(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
         for piece in _pieces(rows):
             table.write_table(pa.Table.from_pandas(metrics_frame(piece), schema, preserve_index=False))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
-    with whole(run / "failures.csv") as path, path.open("w", newline="") as file:
+    with atomic_file(run / "failures.csv") as path, path.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(names)
         lines.writerows([getattr(failure, name) for name in names] for failure in failures)
 
 
-def _pieces(rows: Iterable[Row]) -> Iterator[list[Row]]:
+def _pieces(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
     left = iter(rows)
     while piece := list(islice(left, PIECE)):
         yield piece
 
 
-def read_metrics(run: Place) -> pd.DataFrame:
+def read_metrics(run: Location) -> pd.DataFrame:
     """Read the rows of a run.
 
     Raises

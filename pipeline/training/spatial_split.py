@@ -20,7 +20,7 @@ DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
-class Piece:
+class Block:
     """A tile, or a part of it, on one side of the cut."""
 
     tile: Tile
@@ -36,8 +36,8 @@ class Piece:
 class Split:
     """Both sides of the cut."""
 
-    train: tuple[Piece, ...]
-    validate: tuple[Piece, ...]
+    train: tuple[Block, ...]
+    validate: tuple[Block, ...]
     gap_m: float
     """Cells nearer than this to the validation side are not learnt from."""
 
@@ -59,7 +59,7 @@ def inside(grid: Grid, bounds: Bounds) -> Bools:
     return np.asarray(rows[:, None] & cols)
 
 
-def split(pieces: Sequence[Piece], share: float, gap_m: float, seed: int) -> Split:
+def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Split:
     """Cut the land into a part to learn from and one of about ``share`` to judge by.
 
     Of eight directions, in an order that the seed decides, the first one counts that leaves labels of both
@@ -92,7 +92,7 @@ def split(pieces: Sequence[Piece], share: float, gap_m: float, seed: int) -> Spl
     )
 
 
-def halves(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
+def split_tile(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
     """Return two parts of one tile's bounds, for a catalog that has a single tile.
 
     The second, in the east or, of a tall tile, in the south, has ``share`` of the ground.
@@ -105,9 +105,9 @@ def halves(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
     return (west, middle, east, north), (west, south, east, middle)
 
 
-def _bounds(pieces: Sequence[Piece]) -> Iterator[Bounds]:
+def _bounds(pieces: Sequence[Block]) -> Iterator[Bounds]:
     return (piece.bounds for piece in pieces)
 
 
-def _both(pieces: Sequence[Piece]) -> bool:
+def _both(pieces: Sequence[Block]) -> bool:
     return any(piece.road for piece in pieces) and any(piece.ground for piece in pieces)

@@ -1,6 +1,6 @@
 """Train a segmenter on some of a catalog's tiles, and judge it on others that lie apart.
 
-What is judged is the segmenter itself with the model as it will be used, but for the hygiene: the report
+What is judged is the segmenter itself with the model as it will be used, but for the cleanup: the report
 shows what was learnt, not what tidying makes of it.
 """
 
@@ -22,13 +22,13 @@ from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.pipeline.config.methods import methods
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.training.spatial_split import Piece, Split, halves, inside, split
+from flexroad.pipeline.training.spatial_split import Block, Split, inside, split, split_tile
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING, within
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.training_types import Round, Sample, Trained
@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Asked:
+class TrainOptions:
     """How to train."""
 
     method: str
@@ -56,10 +56,10 @@ class Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Evaluation:
     """What the model made of one piece of the validation side."""
 
-    piece: Piece
+    piece: Block
     quality: Quality
     inner: Quality
     """The same without the band along the labels' edges."""
@@ -69,7 +69,7 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Preview:
     """What there is to look at of one tile."""
 
     grid: Grid
@@ -80,10 +80,10 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Ground:
+class LabelledTiles:
     """Tiles with their labels, read anew whenever they are looked at: memory does not grow with the land."""
 
-    asked: Asked
+    asked: TrainOptions
     load: load.Options
     vectors: rasterise.Options
 
@@ -97,7 +97,7 @@ class Ground:
         """
         data = load.load(tile, self.load)
         if self.asked.labels == "vector":
-            return None if data.roads is None else (data, rasterise.burn(data, self.vectors))
+            return None if data.roads is None else (data, rasterise.rasterise_roads(data, self.vectors))
         road = data.road_mask if data.reference_road is None else data.reference_road
         return None if road is None else (data, road)
 
@@ -118,9 +118,9 @@ class Ground:
         """Return the cells within the survey and outside the band along label edges, ``(H, W)``."""
         cell, reach = data.grid.cell, self.asked.ignore_m
         band = within(road, cell, reach) & within(~road, cell, reach)
-        return ~outside(data) & ~band
+        return ~beyond_extent(data) & ~band
 
-    def pieces(self, tile: Tile, parts: Sequence[Bounds]) -> list[Piece]:
+    def pieces(self, tile: Tile, parts: Sequence[Bounds]) -> list[Block]:
         """Return the parts of a tile with what is labelled in them; none if it has no labels."""
         found = self.labelled(tile)
         if found is None:
@@ -129,7 +129,7 @@ class Ground:
         counts = self.sure(data, road)
         where = [counts & inside(data.grid, bounds) for bounds in parts]
         return [
-            Piece(tile, bounds, int((cells & road).sum()), int((cells & ~road).sum()))
+            Block(tile, bounds, int((cells & road).sum()), int((cells & ~road).sum()))
             for bounds, cells in zip(parts, where, strict=True)
             if cells.any()
         ]
@@ -139,20 +139,20 @@ class Ground:
 class Outcome:
     """A trained model and how good it is."""
 
-    asked: Asked
-    ground: Ground
+    asked: TrainOptions
+    ground: LabelledTiles
     trained: Trained
     split: Split
-    judged: tuple[Judged, ...]
+    judged: tuple[Evaluation, ...]
     notes: tuple[str, ...]
 
-    def look(self, one: Judged) -> Seen:
+    def look(self, one: Evaluation) -> Preview:
         """Return what there is to look at of one tile; it is read anew."""
         data, truth = self.ground.sound(one.piece.tile)
         window = data.grid.window(data.core)
         found = np.unpackbits(one.found, count=data.core.width * data.core.height).astype(bool)
         ground = data.dsm[window] if data.dop is None else read_photo(data.dop, data.core).colour
-        return Seen(data.core, ground, truth[window], found.reshape(data.core.shape))
+        return Preview(data.core, ground, truth[window], found.reshape(data.core.shape))
 
     @property
     def quality(self) -> Quality:
@@ -169,12 +169,12 @@ class Outcome:
 class Samples(Sequence[Sample]):
     """The tiles of one side as a method learns from them, each read when it is asked for."""
 
-    ground: Ground
+    ground: LabelledTiles
     split: Split
     part: Literal["train", "validate"]
 
     @cached_property
-    def _pieces(self) -> tuple[Piece, ...]:
+    def _pieces(self) -> tuple[Block, ...]:
         return self.split.train if self.part == "train" else self.split.validate
 
     def __len__(self) -> int:
@@ -187,7 +187,7 @@ class Samples(Sequence[Sample]):
         return Sample(data, road, self.ground.sure(data, road) & apart(data.grid, piece.bounds))
 
 
-def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
+def train(catalog: Catalog, config: Config, asked: TrainOptions, say: Say) -> Outcome:
     """Train a method on a catalog and judge what it learnt.
 
     Parameters
@@ -208,7 +208,7 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
     """
     method = _method(asked)
     settings = _settings(method, asked)
-    ground = Ground(asked, _chain(config)["load"], _vector_options(config))
+    ground = LabelledTiles(asked, _chain(config)["load"], _vector_options(config))
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, ground, notes)), ground)
     say(f"{len(sides.train)} tiles to learn from, {len(sides.validate)} to judge by")
@@ -231,17 +231,17 @@ def train(catalog: Catalog, config: Config, asked: Asked, say: Say) -> Outcome:
 
 
 def segment_options(config: Config, method: str, model: Path) -> Options:
-    """Return how a model is applied to be judged: as configured, without hygiene."""
+    """Return how a model is applied to be judged: as configured, without cleanup."""
     configured = _chain(config)["segment"]
     module = methods("segment")[method]
     given = configured.model_dump() if isinstance(configured, module.Options) else {"method": method}
-    options: Options = module.Options(**given | {"model": model, "hygiene": NOTHING})
+    options: Options = module.Options(**given | {"model": model, "cleanup": NOTHING})
     return options
 
 
-def _judge(piece: Piece, ground: Ground, segment: Callable[[TileData], RoadMask]) -> Judged:
+def _judge(piece: Block, ground: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
     data, road = ground.sound(piece.tile)
-    here = inside(data.grid, piece.bounds) & ~outside(data)
+    here = inside(data.grid, piece.bounds) & ~beyond_extent(data)
     note = ""
     try:
         mask = segment(data)
@@ -253,10 +253,10 @@ def _judge(piece: Piece, ground: Ground, segment: Callable[[TileData], RoadMask]
         judge(cells, probability, road, known, data.grid) for known in (here, here & ground.sure(data, road))
     )
     core = cells[data.grid.window(data.core)]
-    return Judged(piece, whole, inner, np.packbits(core), note)
+    return Evaluation(piece, whole, inner, np.packbits(core), note)
 
 
-def _labelled(catalog: Catalog, ground: Ground, notes: list[str]) -> Iterator[Piece]:
+def _labelled(catalog: Catalog, ground: LabelledTiles, notes: list[str]) -> Iterator[Block]:
     """Yield the tiles that have labels, a single one in two parts; note those that cannot be read."""
     single = len(catalog.tiles) == 1
     for tile in catalog.tiles:
@@ -264,12 +264,14 @@ def _labelled(catalog: Catalog, ground: Ground, notes: list[str]) -> Iterator[Pi
             continue
         bounds = tile.grid.bounds
         try:
-            yield from ground.pieces(tile, halves(bounds, ground.asked.validation) if single else [bounds])
+            yield from ground.pieces(
+                tile, split_tile(bounds, ground.asked.validation) if single else [bounds]
+            )
         except TaskError as error:
             notes.append(f"{tile.id} is left out: {error}")
 
 
-def _split(pieces: Sequence[Piece], ground: Ground) -> Split:
+def _split(pieces: Sequence[Block], ground: LabelledTiles) -> Split:
     asked = ground.asked
     _check_labels(pieces, asked)
     if len(pieces) == 1:
@@ -287,7 +289,7 @@ def _split(pieces: Sequence[Piece], ground: Ground) -> Split:
     return Split(train, sides.validate, sides.gap_m)
 
 
-def _check_labels(pieces: Sequence[Piece], asked: Asked) -> None:
+def _check_labels(pieces: Sequence[Block], asked: TrainOptions) -> None:
     if not pieces:
         lacking = {
             "vector": "vectors of roads: give --roads to `flexroad catalog rasters`",
@@ -303,7 +305,7 @@ def _check_labels(pieces: Sequence[Piece], asked: Asked) -> None:
         )
 
 
-def _method(asked: Asked) -> Any:
+def _method(asked: TrainOptions) -> Any:
     home = Path(importlib.import_module("flexroad.tasks.segment").__path__[0])
     known = sorted(path.parent.name for path in home.glob("*/train.py"))
     if asked.method not in known:
@@ -311,7 +313,7 @@ def _method(asked: Asked) -> Any:
     return importlib.import_module(f"flexroad.tasks.segment.{asked.method}.train")
 
 
-def _settings(method: Any, asked: Asked) -> Options:
+def _settings(method: Any, asked: TrainOptions) -> Options:
     given = dict(asked.settings or {})
     if "seed" in method.Options.model_fields:
         given.setdefault("seed", asked.seed)

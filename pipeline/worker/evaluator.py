@@ -15,9 +15,9 @@ from typing import Any
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import stat
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
-from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure
-from flexroad.pipeline.worker.profiling import Span
+from flexroad.pipeline.worker.profiling import StageCost
 from flexroad.tasks.errors import TaskError
 
 
@@ -38,17 +38,17 @@ class SourceChanged(Exception):
 
 
 @dataclass
-class Pull:
+class Evaluator:
     """Results of one tile's nodes, each computed or read at most once."""
 
     graph: TileGraph
-    store: Store
-    anew: frozenset[str] = frozenset()
+    store: ArtefactStore
+    force: frozenset[str] = frozenset()
     keep: bool = False
     """Whether to put into the store what is computed; who only looks at a run leaves it as it is."""
     results: dict[str, Any] = field(default_factory=dict)
     chain_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
-    spans: defaultdict[str, Span] = field(default_factory=lambda: defaultdict(Span))
+    spans: defaultdict[str, StageCost] = field(default_factory=lambda: defaultdict(StageCost))
     """What each stage cost here."""
     faults: dict[str, StageError] = field(default_factory=dict)
 
@@ -64,7 +64,7 @@ class Pull:
             raise self.faults[fingerprint]
         if fingerprint not in self.results:
             node = self.graph.nodes[fingerprint]
-            found = self.store.get(node) if node.stored and node.stage not in self.anew else None
+            found = self.store.get(node) if node.stored and node.stage not in self.force else None
             if found is None:
                 self._compute(node)
             else:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flexroad.pipeline.graph.graph import TileGraph
-from flexroad.pipeline.store.products import plain_name
+from flexroad.pipeline.store.products import safe_name
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
@@ -35,7 +35,7 @@ def products(graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, 
         Whole-metre (easting, northing) that the run's meshes are placed against.
     """
     made: dict[str, Product] = {}
-    tile = plain_name(graph.tile.id)
+    tile = safe_name(graph.tile.id)
     for variant in graph.export.variants:
         for kind in graph.export.formats:
             found = _MAKERS[kind](graph, graph.variants[variant], pull, origin)

@@ -14,7 +14,7 @@ PROC = Path("/proc/self")
 
 
 @dataclass
-class Span:
+class StageCost:
     """The cost of one stage over all variants of a tile."""
 
     time: str = ""

@@ -13,15 +13,24 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from flexroad.catalog.index import item
-from flexroad.catalog.storage.paths import place, stat
+from flexroad.catalog.storage.paths import parse_location, stat
 from flexroad.pipeline.graph.graph import Node, TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.store.products import TileFolder, file_entry, no_nan
-from flexroad.pipeline.store.records import MARKERS, Entry, Failure, Marker, Row, State, from_item, to_failed
-from flexroad.pipeline.worker.evaluator import Pull, StageError, failure_of
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.store.products import TileProducts, file_entry, no_nan
+from flexroad.pipeline.store.records import (
+    MARKERS,
+    Failure,
+    MarkerStat,
+    MetricsRow,
+    State,
+    TileRecord,
+    from_item,
+    to_failed,
+)
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
 from flexroad.pipeline.worker.exports import products
-from flexroad.pipeline.worker.profiling import Span, now
+from flexroad.pipeline.worker.profiling import StageCost, now
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
@@ -30,7 +39,7 @@ Status = Literal["done", "failed", "cached"]
 
 
 @dataclass(frozen=True)
-class Job:
+class TileJob:
     """One tile to do, and where its results go; travels to a worker."""
 
     graph: TileGraph
@@ -38,7 +47,7 @@ class Job:
     store: str
     origin: tuple[float, float]
     """Whole-metre (easting, northing) that all meshes of the run are placed against."""
-    anew: frozenset[str] = frozenset()
+    force: frozenset[str] = frozenset()
     """Stages to compute even if the store has them."""
 
     @property
@@ -47,19 +56,19 @@ class Job:
         return f"tile-{self.graph.tile.id}"
 
     @property
-    def folder(self) -> TileFolder:
+    def folder(self) -> TileProducts:
         """Where the tile's products go."""
-        return TileFolder.of(place(self.run), self.graph.tile.id)
+        return TileProducts.of(parse_location(self.run), self.graph.tile.id)
 
 
 @dataclass(frozen=True)
 class TileResult:
     """How one tile went now; what travels back."""
 
-    entry: Entry
+    entry: TileRecord
     status: Status
     """Cached if its result was there and nothing had to be done."""
-    spans: dict[str, Span] = field(default_factory=dict)
+    spans: dict[str, StageCost] = field(default_factory=dict)
     """What each stage cost."""
     notes: tuple[str, ...] = ()
     host: str = ""
@@ -71,7 +80,7 @@ class TileResult:
         return self.entry.tile_id
 
     @property
-    def rows(self) -> tuple[Row, ...]:
+    def rows(self) -> tuple[MetricsRow, ...]:
         """One per variant."""
         return self.entry.rows
 
@@ -101,10 +110,10 @@ class TileResult:
         return max((span.peak_mb for span in self.spans.values()), default=0.0)
 
 
-def do_tile(job: Job) -> TileResult:
+def process_tile(job: TileJob) -> TileResult:
     """Bring one tile up to date with its graph; never raises for what is one tile's own fault."""
     graph = job.graph
-    pull = Pull(graph, Store(place(job.store)), job.anew, keep=True)
+    pull = Evaluator(graph, ArtefactStore(parse_location(job.store)), job.force, keep=True)
     rows, failures = [], []
     for variant in graph.variants:
         try:
@@ -125,14 +134,16 @@ def do_tile(job: Job) -> TileResult:
         if failures:
             rows = [failed_row(graph, row["variant"], failures[0].line) for row in rows]
     if entry is None:
-        entry = give_up(job, rows, failures, _seconds(pull))
+        entry = record_failure(job, rows, failures, _seconds(pull))
     return TileResult(entry, entry.state, dict(pull.spans), notes, socket.gethostname(), os.getpid())
 
 
-def give_up(job: Job, rows: Sequence[Row], failures: Sequence[Failure], seconds: float = 0.0) -> Entry:
+def record_failure(
+    job: TileJob, rows: Sequence[MetricsRow], failures: Sequence[Failure], seconds: float = 0.0
+) -> TileRecord:
     """Write down that the tile failed, and why."""
     tile_id, fingerprint = job.graph.tile.id, job.graph.fingerprint
-    entry = Entry(
+    entry = TileRecord(
         tile_id, "failed", fingerprint, tuple(rows), tuple(failures), finished=now(), seconds=seconds
     )
     marker = None
@@ -143,13 +154,13 @@ def give_up(job: Job, rows: Sequence[Row], failures: Sequence[Failure], seconds:
     return replace(entry, marker=marker)
 
 
-def marker_of(folder: TileFolder, state: State) -> Marker | None:
+def marker_of(folder: TileProducts, state: State) -> MarkerStat | None:
     """Return how the marker that was just written looks."""
     seen = stat(folder.path / MARKERS[state])
     return (MARKERS[state], seen.size, seen.version) if seen else None
 
 
-def failed_row(graph: TileGraph, variant: str, error: str) -> Row:
+def failed_row(graph: TileGraph, variant: str, error: str) -> MetricsRow:
     """Return the row of a variant without figures."""
     return (
         _head(graph, variant, "failed")
@@ -158,7 +169,7 @@ def failed_row(graph: TileGraph, variant: str, error: str) -> Row:
     )
 
 
-def _row(graph: TileGraph, variant: str, pull: Pull) -> Row:
+def _row(graph: TileGraph, variant: str, pull: Evaluator) -> MetricsRow:
     evaluated = graph.variants[variant]["evaluate"]
     figures = asdict(pull(evaluated))
     quality: Quality = pull(graph.variants[variant]["assess"])
@@ -168,7 +179,7 @@ def _row(graph: TileGraph, variant: str, pull: Pull) -> Row:
     return no_nan(_head(graph, variant, "done") | figures | told)
 
 
-def _head(graph: TileGraph, variant: str, status: Status) -> Row:
+def _head(graph: TileGraph, variant: str, status: Status) -> MetricsRow:
     fit = graph.chain(variant)[STAGE_NAMES.index("fit")]
     return {
         "tile_id": graph.tile.id,
@@ -179,11 +190,11 @@ def _head(graph: TileGraph, variant: str, status: Status) -> Row:
     }
 
 
-def _seconds(pull: Pull) -> float:
+def _seconds(pull: Evaluator) -> float:
     return sum(span.seconds for span in pull.spans.values())
 
 
-def _noted(fingerprint: str, node: Node, pull: Pull) -> tuple[str, ...]:
+def _noted(fingerprint: str, node: Node, pull: Evaluator) -> tuple[str, ...]:
     """Return what a stage that reads sources had to say of them, as far as it was asked."""
     if node.stage not in ("load", "segment") or fingerprint not in pull.results:
         return ()
@@ -191,7 +202,7 @@ def _noted(fingerprint: str, node: Node, pull: Pull) -> tuple[str, ...]:
     return notes
 
 
-def _finish(job: Job, pull: Pull, rows: list[Row], notes: tuple[str, ...]) -> Entry:
+def _finish(job: TileJob, pull: Evaluator, rows: list[MetricsRow], notes: tuple[str, ...]) -> TileRecord:
     span = pull.spans["export"]
     with span.measured():
         made = products(job.graph, pull, job.origin)
@@ -205,7 +216,7 @@ def _finish(job: Job, pull: Pull, rows: list[Row], notes: tuple[str, ...]) -> En
 
 def _item(
     graph: TileGraph,
-    rows: list[Row],
+    rows: list[MetricsRow],
     made: Mapping[str, tuple[bytes, str]],
     notes: tuple[str, ...],
     seconds: float,

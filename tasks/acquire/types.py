@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.types import Bools, Floats, Photo
+from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,5 +50,5 @@ class Rasters:
     """Cells with points on the ground, ``(H, W)``; the DTM is inferred in the others."""
     bridges: Floats | None = None
     """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there is none."""
-    photo: Photo | None = None
+    photo: Orthophoto | None = None
     """None if the points have no colours."""

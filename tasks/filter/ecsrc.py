@@ -14,7 +14,15 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.filter.kit.union_find import Roots, clean, flatten, half_disc, least_cells, plant, root
+from flexroad.tasks.filter.kit.union_find import (
+    Roots,
+    clean,
+    compress,
+    find,
+    forward_offsets,
+    init,
+    least_cells,
+)
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 1
@@ -61,12 +69,12 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     points = road.mask & np.isfinite(data.dsm)
     if options.method == "off":
         return RoadClusters(data.grid, points.astype(np.int32))
-    cell, roots = data.grid.cell, plant(points)
+    cell, roots = data.grid.cell, init(points)
     heights = np.ascontiguousarray(data.dsm)
-    _join(heights, roots, half_disc(1.5), options.theta_z_m)
-    _join(heights, roots, half_disc(options.theta_xy_m / cell), options.theta_z_m)
+    _join(heights, roots, forward_offsets(1.5), options.theta_z_m)
+    _join(heights, roots, forward_offsets(options.theta_xy_m / cell), options.theta_z_m)
     least = least_cells(options.min_area_m2, cell)
-    labels = clean(points, flatten(roots).reshape(points.shape), least, options.keep_largest)
+    labels = clean(points, compress(roots).reshape(points.shape), least, options.keep_largest)
     return RoadClusters(data.grid, labels)
 
 
@@ -78,7 +86,7 @@ def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: floa
         if roots[i] < 0:
             continue
         r, c = i // cols, i % cols
-        a = root(roots, i)
+        a = find(roots, i)
         for k in range(steps.shape[0]):
             row, col = r + steps[k, 0], c + steps[k, 1]
             if row >= rows or col < 0 or col >= cols:
@@ -86,6 +94,6 @@ def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: floa
             j = row * cols + col
             if roots[j] < 0 or roots[j] == a or abs(heights[r, c] - heights[row, col]) > theta_z:
                 continue
-            b = root(roots, j)
+            b = find(roots, j)
             a, b = min(a, b), max(a, b)
             roots[b] = a

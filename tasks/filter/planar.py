@@ -19,10 +19,18 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.filter.kit.ground_consistency import ALONE, ON, against_known
+from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, NO_NEIGHBOURS, against_known
 from flexroad.tasks.filter.kit.planar_patches import Patches, flat_patches
-from flexroad.tasks.filter.kit.union_find import Roots, clean, flatten, half_disc, least_cells, plant, root
-from flexroad.tasks.roads.dtm_validity import unsound
+from flexroad.tasks.filter.kit.union_find import (
+    Roots,
+    clean,
+    compress,
+    find,
+    forward_offsets,
+    init,
+    least_cells,
+)
+from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 2
@@ -105,9 +113,9 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     reach = max(1, math.floor(REACH_M / cell + 1e-9))
     near = against_known(data.dsm, data.dtm, ground, points & ~ground, reach, theta)
     level = np.abs(data.dsm - data.dtm) <= theta
-    kept = ground | (near == ON) | (points & ~ground & (near == ALONE) & level)
+    kept = ground | (near == CONSISTENT) | (points & ~ground & (near == NO_NEIGHBOURS) & level)
     labels = _labels(kept, cell, options)
-    astray = unsound(data, road, labels > 0) | _verge(road.mask, labels > 0, options.verge_m / cell)
+    astray = invalid_dtm(data, road, labels > 0) | _verge(road.mask, labels > 0, options.verge_m / cell)
     return RoadClusters(data.grid, labels, astray)
 
 
@@ -131,10 +139,10 @@ def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArra
     Neighbouring patches share most of their cells, so one plane goes over into the next. Across gaps,
     clusters merge if any two of their edges agree in height along the street's slope.
     """
-    forest = plant(patches.centres)
-    _join(forest, patches.centres, half_disc(1.5), dsm, patches.trend, math.inf)
-    _join(forest, _edges(patches.centres), half_disc(gap), dsm, patches.trend, theta)
-    roots: NDArray[np.int32] = _covered(flatten(forest).reshape(dsm.shape), patches.reach)
+    forest = init(patches.centres)
+    _join(forest, patches.centres, forward_offsets(1.5), dsm, patches.trend, math.inf)
+    _join(forest, _edges(patches.centres), forward_offsets(gap), dsm, patches.trend, theta)
+    roots: NDArray[np.int32] = _covered(compress(forest).reshape(dsm.shape), patches.reach)
     return roots
 
 
@@ -164,10 +172,10 @@ def _medians(values: Floats, member: NDArray[np.intp], count: int) -> Floats:
 
 def _labels(kept: Bools, cell: float, options: Options) -> NDArray[np.int32]:
     """Return the clusters of what was kept: heights have been seen to, so now only gaps part them."""
-    forest, level, slope = plant(kept), np.zeros(kept.shape), np.zeros((*kept.shape, 2))
-    _join(forest, kept, half_disc(1.5), level, slope, math.inf)
-    _join(forest, _edges(kept), half_disc(options.theta_xy_m / cell), level, slope, math.inf)
-    roots = flatten(forest).reshape(kept.shape)
+    forest, level, slope = init(kept), np.zeros(kept.shape), np.zeros((*kept.shape, 2))
+    _join(forest, kept, forward_offsets(1.5), level, slope, math.inf)
+    _join(forest, _edges(kept), forward_offsets(options.theta_xy_m / cell), level, slope, math.inf)
+    roots = compress(forest).reshape(kept.shape)
     return clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
 
 
@@ -187,7 +195,7 @@ def _join(
         r, c = i // cols, i % cols
         if not members[r, c]:
             continue
-        a = root(roots, i)
+        a = find(roots, i)
         for down, across in steps:
             row, col = r + down, c + across
             if row >= rows or col < 0 or col >= cols or not members[row, col]:
@@ -199,7 +207,7 @@ def _join(
             up = (down * fall[0] + across * fall[1]) / 2
             if abs(heights[row, col] - heights[r, c] - up) > theta:
                 continue
-            b = root(roots, j)
+            b = find(roots, j)
             a, b = min(a, b), max(a, b)
             roots[b] = a
 

@@ -73,11 +73,11 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         If there are fewer cells with a height than control points, if there is nothing to start from, or if
         the device is not there.
     """
-    from flexroad.tasks.roads.dtm_validity import without_unsound
+    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
     from flexroad.tasks.spline.space import start_heights
     from flexroad.tasks.spline.surface import NurbsSurface
 
-    data, space = without_unsound(data, clusters), space_of(data, options)
+    data, space = without_invalid_dtm(data, clusters), space_of(data, options)
     start, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
     z, weights = _adam(loss, start - datum, options)

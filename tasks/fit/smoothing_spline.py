@@ -47,14 +47,14 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     TaskError
         If there are fewer cells with a height than control points, or if there is nothing to start from.
     """
-    from flexroad.tasks.roads.dtm_validity import without_unsound
+    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
     from flexroad.tasks.spline import space
     from flexroad.tasks.spline.irls import HuberObjective, minimise
     from flexroad.tasks.spline.objective import objective
     from flexroad.tasks.spline.surface import NurbsSurface
     from flexroad.tasks.spline.thin_plate import bending_energy
 
-    data, road = without_unsound(data, clusters), clusters.mask
+    data, road = without_invalid_dtm(data, clusters), clusters.mask
     points = space.points_at_spacing(data.grid, options.degree, options.spacing_m)
     knots = space.spline_space(data.grid, options.degree, points)
     start, datum = space.start_heights(data, road, knots)

@@ -17,16 +17,16 @@ from rasterio.vrt import WarpedVRT
 
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
-from flexroad.catalog.storage.paths import Place
+from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.raster import Lattice, Unreadable, opened, place
-from flexroad.tasks.types import Bools, Photo, Source
+from flexroad.tasks.io.raster import RasterGrid, Unreadable, opened, place
+from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}
 """Depth of the colours that are understood, where a file does not say it uses fewer."""
 
 
-def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Photo:
+def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthophoto:
     """Read the orthophoto over a grid's bounds.
 
     Grey photos are given as three equal bands, of more than three (near infrared) the first three are
@@ -52,7 +52,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Photo:
         If a file that the ground needs is missing or broken; if one is rotated, in another CRS, or in
         colours that are not understood; if none reaches the grid.
     """
-    photo: Photo | None = None
+    photo: Orthophoto | None = None
     broken: list[Unreadable] = []
     reached = np.zeros((1, 1), bool)
     with quiet():
@@ -83,7 +83,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Photo:
     return photo
 
 
-def _under(first: Photo | None, second: Photo) -> Photo:
+def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
     """Return the first photo, filled with the second where it knows nothing."""
     if first is None:
         return second
@@ -91,7 +91,7 @@ def _under(first: Photo | None, second: Photo) -> Photo:
     return replace(first, colour=colour, known=first.known | second.known)
 
 
-def _reached(lattice: Lattice, grid: Grid) -> Bools:
+def _reached(lattice: RasterGrid, grid: Grid) -> Bools:
     """Return the cells whose centres lie on the file, with a value or not, ``(H, W)``."""
     west, south, east, north = lattice.bounds
     inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
@@ -101,12 +101,12 @@ def _reached(lattice: Lattice, grid: Grid) -> Bools:
 
 
 def _read(
-    path: Place, name: str, grid: Grid, gsd_m: float | None, crs: str | None
-) -> tuple[Photo, Lattice] | None:
+    path: Location, name: str, grid: Grid, gsd_m: float | None, crs: str | None
+) -> tuple[Orthophoto, RasterGrid] | None:
     """Return what one file shows of the ground, and where the file lies; None if it lies elsewhere."""
     with opened(path, name) as src:
         lattice = place(src, path, name, grid, grid, crs)
-        if lattice is None or lattice.under(grid) is None:
+        if lattice is None or lattice.window_for(grid) is None:
             return None
         depth = _depth(src, path, name)
         pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or lattice.dx)
@@ -114,10 +114,10 @@ def _read(
     if src.count < 3:
         colour = np.repeat(colour, 3, axis=0)
     scaled = np.rint(colour * (255 / (2**depth - 1)))
-    return Photo(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
+    return Orthophoto(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
 
 
-def _depth(src: Any, path: Place, name: str) -> int:
+def _depth(src: Any, path: Location, name: str) -> int:
     """Return how many bits the colours have."""
     kind = src.dtypes[0]
     if src.colorinterp[0] == ColorInterp.palette:
@@ -132,7 +132,7 @@ def _depth(src: Any, path: Place, name: str) -> int:
     return int(src.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", BITS[kind]))
 
 
-def _warped(src: Any, lattice: Lattice, pixels: Grid) -> tuple[NDArray[np.float32], Bools]:
+def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.float32], Bools]:
     """Return the file's colours on the pixels, ``(1 or 3, h, w)`` in its own counts, and which are known."""
     coarser = pixels.cell > max(lattice.dx, lattice.dy) * (1 + LATTICE_TOLERANCE)
     bands = (1, 2, 3) if src.count >= 3 else (1,)
@@ -158,7 +158,7 @@ def _warped(src: Any, lattice: Lattice, pixels: Grid) -> tuple[NDArray[np.float3
     return np.where(known, colour, np.float32(0)), known
 
 
-def _transform(lattice: Lattice) -> Affine:
+def _transform(lattice: RasterGrid) -> Affine:
     if lattice.northward:
         return Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
     return Affine(lattice.dx, 0, lattice.west, 0, -lattice.dy, lattice.north)

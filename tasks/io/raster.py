@@ -19,7 +19,7 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.storage.paths import Place, gdal_name, is_remote, namesakes, stat
+from flexroad.catalog.storage.paths import Location, gdal_name, is_remote, sidecars, stat
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
@@ -29,7 +29,7 @@ class Unreadable(TaskError):
 
 
 @dataclass(frozen=True)
-class Lattice:
+class RasterGrid:
     """Where a file's cells lie; like a `Grid`, but as the file has it."""
 
     west: float
@@ -42,7 +42,7 @@ class Lattice:
     """True if the file's rows run northward, as in XYZ files sorted by northing."""
 
     @classmethod
-    def of(cls, transform: Affine, width: int, height: int) -> Lattice:
+    def of(cls, transform: Affine, width: int, height: int) -> RasterGrid:
         """Return the lattice of an unrotated file."""
         north = max(transform.f, transform.f + height * transform.e)
         dx, dy = abs(transform.a), abs(transform.e)
@@ -66,7 +66,7 @@ class Lattice:
         same_count = (round(east) - round(west), round(south) - round(north)) == (grid.width, grid.height)
         return off < LATTICE_TOLERANCE and same_count
 
-    def under(self, grid: Grid) -> tuple[slice, slice] | None:
+    def window_for(self, grid: Grid) -> tuple[slice, slice] | None:
         """Return the (row, col) slices of this lattice under the grid, rows from the north, or None."""
         west, north, east, south = self._in_cells(grid)
         if self.fits(grid):
@@ -79,10 +79,10 @@ class Lattice:
         cols = slice(max(0, math.floor(west)), min(self.width, math.ceil(east)))
         return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
 
-    def cut(self, rows: slice, cols: slice) -> Lattice:
+    def cut(self, rows: slice, cols: slice) -> RasterGrid:
         """Return the lattice of a part; rows from the north."""
         west, north = self.west + cols.start * self.dx, self.north - rows.start * self.dy
-        return Lattice(west, north, self.dx, self.dy, cols.stop - cols.start, rows.stop - rows.start)
+        return RasterGrid(west, north, self.dx, self.dy, cols.stop - cols.start, rows.stop - rows.start)
 
     def _in_cells(self, grid: Grid) -> tuple[float, float, float, float]:
         west, south, east, north = grid.bounds
@@ -95,7 +95,7 @@ class Lattice:
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class RasterWindow:
     """The cells of one file under a grid."""
 
     name: str
@@ -103,14 +103,14 @@ class Patch:
     file: str
     values: Floats
     """``(rows, cols)``, row 0 in the north; NaN where the file has nodata."""
-    lattice: Lattice
+    lattice: RasterGrid
     unit: str
     """Unit of the values as the band declares it, or nothing."""
     crs: str | None
     """CRS of the file, else the one it was given."""
 
 
-def read(path: Place, name: str, grid: Grid, core: Grid, crs: str | None) -> Patch | None:
+def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterWindow | None:
     """Read what a file has under a grid.
 
     Parameters
@@ -137,16 +137,16 @@ def read(path: Place, name: str, grid: Grid, core: Grid, crs: str | None) -> Pat
     """
     with opened(path, name) as src:
         lattice = place(src, path, name, grid, core, crs)
-        slices = lattice.under(grid) if lattice else None
+        slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:
             return None
         values, unit = _values(src, lattice, *slices), src.units[0] or ""
         crs = src.crs.to_wkt() if src.crs else crs
-    return Patch(name, str(path), values, lattice.cut(*slices), unit, crs)
+    return RasterWindow(name, str(path), values, lattice.cut(*slices), unit, crs)
 
 
 @contextmanager
-def opened(path: Place, name: str) -> Iterator[Any]:
+def opened(path: Location, name: str) -> Iterator[Any]:
     """Open a raster; what goes wrong with it inside is `Unreadable`; in a bucket, a `TaskError`.
 
     Of a file in a bucket nobody can tell whether it is broken or the storage was, so that a tile had better
@@ -164,21 +164,21 @@ def opened(path: Place, name: str) -> Iterator[Any]:
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
 
 
-def _surroundings(path: Place, name: str) -> AbstractContextManager[Any]:
+def _surroundings(path: Location, name: str) -> AbstractContextManager[Any]:
     """Let GDAL look for files beside one in a bucket only where there are some."""
     if isinstance(path, Path):
         return nullcontext()
-    there = namesakes(path)
+    there = sidecars(path)
     if path.name not in there:
         raise _missing(path, name)
     return nullcontext() if there - {path.name} else rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
 
 
-def _missing(path: Place, name: str) -> Unreadable:
+def _missing(path: Location, name: str) -> Unreadable:
     return Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path))
 
 
-def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
+def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     """Return the patch on the grid's cells, ``(H, W)``; NaN where it has no value.
 
     Cells that coincide are copied. Others are resampled: source cells without a value have no weight, and
@@ -205,7 +205,7 @@ def onto(patch: Patch, grid: Grid, resampling: Resampling) -> Floats:
     return values
 
 
-def misfit(lattice: Lattice, grid: Grid) -> str:
+def misalignment(lattice: RasterGrid, grid: Grid) -> str:
     """Return in words why cells do not coincide, or nothing if they do."""
     if lattice.fits(grid):
         return ""
@@ -218,8 +218,8 @@ def misfit(lattice: Lattice, grid: Grid) -> str:
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
 
 
-def place(src: Any, path: Place, name: str, grid: Grid, core: Grid, crs: str | None) -> Lattice | None:
-    """Return where a file lies, or None if it is in another CRS and elsewhere; parameters as for `read`.
+def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterGrid | None:
+    """Return where a file lies, or None if it is in another CRS and elsewhere; see `read_window`.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def place(src: Any, path: Place, name: str, grid: Grid, core: Grid, crs: str | N
     """
     if src.transform.is_identity:
         if src.shape == core.shape:
-            return Lattice(core.west, core.north, core.cell, core.cell, core.width, core.height)
+            return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
         raise TaskError(
             f"{name} carries no georeference and has {src.width} x {src.height} cells, "
             f"the tile {core.width} x {core.height}; give it a world file",
@@ -236,7 +236,7 @@ def place(src: Any, path: Place, name: str, grid: Grid, core: Grid, crs: str | N
         )
     if src.transform.b or src.transform.d:
         raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
-    lattice = Lattice.of(src.transform, src.width, src.height)
+    lattice = RasterGrid.of(src.transform, src.width, src.height)
     theirs = src.crs.to_wkt() if src.crs else crs
     if theirs is None:
         raise TaskError(f"{name} carries no CRS; build the catalog anew with --crs", str(path))
@@ -256,7 +256,7 @@ def _meet(a: Bounds, b: Bounds) -> bool:
     return not (a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1])
 
 
-def _values(src: Any, lattice: Lattice, rows: slice, cols: slice) -> Floats:
+def _values(src: Any, lattice: RasterGrid, rows: slice, cols: slice) -> Floats:
     top = lattice.height - rows.stop if lattice.northward else rows.start
     window = Window(cols.start, top, cols.stop - cols.start, rows.stop - rows.start)
     values: Floats = src.read(1, window=window).astype(np.float64)

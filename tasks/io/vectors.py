@@ -26,7 +26,7 @@ from upath import UPath
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.storage.paths import Place, Seen, fetch, stat
+from flexroad.catalog.storage.paths import FileStat, Location, fetch, stat
 from flexroad.tasks.errors import TaskError
 
 SQUARE_M = 4000.0
@@ -41,10 +41,10 @@ TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 @dataclass(frozen=True)
-class Asked:
+class Query:
     """What is asked of a file."""
 
-    path: Place
+    path: Location
     layer: str | None
     """None where the file has only one, or is of OSM's own format."""
     where: str | None
@@ -66,7 +66,7 @@ class _Layer:
     where: str | None
 
 
-def near(asked: Asked, bounds: Bounds) -> Any:
+def read_near(asked: Query, bounds: Bounds) -> Any:
     """Return the features whose boxes touch ``bounds`` (m, in ``asked.crs``).
 
     Returns
@@ -97,7 +97,7 @@ def near(asked: Asked, bounds: Bounds) -> Any:
     return pandas.concat(found, ignore_index=True)
 
 
-def _fault(asked: Asked, what: str) -> TaskError:
+def _fault(asked: Query, what: str) -> TaskError:
     return TaskError(f"{asked.path} {what}", str(asked.path), "roads")
 
 
@@ -113,7 +113,7 @@ def _touching(part: Any, bounds: Bounds) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _layers(asked: Asked, version: Seen) -> tuple[_Layer, ...]:
+def _layers(asked: Query, version: FileStat) -> tuple[_Layer, ...]:
     """Return the layers to read; ``version`` tells a changed file from the one that was seen before."""
     import pyogrio
 
@@ -132,7 +132,7 @@ def _layers(asked: Asked, version: Seen) -> tuple[_Layer, ...]:
         raise _fault(asked, f"cannot be read as vectors: {error}") from error
 
 
-def _file(asked: Asked, version: Seen) -> Path:
+def _file(asked: Query, version: FileStat) -> Path:
     """Return the file, or a copy of one in a bucket."""
     if isinstance(asked.path, Path):
         return asked.path
@@ -152,12 +152,12 @@ class _Copy:
 
 
 @lru_cache(maxsize=KEPT)
-def _copied(path: UPath, version: Seen) -> _Copy:
+def _copied(path: UPath, version: FileStat) -> _Copy:
     """Return a copy of that version."""
     return _Copy(path)
 
 
-def _described(asked: Asked, name: str, info: Any) -> _Layer:
+def _described(asked: Query, name: str, info: Any) -> _Layer:
     crs = info["crs"] or asked.bare_crs
     if crs is None:
         remedy = f"give it one, e.g. ogr2ogr -a_srs {short(asked.crs)} NEW {asked.path.name}"
@@ -176,7 +176,7 @@ def _described(asked: Asked, name: str, info: Any) -> _Layer:
 
 
 @lru_cache(maxsize=KEPT)
-def _part(asked: Asked, version: Seen, layer: _Layer, square: Bounds | None) -> Any:
+def _part(asked: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
     """Return a layer's features, or those that touch a square of the tiles' plane, with their index."""
     try:
         bbox = square and transformer(asked.crs, layer.crs).transform_bounds(*square, densify_pts=21)
@@ -194,7 +194,7 @@ def _part(asked: Asked, version: Seen, layer: _Layer, square: Bounds | None) -> 
     return _unpacked(found[there], asked.columns)
 
 
-def _read(asked: Asked, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
+def _read(asked: Query, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
     import pyogrio
 
     def read(**more: str) -> Any:

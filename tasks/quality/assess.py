@@ -24,8 +24,8 @@ VERSION = 1
 AROUND_M = 5.0
 """Side of the square over which the scan's scatter is taken (m): more than a cell, less than a crown."""
 FLAGS = {
-    "doubt": "doubt_m",
-    "patch": "doubted_m2",
+    "error-estimate": "error_estimate_m",
+    "patch": "suspect_m2",
     "spike": "curvature_per_m",
     "edge-step": "edge_step_m",
     "loose": "residual_p95_m",
@@ -45,10 +45,10 @@ class Options(base.Options):
     agree_m: float = Field(
         AGREE_M, gt=0, description="heights that differ by more do not tell of one ground (m)"
     )
-    doubt_m: float = Field(
-        0.1, gt=0, description="flag doubt: mean distance of the surface to its nearer witness (m)"
+    error_estimate_m: float = Field(
+        0.1, gt=0, description="flag error-estimate: mean distance of the surface to its nearer witness (m)"
     )
-    doubted_m2: float = Field(
+    suspect_m2: float = Field(
         50.0, gt=0, description="flag patch: largest patch of road doubted by more than agree_m (m2)"
     )
     curvature_per_m: float = Field(
@@ -103,7 +103,7 @@ def assess(
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
     off_dsm, off_dtm = height - data.dsm[window], height - data.dtm[window]
-    doubted = doubt(off_dsm, off_dtm, data.dsm[window] - data.dtm[window], kept, rests_on, cell)
+    doubted = error_estimate(off_dsm, off_dtm, data.dsm[window] - data.dtm[window], kept, rests_on, cell)
     residuals, to_dtm = _finite(off_dsm[kept]), _finite(off_dtm[on_road])
     figures = {
         "residual_median_m": _quantile(residuals, 50),
@@ -118,14 +118,14 @@ def assess(
         "off_dtm_m": _quantile(to_dtm, 50),
         "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _bounded(surface),
-        "doubt_m": mean(_finite(doubted[on_road])),
-        "doubted_m2": _patch(on_road & (doubted > options.agree_m)) * cell**2,
+        "error_estimate_m": mean(_finite(doubted[on_road])),
+        "suspect_m2": _patch(on_road & (doubted > options.agree_m)) * cell**2,
     }
     flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
     return Quality(**figures, flags=tuple(flags if on_road.any() else [NO_ROAD]), support=rests_on)
 
 
-def doubt(
+def error_estimate(
     off_dsm: Floats, off_dtm: Floats, above: Floats, kept: Bools, rests_on: NDArray[np.uint8], cell: float
 ) -> Floats:
     """Return by how much the surface may be wrong in each cell, ``(H, W)``, m: an estimate, no bound.

@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.roads.dtm_validity import AGREE_M, without_unsound
+from flexroad.tasks.roads.dtm_validity import AGREE_M, without_invalid_dtm
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 
@@ -45,7 +45,7 @@ def support(
     agree_m : float
         Greatest difference of a DSM and a DTM that saw the same ground (m).
     """
-    modelled = np.isfinite(without_unsound(data, clusters).dtm)
+    modelled = np.isfinite(without_invalid_dtm(data, clusters).dtm)
     agreed = modelled & (np.abs(data.dsm - data.dtm) <= agree_m)
     found = np.where(modelled & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
     found[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED

@@ -23,7 +23,7 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.types import Bools, Floats, Photo, TileData
+from flexroad.tasks.types import Bools, Floats, Orthophoto, TileData
 
 Singles = NDArray[np.float32]
 Sun = tuple[float, float]
@@ -87,7 +87,7 @@ class Pair:
     """Brightness and greenness at these cells under every shift, ``(2, shifts, n)``; 0 where unknown."""
 
 
-def note(data: TileData, photo: Photo) -> str | None:
+def note(data: TileData, photo: Orthophoto) -> str | None:
     """Return a warning of a photo that clearly lies off the heights of its tile, or None."""
     if not large_enough(data.grid):
         return None
@@ -107,7 +107,7 @@ def matters(found: Shift, cell: float, scatter_m: float = 0.0) -> bool:
     return found.length_m > max(SMALLEST_M, cell / 2) + scatter_m
 
 
-def pair(data: TileData, photo: Photo) -> Pair:
+def pair(data: TileData, photo: Orthophoto) -> Pair:
     """Return a tile's heights and its photo, which covers the tile's grid, ready to be compared."""
     grid = _working(data.grid)
     height, ground = (_onto(values, data.grid, grid) for values in (data.dsm, data.dtm))
@@ -233,7 +233,7 @@ def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
     return found
 
 
-def _targets(photo: Photo, grid: Grid) -> tuple[Floats, Floats]:
+def _targets(photo: Orthophoto, grid: Grid) -> tuple[Floats, Floats]:
     """Return brightness, white walls and roofs cut off, and greenness on the grid, ``(H, W)``."""
     red, green, blue = photo.colour.astype(np.float64)
     bright = np.where(photo.known, 0.299 * red + 0.587 * green + 0.114 * blue, np.nan)

@@ -29,7 +29,7 @@ THIN_M2 = 0.2
 """What scatters less in some direction (m2) lies on a line, and no plane goes on from it."""
 
 
-def unsound(data: TileData, road: RoadMask, kept: Bools) -> Bools:
+def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
     """Return the road cells the filter dropped where the DTM is off the road's continuation, ``(H, W)``.
 
     The plane through the kept cells around says where the road should be. The DTM may be off it by
@@ -50,7 +50,7 @@ def unsound(data: TileData, road: RoadMask, kept: Bools) -> Bools:
     if not (asked.any() and kept.any()):
         return np.zeros_like(asked)
     away = scipy.ndimage.distance_transform_edt(~kept) * data.grid.cell
-    expected, scatter = continuation(data.dsm, kept, data.grid.cell)
+    expected, scatter = extrapolated_plane(data.dsm, kept, data.grid.cell)
     off = np.abs(data.dtm - expected)
     return np.asarray(asked & (away <= REACH_M) & (off > AGREE_M + scatter + rise(away)))
 
@@ -60,14 +60,14 @@ def rise(away: Floats) -> Floats:
     return away**2 / (2 * CREST_M)
 
 
-def without_unsound(data: TileData, clusters: RoadClusters) -> TileData:
+def without_invalid_dtm(data: TileData, clusters: RoadClusters) -> TileData:
     """Return the data without DTM where that is not sound, so that neither loss nor start see it."""
-    if clusters.unsound is None:
+    if clusters.dtm_invalid is None:
         return data
-    return replace(data, dtm=np.where(clusters.unsound, np.nan, data.dtm))
+    return replace(data, dtm=np.where(clusters.dtm_invalid, np.nan, data.dtm))
 
 
-def continuation(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Floats]:
+def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Floats]:
     """Return height and scatter (m) of the plane through the known cells around each cell, ``(H, W)`` each.
 
     Moving least squares with Gaussian weights; NaN where within `REACH_M` there is no known cell, or all of

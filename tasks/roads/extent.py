@@ -8,7 +8,7 @@ import scipy
 from flexroad.tasks.types import Bools, TileData
 
 
-def outside(data: TileData) -> Bools:
+def beyond_extent(data: TileData) -> Bools:
     """Return the cells beyond the survey, ``(H, W)``.
 
     Cells with neither DSM nor DTM, in a void (joined over cells' sides) that touches the grid's edge.

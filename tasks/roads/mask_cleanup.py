@@ -16,14 +16,14 @@ from pydantic import Field
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import Bools, TileData
 
 SLACK = 1e-9
 """Sizes count as reached within this part of a cell: 0.6 m is three cells of 0.2 m."""
 
 
-class Hygiene(options.Options):
+class Cleanup(options.Options):
     """What is done to a mask, in this order; 0 or none leaves it out."""
 
     fuse: Literal["none", "union", "intersection", "corridor"] = Field(
@@ -43,11 +43,11 @@ class Hygiene(options.Options):
     drop_m2: float = Field(25.0, ge=0, description="drop pieces smaller than this area (m2)")
 
 
-NOTHING = Hygiene(close_m=0, fill_m2=0, drop_m2=0)
+NOTHING = Cleanup(close_m=0, fill_m2=0, drop_m2=0)
 """Leaves every mask as it is."""
 
 
-def clean(mask: Bools, data: TileData, options: Hygiene) -> Bools:
+def clean(mask: Bools, data: TileData, options: Cleanup) -> Bools:
     """Return the tidied mask, ``(H, W)``; cells beyond the survey are never added.
 
     Gaps are closed before pieces are weighed, so that a road in fragments counts as one.
@@ -60,10 +60,10 @@ def clean(mask: Bools, data: TileData, options: Hygiene) -> Bools:
     cell = data.grid.cell
     fused = mask if options.fuse == "none" else fuse(mask, _second(data, options), cell, options)
     filled = fill(close(fused, cell, options.close_m), cell, options.fill_m2)
-    return drop(fused | (filled & ~outside(data)), cell, options.drop_m2)
+    return drop(fused | (filled & ~beyond_extent(data)), cell, options.drop_m2)
 
 
-def fuse(mask: Bools, second: Bools, cell: float, options: Hygiene) -> Bools:
+def fuse(mask: Bools, second: Bools, cell: float, options: Cleanup) -> Bools:
     """Return the mask joined with a second one as ``options.fuse`` says, ``(H, W)``."""
     match options.fuse:
         case "union":
@@ -132,14 +132,14 @@ def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int
     return pieces, stats[:, cv2.CC_STAT_AREA] * cell**2, inner
 
 
-def _second(data: TileData, options: Hygiene) -> Bools:
+def _second(data: TileData, options: Cleanup) -> Bools:
     if options.fuse_with == "road_mask" and data.road_mask is not None:
         return data.road_mask
     if options.fuse_with == "roads" and data.roads is not None:
-        return rasterise.burn(data, options.roads)
+        return rasterise.rasterise_roads(data, options.roads)
     raise TaskError(
-        f"hygiene.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
-        f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set hygiene.fuse: none",
+        f"cleanup.fuse: {options.fuse} needs {options.fuse_with}, which the tile lacks; give "
+        f"--{options.fuse_with.replace('_', '-')} to `flexroad catalog rasters`, or set cleanup.fuse: none",
         layer=options.fuse_with,
     )
 

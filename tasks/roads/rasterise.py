@@ -15,7 +15,7 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.vectors import Asked, near
+from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -76,7 +76,7 @@ class Roads:
     notes: tuple[str, ...] = ()
 
 
-def burn(data: TileData, options: Options = DEFAULTS) -> Bools:
+def rasterise_roads(data: TileData, options: Options = DEFAULTS) -> Bools:
     """Return the cells of a tile whose centre is on a road, ``(H, W)``; see `roads` for errors."""
     return cells(roads(data.roads, data.grid, options).areas, data.grid)
 
@@ -120,7 +120,8 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     columns = _columns(options)
     found = [
         _of_table(
-            near(Asked(path, options.layer, options.where, columns, source.crs, grid.crs), bounds), options
+            read_near(Query(path, options.layer, options.where, columns, source.crs, grid.crs), bounds),
+            options,
         )
         for path in source.paths
     ]

@@ -6,7 +6,7 @@ from typing import Literal
 
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
@@ -37,4 +37,4 @@ def segment(data: TileData, options: Options) -> RoadMask:
             "of `flexroad catalog rasters` which values mean road",
             layer="road_mask",
         )
-    return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=outside(data))
+    return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=beyond_extent(data))

@@ -8,8 +8,8 @@ from pydantic import Field
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
-from flexroad.tasks.roads.extent import outside
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene, clean
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
@@ -20,7 +20,7 @@ class Options(rasterise.Options):
     """Which features are roads, how wide they are, and how the mask is tidied."""
 
     method: Literal["vector"] = "vector"
-    hygiene: Hygiene = Field(NOTHING, description="tidying of the mask; by default it is left as it is")
+    cleanup: Cleanup = Field(NOTHING, description="tidying of the mask; by default it is left as it is")
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
@@ -33,7 +33,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     """
     found = rasterise.roads(data.roads, data.grid, options)
     burnt = rasterise.cells(found.areas, data.grid)
-    mask = clean(burnt, data, options.hygiene)
+    mask = clean(burnt, data, options.cleanup)
     if not mask[data.grid.window(data.core)].any():
         files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
         raise TaskError(
@@ -45,7 +45,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         grid=data.grid,
         core=data.core,
         mask=mask,
-        outside=outside(data),
+        outside=beyond_extent(data),
         bridge=rasterise.cells(found.areas[found.bridge], data.grid) & mask,
         notes=found.notes,
     )

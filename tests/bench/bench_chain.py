@@ -15,7 +15,7 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.worker.tile import do_tile
+from flexroad.pipeline.worker.tile import process_tile
 
 TILES = 8
 MANY = 2000
@@ -35,11 +35,11 @@ def main(many: int = MANY) -> None:
 def table(config: Config, catalog: Catalog, folder: Path) -> None:
     run = Run.create(folder, config, catalog)
     # The first tile compiles, or reads what was compiled.
-    do_tile(run.job(run.graph(run.catalog.tiles[0]), frozenset(STAGE_NAMES)))
+    process_tile(run.job(run.graph(run.catalog.tiles[0]), frozenset(STAGE_NAMES)))
     totals, stages = [], []
     for graph in map(run.graph, run.catalog.tiles):
         start = time.perf_counter()
-        stages.append(do_tile(run.job(graph, frozenset(STAGE_NAMES))).seconds)
+        stages.append(process_tile(run.job(graph, frozenset(STAGE_NAMES))).seconds)
         totals.append(time.perf_counter() - start)
     names = [*STAGE_NAMES, "export"]
     each = {name: statistics.median(seconds[name] for seconds in stages) for name in names}
@@ -61,7 +61,7 @@ def growth(config: Config, catalog: Catalog, folder: Path, many: int) -> None:
     for done in range(many):
         if done % every == 0:
             print(f"  {done:6} {resident_mb():8.0f}")
-        do_tile(run.job(graphs[done % len(graphs)], frozenset(STAGE_NAMES)))
+        process_tile(run.job(graphs[done % len(graphs)], frozenset(STAGE_NAMES)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
         f"  {many:6} {resident_mb():8.0f}   peak {peak:.0f} MB; the limit is 700 MB: {peak / 700:.2f} of it"

@@ -33,9 +33,9 @@ from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
-from flexroad.pipeline.store.database import NAME as LEDGER
-from flexroad.pipeline.worker.tile import Job, TileResult, failed_row
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.store.database import NAME as DATABASE
+from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
@@ -78,8 +78,8 @@ def main(tiles: int = TILES, plot: Path | None = None) -> None:
         overhead(Run.create(folder / "ASLEEP", config, catalog))
         memory = watched(run)
         resumed(folder, side**2)
-        size = (run.path / LEDGER).stat().st_size
-        print(f"ledger {size / 2**20:.1f} MB; of a state {size / side**2 * STATE / 2**30:.1f} GB")
+        size = (run.path / DATABASE).stat().st_size
+        print(f"database {size / 2**20:.1f} MB; of a state {size / side**2 * STATE / 2**30:.1f} GB")
         if plot:
             draw(memory, plot)
 
@@ -113,14 +113,14 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
 # --- overhead -----------------------------------------------------------------------------------------
 
 
-def sleep_tile(job: Job) -> TileResult:
+def sleep_tile(job: TileJob) -> TileResult:
     """Take as long as a real tile, and send back as much."""
-    from flexroad.pipeline.store.records import Entry
+    from flexroad.pipeline.store.records import TileRecord
 
     time.sleep(SLEEP_S)
     rows = tuple(failed_row(job.graph, v, "") | {"status": "done"} for v in job.graph.variants)
     return TileResult(
-        Entry(job.graph.tile.id, "done", job.graph.fingerprint, rows, sources=job.graph.sources), "done"
+        TileRecord(job.graph.tile.id, "done", job.graph.fingerprint, rows, sources=job.graph.sources), "done"
     )
 
 
@@ -159,7 +159,7 @@ def busy(processes: list[psutil.Process]) -> float:
 def overhead(run: Run) -> None:
     asleep = Asleep(SLEEPERS)
     some = {tile.id for tile in run.catalog.tiles[:ASLEEP]}
-    execute(run, asleep, only=lambda tile: tile.id in some)
+    run_tiles(run, asleep, only=lambda tile: tile.id in some)
     # Of each worker's first tile one sees the end only.
     first, tiles = SLEEPERS - 1, len(asleep.times) - SLEEPERS
     wall, slept = asleep.times[-1] - asleep.times[first], SLEEP_S * tiles
@@ -213,7 +213,7 @@ def watched(run: Run) -> Memory:
     looking = threading.Thread(target=memory.keep_looking, args=(over, 1.0))
     looking.start()
     try:
-        how, took = timed(lambda: execute(run, DaskExecutor(WORKERS), watch=memory.note))
+        how, took = timed(lambda: run_tiles(run, DaskExecutor(WORKERS), watch=memory.note))
     finally:
         over.set()
         looking.join()
@@ -252,9 +252,9 @@ def resumed(folder: Path, tiles: int) -> None:
     for words in commands:
         _, took = timed(lambda words=words: flexroad(folder, words))
         say(f"flexroad {words[0]}", took, tiles)
-    (folder / "RUN" / LEDGER).unlink()
+    (folder / "RUN" / DATABASE).unlink()
     _, took = timed(lambda: flexroad(folder, again))
-    say("flexroad run, ledger lost", took, tiles)
+    say("flexroad run, database lost", took, tiles)
 
 
 def flexroad(folder: Path, words: list[str]) -> None:

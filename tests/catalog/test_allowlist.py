@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
-from flexroad.catalog.allowlist import needed, refuse_outside
+from flexroad.catalog.allowlist import check_allowed, needed
 from flexroad.catalog.tile import LAYERS
 
 
@@ -30,27 +30,27 @@ def test_a_file_outside_is_refused_and_the_option_named_that_allows_it(tmp_path,
     found = catalog("dsm/in.tif", file, root=home)
     option = f"--allow {allow.format(tmp_path / 'dsm')}"
     with pytest.raises(CatalogError, match="^tile one: dsm names ") as caught:
-        refuse_outside(found, home)
+        check_allowed(found, home)
     assert str(caught.value).endswith(f"if that is meant, add {option}")
     (folder,) = needed(found, home)
     assert folder in option
-    refuse_outside(found, home, [folder])
-    refuse_outside(found, home, [folder + "/"])
+    check_allowed(found, home, [folder])
+    check_allowed(found, home, [folder + "/"])
     with pytest.raises(CatalogError):
-        refuse_outside(found, home, [folder + "-more"])
+        check_allowed(found, home, [folder + "-more"])
 
 
 @pytest.mark.parametrize("file", ["https://host/a.tif", "file:///etc/passwd", "ftp://host/a", "HTTP:/host/a"])
 def test_other_addresses_are_never_read(tmp_path, file):
     for found in (catalog(file, root=tmp_path), catalog("a.tif", root=file)):
         with pytest.raises(CatalogError, match="fetch it first"):
-            refuse_outside(found, tmp_path, ["/", file])
+            check_allowed(found, tmp_path, ["/", file])
 
 
 def test_a_catalog_cannot_say_itself_where_its_folder_is(tmp_path):
     """As the root that a run's own copy names."""
     with pytest.raises(CatalogError, match="--allow /etc"):
-        refuse_outside(catalog("passwd", root="/etc"), tmp_path)
+        check_allowed(catalog("passwd", root="/etc"), tmp_path)
 
 
 def test_folders_of_links_stay_usable(tmp_path):
@@ -58,19 +58,19 @@ def test_folders_of_links_stay_usable(tmp_path):
     data.mkdir()
     home.mkdir()
     (home / "dsm").symlink_to(data)
-    refuse_outside(catalog("dsm/a.tif", root=home), home)
+    check_allowed(catalog("dsm/a.tif", root=home), home)
     # By either name of the catalog's own folder.
     (tmp_path / "alias").symlink_to(home)
-    refuse_outside(catalog("dsm/a.tif", root=home), tmp_path / "alias")
-    refuse_outside(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
+    check_allowed(catalog("dsm/a.tif", root=home), tmp_path / "alias")
+    check_allowed(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
 
 
 @pytest.mark.slow
 def test_a_catalog_in_a_bucket_has_its_folder_there(bucket):
-    refuse_outside(catalog("dsm/a.tif", root=bucket), bucket)
+    check_allowed(catalog("dsm/a.tif", root=bucket), bucket)
     for file in ("../a.tif", "../../other/a.tif", "/data/a.tif", f"{bucket}-more/a.tif"):
         with pytest.raises(CatalogError, match="--allow"):
-            refuse_outside(catalog(file, root=bucket), bucket)
+            check_allowed(catalog(file, root=bucket), bucket)
 
 
 def test_what_needs_to_be_allowed_is_few(tmp_path):
@@ -87,7 +87,7 @@ def test_what_needs_to_be_allowed_is_few(tmp_path):
 def test_what_nobody_reads_may_lie_anywhere(tmp_path):
     found = catalog("/elsewhere/a.tif", root=tmp_path)
     others = set(LAYERS) - {"dsm"}
-    refuse_outside(found, tmp_path, layers=others)
+    check_allowed(found, tmp_path, layers=others)
     assert needed(found, tmp_path, others) == ()
     with pytest.raises(CatalogError, match="--allow /elsewhere"):
-        refuse_outside(found, tmp_path, layers={"dsm"})
+        check_allowed(found, tmp_path, layers={"dsm"})

@@ -5,7 +5,7 @@ from pyproj import CRS, Transformer
 from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import in_plan, metric_twin, plan_unit
 from flexroad.catalog.headers.point_clouds import inspect
-from flexroad.catalog.to_metres import Frame, agreed
+from flexroad.catalog.to_metres import MetricTransform, agreed
 
 OREGON = (637000.0, 852000.0)
 COLOGNE = (6.95, 50.94)
@@ -32,7 +32,7 @@ def nameless(code: str, shift: float = 0) -> str:
     ],
 )
 def test_a_plane_in_feet_has_its_twin_in_metres(feet, metres, place):
-    assert Frame.of(feet, place).target == metres
+    assert MetricTransform.of(feet, place).target == metres
 
 
 def test_a_twin_that_no_register_knows_is_described():
@@ -44,7 +44,7 @@ def test_a_twin_that_no_register_knows_is_described():
 
 def test_feet_become_metres_by_multiplication_alone():
     """And PROJ agrees, up to the digits that the register has of the twins' false eastings."""
-    frame = Frame.of("EPSG:2994", OREGON)
+    frame = MetricTransform.of("EPSG:2994", OREGON)
     x, y, z = np.array([635652.69, 639003.73]), np.array([851377.98, 853537.66]), np.array([407.81, 598.15])
     got = frame.metres(x, y, z)
     assert np.array_equal(got, [x * 0.3048, y * 0.3048, z * 0.3048])
@@ -55,10 +55,10 @@ def test_feet_become_metres_by_multiplication_alone():
 def test_the_two_feet_are_kept_apart():
     """2 ppm: 4 m in 6.5 million feet of California."""
     x, zero = np.array([6.5e6]), np.zeros(1)
-    survey = Frame.of("EPSG:2227", (6.5e6, 2.1e6)).metres(x, zero, x)
+    survey = MetricTransform.of("EPSG:2227", (6.5e6, 2.1e6)).metres(x, zero, x)
     assert survey[0][0] == pytest.approx(6.5e6 * 1200 / 3937, abs=1e-6)
     assert survey[2][0] == pytest.approx(6.5e6 * 1200 / 3937, abs=1e-6)
-    assert Frame.of("EPSG:2994", OREGON).metres(x, zero, x)[0][0] == 6.5e6 * 0.3048
+    assert MetricTransform.of("EPSG:2994", OREGON).metres(x, zero, x)[0][0] == 6.5e6 * 0.3048
     assert abs(6.5e6 * 1200 / 3937 - 6.5e6 * 0.3048) > 3.9
 
 
@@ -75,14 +75,14 @@ def test_the_two_feet_are_kept_apart():
     ],
 )
 def test_heights_have_a_unit_of_their_own(crs, unit, metres, notes):
-    frame = Frame.of(crs, OREGON, unit=unit)
+    frame = MetricTransform.of(crs, OREGON, unit=unit)
     assert frame.height_m == pytest.approx(metres, rel=1e-12)
     assert len(frame.notes) == notes
     assert all("taken to be in feet, like the plan; --height-unit" in note for note in frame.notes)
 
 
 def test_degrees_go_to_the_zone_of_the_place():
-    frame = Frame.of("EPSG:4326", COLOGNE)
+    frame = MetricTransform.of("EPSG:4326", COLOGNE)
     assert (frame.target, frame.height_m, frame.notes) == ("EPSG:32632", 1.0, ())
     east, north = np.array([COLOGNE[0], 6.96]), np.array([COLOGNE[1], 50.95])
     got = frame.metres(east, north, np.array([50.0, 60.0]))
@@ -92,11 +92,11 @@ def test_degrees_go_to_the_zone_of_the_place():
 
 
 def test_another_crs_may_be_asked_for():
-    frame = Frame.of("EPSG:2994", OREGON, to_crs="EPSG:32610")
+    frame = MetricTransform.of("EPSG:2994", OREGON, to_crs="EPSG:32610")
     x, y = np.array([OREGON[0]]), np.array([OREGON[1]])
     want = Transformer.from_crs("EPSG:2994", "EPSG:32610", always_xy=True).transform(x, y)
     assert np.array_equal(frame.metres(x, y, x)[:2], want)
-    assert Frame.of("EPSG:2994", OREGON, to_crs="EPSG:2993").plan_m == 0.3048
+    assert MetricTransform.of("EPSG:2994", OREGON, to_crs="EPSG:2993").plan_m == 0.3048
 
 
 @pytest.mark.parametrize(
@@ -112,11 +112,11 @@ def test_another_crs_may_be_asked_for():
 )
 def test_what_does_not_fit_is_one_line(how, message):
     with pytest.raises(CatalogError, match=message):
-        Frame.of(**{"source": "EPSG:2994", "place": OREGON, **how})
+        MetricTransform.of(**{"source": "EPSG:2994", "place": OREGON, **how})
 
 
 def test_a_place_that_the_target_does_not_have_is_an_error():
-    frame = Frame.of("EPSG:4326", COLOGNE, to_crs="EPSG:25832")
+    frame = MetricTransform.of("EPSG:4326", COLOGNE, to_crs="EPSG:25832")
     with pytest.raises(CatalogError, match="in EPSG:4326 lie nowhere in EPSG:25832; .* --to-crs"):
         frame.metres(np.array([7.0]), np.array([95.0]), np.zeros(1))
 
@@ -138,5 +138,5 @@ def test_files_of_a_set_share_one_crs():
 @pytest.mark.real
 def test_the_survey_without_a_code_gets_one(real_data):
     cloud = inspect(real_data / "autzen" / "autzen_north.laz")
-    assert Frame.of(cloud.crs, cloud.bounds[:2]).target == "EPSG:2993"
+    assert MetricTransform.of(cloud.crs, cloud.bounds[:2]).target == "EPSG:2993"
     assert inspect(real_data / "autzen" / "autzen-thin.las").crs is None

@@ -22,7 +22,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 
 ROOT = Path(__file__).parents[2]
 MODULES = [
@@ -41,7 +41,7 @@ def city(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("library")
     catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=0, size_m=60))
     run = Run.create(folder / "runs" / "city", load_config("nightly"), catalog)
-    execute(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
+    run_tiles(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
     return folder
 
 
@@ -305,7 +305,7 @@ def test_run_lists_failures(city, tmp_path):
     run = Run.create(tmp_path / "run", load_config("nightly"), catalog)
     with pytest.raises(flexroad.ConfigError, match=r"failures.csv does not exist"):
         assert flexroad.open_run(run.path).failures
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     view = flexroad.open_run(run.path)
     assert view.failures[["tile_id", "stage"]].values.tolist() == [["499980_5599980", "load"]]
     assert view.tiles.state.tolist() == ["failed"]

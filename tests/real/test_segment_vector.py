@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.tasks.roads.rasterise import Options, burn
+from flexroad.tasks.roads.rasterise import Options, rasterise_roads
 from flexroad.tasks.segment import vector
 from flexroad.tasks.types import Source, TileData
 
@@ -25,8 +25,10 @@ def north(real_data) -> TileData:
 def iou(data: TileData, **options) -> float:
     """Of centre lines against polygons; what is uncertain counts in neither."""
     areas = f"{SURE} AND visible_in <> 'rgb'"
-    truth = burn(data, Options(layer="road_polygons", where=areas))
-    unsure = burn(data, Options(layer="road_polygons", where="class = 'road' AND certainty = 'low'"))
+    truth = rasterise_roads(data, Options(layer="road_polygons", where=areas))
+    unsure = rasterise_roads(
+        data, Options(layer="road_polygons", where="class = 'road' AND certainty = 'low'")
+    )
     found = vector.segment(data, vector.Options(layer="road_centerlines", where=SURE, **options)).mask
     return float((found & truth)[~unsure].sum() / (found | truth)[~unsure].sum())
 

@@ -13,9 +13,9 @@ from matplotlib.ticker import MaxNLocator
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.reproduce.figures.plate import PATH, STRATA, Plate, new_figure
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull, StageError
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.types import TileData
 
 NAME = "dataset"
@@ -36,10 +36,10 @@ def statistics(run: Run, full: str, done: Table) -> Table:
     table = done.loc[done.variant == full, ["tile_id", "stratum", "road_fraction"]].copy()
     wanted = set(table.tile_id)
     ranges: dict[str, float] = {}
-    for found in look_at(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
+    for found in peek_statuses(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
         graph = found.graph
         try:
-            data: TileData = Pull(graph, Store(run.store))(graph.variants[full]["load"])
+            data: TileData = Evaluator(graph, ArtefactStore(run.store))(graph.variants[full]["load"])
         except StageError as error:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
         dsm = data.dsm[data.grid.window(data.core)]

@@ -13,9 +13,9 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.reproduce.figures.cast import Cast
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import look_at
-from flexroad.pipeline.store.artefacts import Store
-from flexroad.pipeline.worker.evaluator import Pull, StageError
+from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
@@ -80,18 +80,18 @@ def view_tile(run: Run, tile_id: str, cast: Cast) -> TileView:
         If a variant is, or a stage fails on the tile.
     """
     (tile,) = run.catalog.select([tile_id]).tiles
-    (found,) = look_at(run, [tile])
+    (found,) = peek_statuses(run, [tile])
     graph = found.graph
     for variant in cast.names:
         if variant not in graph.variants:
             raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
     try:
-        return _view(graph, Pull(graph, Store(run.store)), cast)
+        return _view(graph, Evaluator(graph, ArtefactStore(run.store)), cast)
     except StageError as error:
         raise ConfigError(f"tile {tile_id}: {error}; name another with --tile") from error
 
 
-def _view(graph: TileGraph, pull: Pull, cast: Cast) -> TileView:
+def _view(graph: TileGraph, pull: Evaluator, cast: Cast) -> TileView:
     made = graph.variants[cast.full]
     data: TileData = pull(made["load"])
     road: RoadMask = pull(made["segment"])
@@ -111,7 +111,7 @@ def _view(graph: TileGraph, pull: Pull, cast: Cast) -> TileView:
     )
 
 
-def _result(graph: TileGraph, pull: Pull, variant: str, core: Grid) -> Result:
+def _result(graph: TileGraph, pull: Evaluator, variant: str, core: Grid) -> Result:
     mesh: Mesh = pull(graph.variants[variant]["sample"])
     metrics: Metrics = pull(graph.variants[variant]["evaluate"])
     return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), metrics)

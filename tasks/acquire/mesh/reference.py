@@ -55,9 +55,9 @@ def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float, options: ecsrc
     kept = _kept(dtm, ground, grid, options)
     voids_of_all, _ = label(~kept, np.ones((3, 3)))
     # Voids that lost no ground keep the heights they were bridged with.
-    anew = np.isin(voids_of_all, voids_of_all[ground & ~kept]) & ~kept
+    force = np.isin(voids_of_all, voids_of_all[ground & ~kept]) & ~kept
     bridged = fill_voids.fill(np.where(kept, dtm, np.nan), grid, fill_m)
-    return np.where(anew & np.isfinite(dtm), bridged, dtm)
+    return np.where(force & np.isfinite(dtm), bridged, dtm)
 
 
 def reference(

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.to_metres import Frame
+from flexroad.catalog.to_metres import MetricTransform
 from flexroad.tasks.acquire.types import Points
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Bools, Floats, Photo
+from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 CHUNK = 500_000
 """Points, or rays of the orthophoto, coloured at a time: memory does not grow with the area."""
@@ -75,7 +75,7 @@ class TexturedMesh:
         return float(np.linalg.norm(self.normals, axis=1).sum() / 2)
 
 
-def in_metres(mesh: TexturedMesh, frame: Frame) -> TexturedMesh:
+def in_metres(mesh: TexturedMesh, frame: MetricTransform) -> TexturedMesh:
     """Return the mesh in the frame's CRS, in metres.
 
     Raises
@@ -122,7 +122,7 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
         yield Points(east, north, up, np.zeros(len(up), np.uint8), colour)
 
 
-def orthophoto(mesh: TexturedMesh, grid: Grid) -> Photo:
+def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
     """Draw the mesh as seen from straight above: the colour of the highest surface under each ray.
 
     Where the texture is finer than the pixels, several rays a pixel, `MOST_RAYS` across at most, are
@@ -147,7 +147,7 @@ def orthophoto(mesh: TexturedMesh, grid: Grid) -> Photo:
     for first in range(0, grid.height, rows):
         band = slice(first, min(first + rows, grid.height))
         colour[:, band], known[band] = _band(mesh, grid, band, rays)
-    return Photo(grid, colour, known)
+    return Orthophoto(grid, colour, known)
 
 
 def tops(mesh: TexturedMesh, grid: Grid) -> Floats:

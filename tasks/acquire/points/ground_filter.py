@@ -248,7 +248,7 @@ def _ground(
     for b in range(rows * cols):
         if start[b] < start[b + 1]:
             floor[b] = z[start[b]]
-    suspects = np.empty((2 * math.ceil(radius / side) + 3) ** 2, np.int64)
+    quarantined = np.empty((2 * math.ceil(radius / side) + 3) ** 2, np.int64)
     for b in range(rows * cols):
         if start[b] == start[b + 1]:
             continue
@@ -260,14 +260,14 @@ def _ground(
             if out[p]:
                 top = z[p]
         # The rest is compared with all buckets that are low enough for the highest of them.
-        count = _suspects(floor, shape, side, b, radius, slope, tolerance, top, suspects)
+        count = _suspects(floor, shape, side, b, radius, slope, tolerance, top, quarantined)
         for p in range(start[b], start[b + 1]):
             for k in range(count):
                 if not out[p]:
                     break
-                row, col = divmod(suspects[k], cols)
+                row, col = divmod(quarantined[k], cols)
                 gap = math.sqrt(_gap(x[p], x[p], col, side) ** 2 + _gap(y[p], y[p], row, side) ** 2)
-                first, end = start[suspects[k]], start[suspects[k] + 1]
+                first, end = start[quarantined[k]], start[quarantined[k] + 1]
                 out[p] = not _over(x, y, z, p, first, end, radius, slope, tolerance, gap)
     return out
 
@@ -325,7 +325,7 @@ def _suspects(
     slope: float,
     tolerance: float,
     top: float,
-    suspects: Indices,
+    quarantined: Indices,
 ) -> int:
     """List the buckets a point of bucket b at a height of top might stand too high over; return how many."""
     row, col = divmod(b, shape[1])
@@ -344,6 +344,6 @@ def _suspects(
                 continue
             gap = math.sqrt(_gap(west, west + side, c, side) ** 2 + away**2)
             if gap <= radius and drop > slope * gap + tolerance:
-                suspects[count] = r * shape[1] + c
+                quarantined[count] = r * shape[1] + c
                 count += 1
     return count

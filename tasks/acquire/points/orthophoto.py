@@ -9,13 +9,13 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points.binning import Cells, bins
 from flexroad.tasks.acquire.types import Points
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats, Photo
+from flexroad.tasks.types import Floats, Orthophoto
 
 Codes = NDArray[np.int32]
 """A colour as one number, red above green above blue; -1 is unknown."""
 
 
-def photo(points: Points, grid: Grid, fill_m: float) -> Photo:
+def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
     """Return the colour of the highest point in each pixel; voids take that of the nearest known pixel.
 
     Of points at the same height the one of the greatest red, then green, then blue counts; of pixels at
@@ -39,7 +39,7 @@ def photo(points: Points, grid: Grid, fill_m: float) -> Photo:
     codes = _nearest(found, _steps(fill_m / grid.cell))[rim.window(grid)]
     colour = np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255]).astype(np.uint8)
     known = codes >= 0
-    return Photo(grid, np.where(known, colour, np.uint8(0)), known)
+    return Orthophoto(grid, np.where(known, colour, np.uint8(0)), known)
 
 
 @compiled()

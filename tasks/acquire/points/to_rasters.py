@@ -19,7 +19,7 @@ from flexroad.tasks.acquire.points.binning import Cells, bins, means
 from flexroad.tasks.acquire.points.max_height import highest, spikes
 from flexroad.tasks.acquire.points.orthophoto import photo
 from flexroad.tasks.acquire.types import Points, Rasters
-from flexroad.tasks.types import Bools, Floats, Photo
+from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 
 class Options(base.Options):
@@ -154,7 +154,7 @@ def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:
     return dtm.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
 
 
-def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Photo | None:
+def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Orthophoto | None:
     if points.colour is None or dop_cell is None:
         return None
     return photo(points, Grid.covering(grid.crs, grid.bounds, dop_cell), options.dop_fill_m)

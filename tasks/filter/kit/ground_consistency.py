@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats
 
-ALONE, OFF, ON = np.uint8(0), np.uint8(1), np.uint8(2)
+NO_NEIGHBOURS, INCONSISTENT, CONSISTENT = np.uint8(0), np.uint8(1), np.uint8(2)
 """Nothing known is near; the cell is off what is known; it lies on it."""
 SURE = 0.5
 """A plane counts where the variance of its height is at most this part of a single cell's."""
@@ -21,7 +21,7 @@ Window = tuple[int, int, int, int]
 def against_known(
     dsm: Floats, dtm: Floats, known: Bools, asked: Bools, reach: int, theta: float
 ) -> NDArray[np.uint8]:
-    """Return `ALONE`, `OFF` or `ON` for the asked cells, ``(H, W)``.
+    """Return `NO_NEIGHBOURS`, `INCONSISTENT` or `CONSISTENT` for the asked cells, ``(H, W)``.
 
     What is known are the cells in the square of ``reach`` cells around. A cell lies on them if it is within
     ``theta`` (m) of the DTM plus their mean height above it, or of their least-squares plane, where that is
@@ -39,7 +39,7 @@ def against_known(
             on = abs(dsm[r, c] - dtm[r, c] - over) <= theta
             if n > 0:
                 on = on or abs(_above_plane(dsm, known, window, n, r, c)) <= theta
-                found[r, c] = ON if on else OFF
+                found[r, c] = CONSISTENT if on else INCONSISTENT
     return found
 
 

@@ -16,13 +16,13 @@ Roots = NDArray[np.int32]
 """Flat index of each cell's parent, ``(H * W,)``; a root is its own parent, -1 is no member."""
 
 
-def plant(members: Bools) -> Roots:
+def init(members: Bools) -> Roots:
     """Return a forest in which every member is a cluster of its own."""
     cells = np.arange(members.size, dtype=np.int32)
     return np.where(members.ravel(), cells, np.int32(-1))
 
 
-def half_disc(radius: float) -> NDArray[np.int64]:
+def forward_offsets(radius: float) -> NDArray[np.int64]:
     """Return the (row, col) steps of up to ``radius`` cells that go forward in row-major order, ``(n, 2)``.
 
     A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc are the same pairs of
@@ -37,7 +37,7 @@ def half_disc(radius: float) -> NDArray[np.int64]:
 
 
 @compiled()
-def root(roots: Roots, i: int) -> int:
+def find(roots: Roots, i: int) -> int:
     """Return the root of a cell, and shorten the way to it."""
     while roots[i] != i:
         roots[i] = roots[roots[i]]
@@ -46,7 +46,7 @@ def root(roots: Roots, i: int) -> int:
 
 
 @compiled()
-def flatten(roots: Roots) -> Roots:
+def compress(roots: Roots) -> Roots:
     """Let every member point at its root, in place."""
     # A parent comes before its children, so it already points at the root.
     for i in range(roots.size):

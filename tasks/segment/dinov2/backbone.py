@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.types import Photo
+from flexroad.tasks.types import Orthophoto
 
 if TYPE_CHECKING:
     import torch
@@ -32,7 +32,7 @@ KINDS = ("dinov2", "dinov2_with_registers")
 
 
 def normalised(
-    photo: Photo, mean: tuple[float, float, float] = MEAN, std: tuple[float, float, float] = STD
+    photo: Orthophoto, mean: tuple[float, float, float] = MEAN, std: tuple[float, float, float] = STD
 ) -> NDArray[np.float32]:
     """Return a photo as the backbone wants it, ``(3, h, w)``; what is unknown has the mean colour."""
     centre, spread = (np.array(v, np.float32)[:, None, None] for v in (mean, std))

@@ -17,16 +17,16 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import coregistration
-from flexroad.tasks.roads.extent import outside
-from flexroad.tasks.roads.mask_cleanup import Hygiene, clean
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
 from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, Device, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.windows import blend, cover
-from flexroad.tasks.types import Bools, Photo, RoadMask, TileData
+from flexroad.tasks.types import Bools, Orthophoto, RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")
-"""The roads where the hygiene fuses with them."""
+"""The roads where the cleanup fuses with them."""
 TIE_M = 1e-6
 """Of pixels equally near to a cell's centre the one in the south-east is taken, in every tile."""
 
@@ -54,7 +54,7 @@ class Options(options.Options):
     threshold: float | None = Field(
         None, gt=0, lt=1, description="probability from which a pixel is road; null: the head's"
     )
-    hygiene: Hygiene = Field(Hygiene(), description="how the mask is tidied")
+    cleanup: Cleanup = Field(Cleanup(), description="how the mask is tidied")
 
 
 def files(options: Options) -> tuple[Path, ...]:
@@ -90,7 +90,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     photo, probability = _seen(data, head, backbone, options)
     row, col = photo.grid.cells(*_centres(data.grid))
     threshold = options.threshold or head.about.threshold
-    mask = clean(probability[row, col] >= threshold, data, options.hygiene)
+    mask = clean(probability[row, col] >= threshold, data, options.cleanup)
     if not mask[data.grid.window(data.core)].any():
         raise TaskError(
             f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
@@ -101,7 +101,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         grid=data.grid,
         core=data.core,
         mask=mask,
-        outside=outside(data),
+        outside=beyond_extent(data),
         probability=_mean(probability, photo.grid, data.grid),
         notes=_notes(photo.known[row, col], coregistration.note(data, photo)),
     )
@@ -109,7 +109,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
 
 def _seen(
     data: TileData, head: Head, backbone: Backbone, options: Options
-) -> tuple[Photo, NDArray[np.float32]]:
+) -> tuple[Orthophoto, NDArray[np.float32]]:
     """Return the photo around the tile and the probability of road of its pixels, 0 where it has none."""
     gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
     from flexroad.tasks.io.orthophoto import read_photo

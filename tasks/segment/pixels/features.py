@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.tasks.types import Photo, TileData
+from flexroad.tasks.types import Orthophoto, TileData
 
 Layer = NDArray[np.float32]
 """One value a cell, ``(H, W)``; NaN where unknown."""
@@ -41,7 +41,7 @@ class Features:
     """``(n, H, W)``, in the order of the names; NaN where unknown."""
 
 
-def look(data: TileData) -> Photo | None:
+def look(data: TileData) -> Orthophoto | None:
     """Return the tile's photo with four pixels a cell, or None if the tile has none.
 
     Raises
@@ -54,7 +54,7 @@ def look(data: TileData) -> Photo | None:
     return read_photo(data.dop, data.grid, data.grid.cell / 2) if data.dop else None
 
 
-def features(data: TileData, photo: Photo | None) -> Features:
+def features(data: TileData, photo: Orthophoto | None) -> Features:
     """Return the features of a tile's cells.
 
     Parameters
@@ -85,7 +85,7 @@ def _of_heights(data: TileData) -> Iterator[tuple[str, Layer]]:
         yield from _relief("dtm", dtm, scale, cell)
 
 
-def _of_colours(photo: Photo, cell: float) -> Iterator[tuple[str, Layer]]:
+def _of_colours(photo: Orthophoto, cell: float) -> Iterator[tuple[str, Layer]]:
     fine = np.where(photo.known, photo.colour.astype(np.float32), np.float32(np.nan))
     red, green, blue = (_quarter(band) for band in fine)
     total = red + green + blue + 1

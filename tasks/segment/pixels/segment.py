@@ -10,15 +10,15 @@ from pydantic import Field
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import coregistration
-from flexroad.tasks.roads.extent import outside
-from flexroad.tasks.roads.mask_cleanup import Hygiene, clean
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
 from flexroad.tasks.segment.pixels.features import features, look
 from flexroad.tasks.segment.pixels.model import About, read_model
-from flexroad.tasks.types import Photo, RoadMask, TileData
+from flexroad.tasks.types import Orthophoto, RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")
-"""The roads where the hygiene fuses with them."""
+"""The roads where the cleanup fuses with them."""
 SHOWN = 0.99
 """Share of the tile below which it is said how much the photo shows."""
 
@@ -31,7 +31,7 @@ class Options(options.Options):
     threshold: float | None = Field(
         None, gt=0, lt=1, description="probability from which a cell is road; null: the model's"
     )
-    hygiene: Hygiene = Field(Hygiene(), description="how the mask is tidied")
+    cleanup: Cleanup = Field(Cleanup(), description="how the mask is tidied")
 
 
 def files(options: Options) -> tuple[Path, ...]:
@@ -49,10 +49,10 @@ def segment(data: TileData, options: Options) -> RoadMask:
     """
     model = read_model(options.model)
     photo = _photo(data, model.about, options.model)
-    beyond = outside(data)
+    beyond = beyond_extent(data)
     probability = model.probability(features(data, photo), ~beyond)
     threshold = options.threshold or model.about.threshold
-    mask = clean(probability >= threshold, data, options.hygiene)
+    mask = clean(probability >= threshold, data, options.cleanup)
     core = data.grid.window(data.core)
     if not mask[core].any():
         raise TaskError(
@@ -64,7 +64,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     return RoadMask(data.grid, data.core, mask, beyond, probability=probability, notes=notes)
 
 
-def _photo(data: TileData, about: About, path: Path) -> Photo | None:
+def _photo(data: TileData, about: About, path: Path) -> Orthophoto | None:
     """Return the tile's photo if the model looks at one."""
     if not about.photo:
         return None
@@ -78,7 +78,7 @@ def _photo(data: TileData, about: About, path: Path) -> Photo | None:
     return photo
 
 
-def _notes(data: TileData, photo: Photo | None, about: About) -> tuple[str, ...]:
+def _notes(data: TileData, photo: Orthophoto | None, about: About) -> tuple[str, ...]:
     notes: list[str | None] = []
     if abs(data.grid.cell / about.cell_m - 1) > 0.01:
         notes.append(f"segment: the model learnt from cells of {about.cell_m:g} m, not {data.grid.cell:g} m")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Sightings, place
+from flexroad.catalog.storage.paths import StatCache, parse_location
 from tests.s3_server import Fault
 
 
@@ -21,7 +21,7 @@ def test_what_is_written_is_seen_listed_and_read(folder):
         paths.write(folder / name, name.encode())
     found = paths.listing(folder)
     assert {name: seen.size for name, seen in found.items()} == {"a.bin": 5, "b/c.bin": 7, "b/d/e.bin": 9}
-    look = Sightings()
+    look = StatCache()
     for name, seen in found.items():
         assert paths.read(folder / name) == name.encode()
         assert paths.stat(folder / name) == look(folder / name) == seen
@@ -53,30 +53,30 @@ def test_what_is_missing_is_named(folder):
 
 @pytest.mark.slow
 def test_a_place_says_what_it_was_called(tmp_path, bucket):
-    assert place(str(tmp_path)) == tmp_path
-    assert type(place(str(tmp_path))) is type(tmp_path)
-    assert not paths.is_remote(place("a/s3:/b"))
+    assert parse_location(str(tmp_path)) == tmp_path
+    assert type(parse_location(str(tmp_path))) is type(tmp_path)
+    assert not paths.is_remote(parse_location("a/s3:/b"))
     address = f"{bucket}/a/b.tif"
     # A path has lost a slash on its way through a command line.
     for told in (address, Path(address), bucket / "a" / "b.tif"):
-        assert str(place(told)) == address
-        assert paths.is_remote(place(told))
-    assert paths.gdal_name(place(address)) == address.replace("s3://", "/vsis3/")
+        assert str(parse_location(told)) == address
+        assert paths.is_remote(parse_location(told))
+    assert paths.gdal_name(parse_location(address)) == address.replace("s3://", "/vsis3/")
 
 
 def test_without_s3fs_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
     with pytest.raises(OSError, match=r"install it with pip install 'flexroad\[s3\]'.*s3://bucket/name"):
-        place("s3://bucket/name")
+        parse_location("s3://bucket/name")
 
 
 def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):
     (tmp_path / "link").symlink_to("/")
-    assert paths.normal(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
-    assert paths.normal("s3://one/a/../b/c") == "s3://one/b/c"
+    assert paths.normalise(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
+    assert paths.normalise("s3://one/a/../b/c") == "s3://one/b/c"
     # Out of the bucket is another bucket, and no longer below the folder.
-    assert paths.normal("s3://one/a/../../../two/c") == "s3://two/c"
+    assert paths.normalise("s3://one/a/../../../two/c") == "s3://two/c"
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
     for i in range(20):
         paths.write(bucket / "data" / f"{i}.tif", b"x")
     storage.requests()
-    look = Sightings()
+    look = StatCache()
     assert all(look(bucket / "data" / f"{i}.tif") for i in range(20))
     assert len(storage.requests()) == 1
 
@@ -125,7 +125,7 @@ def test_storage_that_never_answers_is_named(bucket, storage, answer):
         lambda: paths.read(bucket / "a"),
         lambda: paths.stat(bucket / "a"),
         lambda: paths.listing(bucket),
-        lambda: Sightings()(bucket / "a"),
+        lambda: StatCache()(bucket / "a"),
     ):
         with pytest.raises(OSError, match=str(bucket)) as caught:
             attempt()

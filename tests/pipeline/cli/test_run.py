@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.cli.main import main
-from flexroad.pipeline.run.lock import held
+from flexroad.pipeline.run.lock import run_lock
 from tests.command_line import same_signals
 
 QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
@@ -110,7 +110,7 @@ def test_the_alarm_rings_when_nothing_could_start(flexroad, nightly, alarm, tmp_
     assert "dask and serial" in said
     # A run before this one tells nothing of it.
     assert "tiles" not in told
-    with held(tmp_path / "run"):
+    with run_lock(tmp_path / "run"):
         flexroad(*nightly, *alarm.words, expect=2)
     assert f"is in use by pid {os.getpid()}" in alarm.told["text"]
     flexroad(*nightly, "--wrokers", 2, *alarm.words, expect=2)
@@ -128,7 +128,7 @@ def test_an_interruption_rings_the_alarm_and_a_broken_alarm_changes_nothing(
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexroad.pipeline.run.runner.execute", interrupted)
+    monkeypatch.setattr("flexroad.pipeline.run.runner.run_tiles", interrupted)
     said = flexroad(*nightly, *alarm.words, expect=130)
     assert "interrupted; the same command goes on from here" in said
     assert alarm.told["exit_code"] == 130
@@ -176,6 +176,6 @@ def test_status_tells_who_is_at_work(flexroad, nightly, survey, tmp_path):
     Catalog(Catalog.read(survey).tiles[:1]).write(survey)
     flexroad(*nightly)
     assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"] is None
-    with held(tmp_path / "run"):
+    with run_lock(tmp_path / "run"):
         assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"]["pid"] == os.getpid()
         assert f"pid {os.getpid()} on" in flexroad("status", tmp_path / "run")

@@ -14,7 +14,7 @@ from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor
-from flexroad.pipeline.execute.clusters import kubernetes_options, opened, slurm_options
+from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster, slurm_options
 from tests.dask_processes import Processes, until, wait_for
 
 pytestmark = pytest.mark.slow
@@ -297,7 +297,7 @@ def test_the_section_reaches_kubernetes():
 def test_what_is_missing_is_named(kind, remedy, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "dask_kubernetes.operator", None)
-    with pytest.raises(ConfigError, match=remedy), opened(Cluster(kind=kind), None, None, False):
+    with pytest.raises(ConfigError, match=remedy), open_cluster(Cluster(kind=kind), None, None, False):
         pass
 
 

@@ -8,12 +8,12 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.inspect.points import Ground
 from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 
 
 def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
-    execute(run, SerialExecutor(), only=lambda tile: tile == run.catalog.tiles[0])
+    run_tiles(run, SerialExecutor(), only=lambda tile: tile == run.catalog.tiles[0])
     tile = run.catalog.tiles[0]
     found = open_tile(run.path, tile.id)
     assert set(found.data_vars) == {

@@ -6,10 +6,10 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from flexroad.pipeline.monitor.alerts import Patience, notify
+from flexroad.pipeline.monitor.alerts import RetryPolicy, notify
 
 TOLD = {"exit_code": 1, "failed": 3}
-QUICK = Patience(command_s=1, answer_s=1, pause_s=0.01)
+QUICK = RetryPolicy(command_s=1, answer_s=1, pause_s=0.01)
 
 
 @pytest.fixture

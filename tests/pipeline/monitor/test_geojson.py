@@ -11,22 +11,26 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.monitor.geojson import outlines, write_states
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.database import NAME, Ledger
-from flexroad.pipeline.store.records import Entry, Failure
+from flexroad.pipeline.store.database import NAME, RunDatabase
+from flexroad.pipeline.store.records import Failure, TileRecord
 
 
 @pytest.fixture
 def run(made_survey, quick_config, tmp_path) -> Run:
-    """Four tiles: one done, one found done, one failed, one that the ledger does not know."""
+    """Four tiles: one done, one found done, one failed, one that the database does not know."""
     catalog = Catalog.read(made_survey / "catalog.parquet")
     run = Run.create(tmp_path / "run", load_config(quick_config), catalog)
     one, two, three, _ = (tile.id for tile in catalog.tiles)
-    rows = tuple({"variant": name, "doubt_m": doubt} for name, doubt in (("rgt", 9.0), ("flexroad", 0.25)))
-    with Ledger.open(run.path / NAME) as ledger:
-        ledger.ask([(one, "done"), (two, "cached"), (three, "failed")])
-        ledger.record(Entry(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
-        ledger.record(Entry(three, "failed", "f", (), (Failure(three, "load", "TaskError", "no, file"),)))
-        ledger.ask([(one, "done"), (two, "cached"), (three, "failed")])
+    rows = tuple(
+        {"variant": name, "error_estimate_m": doubt} for name, doubt in (("rgt", 9.0), ("flexroad", 0.25))
+    )
+    with RunDatabase.open(run.path / NAME) as database:
+        database.ask([(one, "done"), (two, "cached"), (three, "failed")])
+        database.record(TileRecord(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
+        database.record(
+            TileRecord(three, "failed", "f", (), (Failure(three, "load", "TaskError", "no, file"),))
+        )
+        database.ask([(one, "done"), (two, "cached"), (three, "failed")])
     return run
 
 
@@ -38,10 +42,10 @@ def test_other_programs_read_it(run, tmp_path):
     assert table.state.tolist() == ["done", "cached", "failed", "pending"]
     done, _, failed, pending = table.itertuples()
     # Of the surface that is exported, not of the baselines.
-    assert (done.doubt_m, done.seconds) == (0.25, 1.5)
+    assert (done.error_estimate_m, done.seconds) == (0.25, 1.5)
     assert done.finished.isoformat() == "2026-11-21T02:00:00+00:00"
     assert failed.error == "load: TaskError: no, file"
-    assert table.loc[pending.Index, ["error", "seconds", "doubt_m", "finished"]].isna().all()
+    assert table.loc[pending.Index, ["error", "seconds", "error_estimate_m", "finished"]].isna().all()
     crs = run.catalog.tiles[0].grid.crs
     for tile, there in zip(run.catalog.tiles, table.to_crs(crs).geometry, strict=True):
         assert there.bounds == pytest.approx(tile.grid.bounds, abs=0.02)

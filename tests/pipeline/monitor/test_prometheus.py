@@ -5,13 +5,13 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.pipeline.monitor.prometheus import Textfile
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.records import Entry
-from flexroad.pipeline.worker.profiling import Span
+from flexroad.pipeline.store.records import TileRecord
+from flexroad.pipeline.worker.profiling import StageCost
 from flexroad.pipeline.worker.tile import TileResult
 
 
 def result(status, **spans) -> TileResult:
-    return TileResult(Entry("t", "done", "f", ()), status, spans)
+    return TileResult(TileRecord("t", "done", "f", ()), status, spans)
 
 
 def read(path) -> dict[tuple[str, str], float]:
@@ -36,8 +36,14 @@ def test_it_tells_how_a_run_goes_and_how_it_ended(tmp_path):
         assert read(path)["flexroad_run_running", ""] == 1
         told.total = 5
         told(result("cached"))
-        told(result("done", fit=Span(seconds=2, peak_mb=100, computed=1), load=Span(seconds=1, computed=1)))
-        told(result("failed", fit=Span(seconds=1, peak_mb=50, computed=1)))
+        told(
+            result(
+                "done",
+                fit=StageCost(seconds=2, peak_mb=100, computed=1),
+                load=StageCost(seconds=1, computed=1),
+            )
+        )
+        told(result("failed", fit=StageCost(seconds=1, peak_mb=50, computed=1)))
         told.write()
         going = read(path)
         assert tiles(going) == {"done": 1, "cached": 1, "failed": 1, "pending": 2}

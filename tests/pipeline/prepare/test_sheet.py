@@ -8,7 +8,7 @@ from rio_cogeo.cogeo import cog_validate
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.sheet import Sheet
-from flexroad.tasks.types import Photo
+from flexroad.tasks.types import Orthophoto
 
 CRS = "EPSG:25832"
 FACTS = {"SOURCE": "made", "DTM": "a slope"}
@@ -37,7 +37,7 @@ def fill(sheet, dop=True):
         if dop:
             pixels = Grid(CRS, part.west, part.north, 0.5, 2 * part.width, 2 * part.height)
             colour = np.full((3, *pixels.shape), 200, np.uint8)
-            sheet.write_photo(Photo(pixels, colour, np.ones(pixels.shape, bool)))
+            sheet.write_photo(Orthophoto(pixels, colour, np.ones(pixels.shape, bool)))
 
 
 def make(out, filling):
@@ -83,7 +83,7 @@ def test_pixels_without_colour_are_masked(tmp_path):
         west = Grid(CRS, whole.west, whole.north, 0.5, 100, 200)
         known = np.ones(west.shape, bool)
         known[:50] = False
-        sheet.write_photo(Photo(west, np.full((3, 200, 100), 9, np.uint8), known))
+        sheet.write_photo(Orthophoto(west, np.full((3, 200, 100), 9, np.uint8), known))
         sheet.publish()
     with rasterio.open(tmp_path / "dop.tif") as raster:
         mask = raster.dataset_mask() > 0

@@ -20,7 +20,7 @@ from flexroad.pipeline.reproduce.figures import cast as casting
 from flexroad.pipeline.reproduce.figures import dataset, maps, profile, renders, route, trade_off, view
 from flexroad.pipeline.reproduce.figures.plate import DPI
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,7 @@ CAST = casting.Cast("flexroad", "flat", "cells", "mixed", "bare")
 
 def finished(folder, raw, survey) -> Run:
     run = Run.create(folder, compose(raw, "quick"), Catalog.read(survey / "catalog.parquet"))
-    assert execute(run, SerialExecutor()).done == len(run.catalog.tiles)
+    assert run_tiles(run, SerialExecutor()).done == len(run.catalog.tiles)
     return run
 
 

@@ -9,7 +9,7 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.graph.graph import tile_graph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 
 VARIANTS = 21
@@ -67,18 +67,18 @@ def test_stages_in_common_run_once(one_tile, tmp_path):
     store = tmp_path / "store"
     run = Run.create(tmp_path / "ours", brief("ablation"), one_tile, store)
     results = []
-    execute(run, SerialExecutor(), watch=results.append)
+    run_tiles(run, SerialExecutor(), watch=results.append)
     (result,) = results
     assert result.failures == ()
     assert {stage: result.computed[stage] for stage in NODES} == NODES
     assert len(read_metrics(run.path)) == VARIANTS
 
     true = Run.create(tmp_path / "true", brief("ablation_true"), one_tile, store)
-    execute(true, SerialExecutor(), watch=results.append)
+    run_tiles(true, SerialExecutor(), watch=results.append)
     again = results[-1]
     # Rasters are not stored, as `load` reads them anyway, and of meshes only the exported one.
     rasters = 2
     once_more = {"load": 1, "fit": rasters, "sample": VARIANTS - 1, "evaluate": VARIANTS, "export": 1}
     assert again.computed == once_more
 
-    assert execute(run, SerialExecutor()).cached == 1
+    assert run_tiles(run, SerialExecutor()).cached == 1

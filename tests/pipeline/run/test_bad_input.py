@@ -20,7 +20,7 @@ from flexroad.catalog.sources import prepared
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from tests.command_line import PROCESS, Said, error_lines
 from tests.conftest import QUICK
@@ -724,7 +724,7 @@ def finished(made_survey, tmp_path_factory) -> Path:
     """A whole run, not to be touched."""
     out = tmp_path_factory.mktemp("finished") / "run"
     made = Run.create(out, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
-    execute(made, SerialExecutor())
+    run_tiles(made, SerialExecutor())
     return out
 
 

@@ -12,7 +12,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import load
 from flexroad.tasks.segment.dinov2 import train as training
@@ -45,7 +45,7 @@ def done(place, **segment):
     config.write_text(yaml.safe_dump({**QUICK, "segment": options}, sort_keys=False))
     run = Run.create(place / "run", load_config(config), Catalog.read(place / "scenes" / "catalog.parquet"))
     results = []
-    execute(run, SerialExecutor(), watch=results.append)
+    run_tiles(run, SerialExecutor(), watch=results.append)
     return {result.tile_id: result for result in results}
 
 
@@ -62,8 +62,8 @@ def test_one_line_of_the_config_chooses_dinov2(place):
     head = read_head(place / "head.safetensors")
     other = Head(head.weight, head.bias - 1, head.about)
     (place / "head.safetensors").write_bytes(other.encode())
-    anew = done(place, backbone=str(place / "backbone"))[second.tile_id]
-    assert anew.computed["segment"] == 1
+    force = done(place, backbone=str(place / "backbone"))[second.tile_id]
+    assert force.computed["segment"] == 1
 
 
 @pytest.mark.slow

@@ -29,10 +29,10 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.event_log import Journal
-from flexroad.pipeline.run.lock import Holder, held
+from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import wait_for
 
@@ -57,7 +57,7 @@ def undisturbed(made_survey, config, tmp_path_factory) -> Path:
     """A run that nothing happened to; not to be touched."""
     catalog = Catalog.read(made_survey / "catalog.parquet")
     run = Run.create(tmp_path_factory.mktemp("undisturbed") / "run", load_config(config), catalog)
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     return run.path
 
 
@@ -151,13 +151,13 @@ def test_a_scheduler_that_is_killed(
     scheduler = processes.scheduler()
     processes.worker()
     wait_for(processes.address, 1)
-    noted = Journal.tile
+    noted = EventLog.tile
 
     def kill(self, result) -> None:
         noted(self, result)
         scheduler.kill()
 
-    monkeypatch.setattr(Journal, "tile", kill)
+    monkeypatch.setattr(EventLog, "tile", kill)
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
     said = flexroad("run", *words, "--scheduler", processes.address)
     assert said.code == 1
@@ -253,7 +253,7 @@ def test_a_lost_record_leaves_meshes_where_they_are(night, made_survey, config, 
     tiles = Catalog.read(made_survey / "catalog.parquet").tiles
     east = tuple(tile for tile in tiles if tile.grid.west > tiles[0].grid.west)
     run = Run.create(out, load_config(config), Catalog(east))
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     (out / "run.json").unlink()
     assert night().code == 0
     found = Run.open(out)
@@ -309,7 +309,7 @@ def obeying() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("size", "told"),
     [
-        pytest.param(30_000, "ledger.sqlite", id="products and the ledger"),
+        pytest.param(30_000, "database.sqlite", id="products and the database"),
         pytest.param(40_000, "3 failed", id="products"),
     ],
 )
@@ -370,7 +370,7 @@ def test_what_becomes_unwritable_in_the_middle(part, night, before_tile, undistu
     assert all(str(out) in line for line in said.errors)
     if (out / "lock.json").exists():
         # It could not be removed; by the next night this process would be gone.
-        gone = replace(Holder.me(), pid=2**22 + 1)
+        gone = replace(Owner.me(), pid=2**22 + 1)
         (out / "lock.json").write_bytes(gone.data)
     before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
     assert len(before) == 2
@@ -420,7 +420,7 @@ def test_a_lock_is_given_back_on_a_full_disk(monkeypatch, tmp_path):
     def full(**_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with held(tmp_path):
+    with run_lock(tmp_path):
         monkeypatch.setattr("tempfile.TemporaryFile", full)
     assert not list(tmp_path.iterdir())
 
@@ -497,8 +497,8 @@ def test_a_clock_set_back_between_nights(survey, night, undisturbed, out):
 
 
 def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, undisturbed):
-    me = Holder.me()
-    with held(finished):
+    me = Owner.me()
+    with run_lock(finished):
         before = paths.listing(finished)
         for said in (
             night("--verify"),

@@ -12,11 +12,11 @@ from flexroad.catalog.storage.paths import listing
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.garbage import alone, drop, waste
-from flexroad.pipeline.run.lock import held
+from flexroad.pipeline.run.garbage import delete, exclusive, find_garbage
+from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
-from flexroad.pipeline.run.store_users import forget, users
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.store_users import runs_using, unregister
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
@@ -48,7 +48,7 @@ def made(catalog, tmp_path_factory):
         config = tmp_path_factory.mktemp("config") / "c.yaml"
         config.write_text(yaml.safe_dump(options, sort_keys=False))
         run = Run.create(path, load_config(config), Catalog(catalog.tiles[:tiles]), store)
-        execute(run, SerialExecutor())
+        run_tiles(run, SerialExecutor())
         return run
 
     def make_or_copy(path: Path, *steps: tuple[dict, int]) -> Run:
@@ -71,8 +71,8 @@ def files(folder: Path) -> set[str]:
 def cleaned(run: Run, without=()) -> dict[str, set[str]]:
     """Drop the waste; return the files dropped by kind, relative to the run's folder's parent."""
     dropped: dict[str, set[str]] = {}
-    with held(run.path), alone(run, without, print) as runs:
-        for one in drop(waste(runs)):
+    with run_lock(run.path), exclusive(run, without, print) as runs:
+        for one in delete(find_garbage(runs)):
             dropped.setdefault(one.kind, set()).add(str(one.path.relative_to(run.path.parent)))
     return dropped
 
@@ -94,7 +94,7 @@ def test_what_is_left_is_what_a_new_run_makes(made, tmp_path):
     }
     assert dropped.keys() == {"artefacts", "products", "tiles"}
     assert {Path(name).suffix for name in dropped["products"]} == {".glb", ".tif"}
-    how = execute(run, SerialExecutor())
+    how = run_tiles(run, SerialExecutor())
     assert (how.cached, how.done) == (2, 2)
 
 
@@ -108,7 +108,7 @@ def test_after_it_no_stage_is_computed_that_was_not_before(made, tmp_path):
         for marker in (run.path / "tiles").glob("*/item.json"):
             marker.unlink()
         results = []
-        execute(run, SerialExecutor(), watch=results.append)
+        run_tiles(run, SerialExecutor(), watch=results.append)
         computed.append([result.computed for result in results])
     assert computed[0] == computed[1]
     assert not any("evaluate" in stages for stages in computed[0])
@@ -150,8 +150,8 @@ def test_foreign_files_stay_and_those_of_killed_writers_go(made, tmp_path):
 def test_finding_drops_nothing(made, tmp_path):
     run = made(tmp_path / "run", (QUICK, 3), (LATER, 2))
     before = listing(run.path)
-    with alone(run, (), print) as runs:
-        assert sum(1 for _ in waste(runs)) > 5
+    with exclusive(run, (), print) as runs:
+        assert sum(1 for _ in find_garbage(runs)) > 5
     assert listing(run.path) == before
 
 
@@ -160,7 +160,7 @@ def test_what_another_run_of_the_store_needs_stays(made, tmp_path):
     first = made.into(one, QUICK, 2, store)
     kept = files(store / "fit")
     second = made.into(two, LATER, 2, store)
-    assert set(users(store)) == {one, two}
+    assert set(runs_using(store)) == {one, two}
     assert not cleaned(first)
     assert not cleaned(second)
     # Its tiles are gone from one of them.
@@ -169,7 +169,7 @@ def test_what_another_run_of_the_store_needs_stays(made, tmp_path):
         cleaned(first)
     assert cleaned(first, [two]).keys() == {"artefacts"}
     assert files(store / "fit") == kept
-    assert forget(store, two)
+    assert unregister(store, two)
     assert not cleaned(first)
 
 
@@ -177,7 +177,7 @@ def test_a_run_that_cannot_be_read_or_is_at_work_stops_it(made, tmp_path):
     store, one, two = tmp_path / "store", tmp_path / "one", tmp_path / "two"
     run = made.into(one, QUICK, 1, store)
     made.into(two, QUICK, 1, store)
-    with held(two), pytest.raises(ConfigError, match=f"{two} is in use by pid"):
+    with run_lock(two), pytest.raises(ConfigError, match=f"{two} is in use by pid"):
         cleaned(run)
     (two / "config.yaml").write_text("fit: {iterations: many}")
     before = files(store)

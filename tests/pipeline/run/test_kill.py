@@ -14,7 +14,7 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import until
 
@@ -41,7 +41,7 @@ def place(tmp_path_factory):
 def undisturbed(place) -> pd.DataFrame:
     catalog = Catalog.read(place / "survey" / "catalog.parquet")
     run = Run.create(place / "undisturbed", load_config(place / "slow.yaml"), catalog)
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     return read_metrics(run.path).drop(columns="seconds")
 
 

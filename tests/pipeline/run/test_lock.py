@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock import Holder, Pace, at_work, held, holder, started
+from flexroad.pipeline.run.lock import Heartbeat, Owner, at_work, owner, run_lock, started
 
 HOLD = """
 import sys, time
@@ -22,8 +22,8 @@ with held(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
-QUICK = Pace(beat_s=0.05, stale_s=0.5)
-ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
+QUICK = Heartbeat(beat_s=0.05, stale_s=0.5)
+ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 
 
 @pytest.fixture
@@ -35,37 +35,37 @@ def process(tmp_path):
         other.kill()
 
 
-def written(folder, who: Holder, age_s: float = 0.0) -> None:
+def written(folder, who: Owner, age_s: float = 0.0) -> None:
     (folder / "lock.json").write_bytes(who.data)
     then = time.time() - age_s
     os.utime(folder / "lock.json", (then, then))
 
 
-def taken(folder, pace: Pace = QUICK) -> list[str]:
+def taken(folder, pace: Heartbeat = QUICK) -> list[str]:
     """Take the lock and give it back; return what was said."""
     said: list[str] = []
-    with held(folder, said.append, pace):
-        assert holder(folder).pid == os.getpid()
+    with run_lock(folder, said.append, pace):
+        assert owner(folder).pid == os.getpid()
     assert not (folder / "lock.json").exists()
     return said
 
 
 def test_a_second_holder_is_refused_by_host_and_pid(process, tmp_path):
-    me = Holder.me()
+    me = Owner.me()
     with pytest.raises(ConfigError, match=rf"pid {process.pid} on {me.host} since .* `kill {process.pid}`"):
         taken(tmp_path)
-    assert holder(tmp_path).pid == process.pid
+    assert owner(tmp_path).pid == process.pid
 
 
 def test_of_a_killed_holder_it_is_taken_over_at_once_and_said_in_one_line(process, tmp_path):
-    assert "at work since" in at_work(holder(tmp_path))
+    assert "at work since" in at_work(owner(tmp_path))
     process.send_signal(signal.SIGKILL)
     # Not waited for: a dead process that nobody buried still has its number.
     while started(process.pid) is not None:
         time.sleep(0.01)
-    assert "ended in the middle (that process is gone)" in at_work(holder(tmp_path))
+    assert "ended in the middle (that process is gone)" in at_work(owner(tmp_path))
     assert taken(tmp_path) == [
-        f"took over the lock of pid {process.pid} on {Holder.me().host}: that process is gone"
+        f"took over the lock of pid {process.pid} on {Owner.me().host}: that process is gone"
     ]
 
 
@@ -79,16 +79,16 @@ def test_of_a_killed_holder_it_is_taken_over_at_once_and_said_in_one_line(proces
 )
 def test_a_holder_of_this_machine_is_judged_by_the_process_table(change, why, tmp_path):
     # A heartbeat in the future, as after a clock set back, or a fresh one: neither counts.
-    written(tmp_path, replace(Holder.me(), **change), age_s=-3600)
+    written(tmp_path, replace(Owner.me(), **change), age_s=-3600)
     (said,) = taken(tmp_path)
     assert why in said
-    written(tmp_path, Holder.me(), age_s=86400)
+    written(tmp_path, Owner.me(), age_s=86400)
     with pytest.raises(ConfigError, match="is in use by pid"):
         taken(tmp_path)
 
 
 def test_a_container_that_counts_processes_for_itself_is_another_machine(tmp_path):
-    written(tmp_path, replace(Holder.me(), machine="m pid:[2]", pid=2**22 + 1))
+    written(tmp_path, replace(Owner.me(), machine="m pid:[2]", pid=2**22 + 1))
     with pytest.raises(ConfigError, match="last sign of life 0 s ago"):
         taken(tmp_path)
 
@@ -116,7 +116,7 @@ def test_a_clock_that_jumped_kills_no_living_holder(age_s, tmp_path):
     alive.start()
     try:
         with pytest.raises(ConfigError, match="pid 4711 on node7"):
-            taken(tmp_path, Pace(beat_s=1, stale_s=300))
+            taken(tmp_path, Heartbeat(beat_s=1, stale_s=300))
     finally:
         over.set()
         alive.join()
@@ -151,13 +151,13 @@ def test_of_many_that_race_exactly_one_wins(stale, tmp_path):
     ]  # fmt: skip
     assert [one.stdout.readline() for one in many] == ["ready\n"] * 3
     if stale:
-        written(tmp_path, replace(Holder.me(), pid=2**22 + 1))
+        written(tmp_path, replace(Owner.me(), pid=2**22 + 1))
     for one in many:
         one.stdin.write("go\n")
         one.stdin.flush()
     winners = [one for one in many if one.stdout.readline() == "won\n"]
     assert len(winners) == 1
-    assert holder(tmp_path).pid == winners[0].pid
+    assert owner(tmp_path).pid == winners[0].pid
     for one in many:
         _, error = one.communicate("end\n")
         assert one in winners or f"is in use by pid {winners[0].pid} on" in error
@@ -165,19 +165,19 @@ def test_of_many_that_race_exactly_one_wins(stale, tmp_path):
 
 
 def test_a_living_holder_gives_signs_of_life_and_mends_a_lock_removed_by_hand(tmp_path):
-    with held(tmp_path, pace=QUICK):
+    with run_lock(tmp_path, pace=QUICK):
         os.utime(tmp_path / "lock.json", (1, 1))
         _until(lambda: (tmp_path / "lock.json").stat().st_mtime > 1)
         (tmp_path / "lock.json").unlink()
-        _until(lambda: holder(tmp_path) is not None)
-        assert holder(tmp_path).pid == os.getpid()
+        _until(lambda: owner(tmp_path) is not None)
+        assert owner(tmp_path).pid == os.getpid()
 
 
 def test_who_lost_the_lock_ends_and_leaves_it_to_the_other(tmp_path):
     said: list[str] = []
 
     def lose() -> None:
-        with held(tmp_path, said.append, QUICK):
+        with run_lock(tmp_path, said.append, QUICK):
             written(tmp_path, ELSEWHERE)
             _until(lambda: bool(said), 10)
             time.sleep(30)

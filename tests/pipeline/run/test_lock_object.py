@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from flexroad.catalog.storage.paths import place, read, write
+from flexroad.catalog.storage.paths import parse_location, read, write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock import Holder, Pace, held, holder
+from flexroad.pipeline.run.lock import Heartbeat, Owner, owner, run_lock
 
 pytestmark = pytest.mark.slow
 
-ELSEWHERE = Holder("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
-QUICK = Pace(beat_s=0.05, stale_s=0.5)
+ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
+QUICK = Heartbeat(beat_s=0.05, stale_s=0.5)
 
 
 @pytest.fixture
@@ -22,37 +22,40 @@ def run(bucket):
 
 
 def test_one_holds_it_and_gives_it_back(run):
-    with held(run):
-        assert holder(run).token != ELSEWHERE.token
-        with pytest.raises(ConfigError, match="is in use by pid"), held(run):
+    with run_lock(run):
+        assert owner(run).token != ELSEWHERE.token
+        with pytest.raises(ConfigError, match="is in use by pid"), run_lock(run):
             pass
-    assert holder(run) is None
-    with held(run):
+    assert owner(run) is None
+    with run_lock(run):
         pass
 
 
 def test_a_dead_holder_of_this_machine_is_taken_over_at_once(run):
-    write(run / "lock.json", replace(Holder.me(), boot="before").data)
+    write(run / "lock.json", replace(Owner.me(), boot="before").data)
     said = []
-    with held(run, said.append):
-        assert holder(run).pid == Holder.me().pid
+    with run_lock(run, said.append):
+        assert owner(run).pid == Owner.me().pid
     assert "was restarted since" in said[0]
 
 
 def test_of_another_machine_the_heartbeat_tells(run):
     write(run / "lock.json", ELSEWHERE.data)
-    with pytest.raises(ConfigError, match="the same command takes over"), held(run, pace=Pace(stale_s=60)):
+    with (
+        pytest.raises(ConfigError, match="the same command takes over"),
+        run_lock(run, pace=Heartbeat(stale_s=60)),
+    ):
         pass
     said = []
     # A bucket's times are whole seconds.
     time.sleep(1.1)
-    with held(run, said.append, QUICK):
-        assert holder(run).token != "t7"
+    with run_lock(run, said.append, QUICK):
+        assert owner(run).token != "t7"
     assert said[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
 
 
 def test_a_living_holder_gives_signs_of_life(run):
-    with held(run, pace=QUICK):
+    with run_lock(run, pace=QUICK):
         first = _time(run)
         while _time(run) == first:
             time.sleep(0.1)
@@ -61,13 +64,13 @@ def test_a_living_holder_gives_signs_of_life(run):
 @pytest.mark.parametrize("stale", [False, True])
 def test_of_many_that_race_exactly_one_wins(stale, run):
     if stale:
-        write(run / "lock.json", replace(Holder.me(), boot="before").data)
+        write(run / "lock.json", replace(Owner.me(), boot="before").data)
     start, tried, outcomes = threading.Barrier(4), threading.Semaphore(0), []
 
     def race() -> None:
         start.wait()
         try:
-            with held(run):
+            with run_lock(run):
                 outcomes.append("won")
                 # Until all others have been refused.
                 for _ in range(3):
@@ -92,24 +95,24 @@ def test_a_lost_answer_is_no_second_holder(run, monkeypatch):
 
     create = InBucket.create
     monkeypatch.setattr(InBucket, "create", lambda self, data: create(self, data) and create(self, data))
-    with held(run):
-        assert holder(run).pid == Holder.me().pid
+    with run_lock(run):
+        assert owner(run).pid == Owner.me().pid
 
 
 def test_a_bucket_that_is_not_there_is_said(run):
-    with pytest.raises(ConfigError, match="s3://nowhere/run"), held(place("s3://nowhere/run")):
+    with pytest.raises(ConfigError, match="s3://nowhere/run"), run_lock(parse_location("s3://nowhere/run")):
         pass
 
 
 def _time(run):
-    assert Holder.of(read(run / "lock.json"))
+    assert Owner.of(read(run / "lock.json"))
     return run.fs.info((run / "lock.json").path)["LastModified"]
 
 
 def test_a_bucket_that_is_not_there_is_named(run):
-    nowhere = place("s3://nowhere/run")
+    nowhere = parse_location("s3://nowhere/run")
     with (
         pytest.raises(ConfigError, match=r"cannot write the run to s3://nowhere/run: .*no such bucket"),
-        held(nowhere),
+        run_lock(nowhere),
     ):
         pass

@@ -12,7 +12,7 @@ from shapely import LineString
 
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import place
+from flexroad.catalog.storage.paths import parse_location
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
@@ -21,14 +21,14 @@ from flexroad.pipeline.inspect.points import Ground
 from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.report import write_report
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
+from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store import codec
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
-from flexroad.tasks.io.vectors import Asked, near
+from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.types import Source
 from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
@@ -48,7 +48,7 @@ def local(made_survey, tmp_path_factory):
 
 def on_disk(survey, folder, config):
     run = Run.create(folder, config, Catalog.read(survey / "catalog.parquet"))
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     return run
 
 
@@ -81,7 +81,7 @@ def flexroad(monkeypatch, capsys):
 
 def bring_up_to_date(run):
     results = []
-    how = execute(run, SerialExecutor(), watch=results.append)
+    how = run_tiles(run, SerialExecutor(), watch=results.append)
     return how, {result.tile_id: result for result in results}
 
 
@@ -114,13 +114,13 @@ def test_a_run_in_a_bucket_is_the_one_on_disk(survey, made_survey, bucket, tmp_p
     how, results = bring_up_to_date(run)
     assert (how.exit_code, {result.status for result in results.values()}) == (0, {"done"})
     assert_same(run, local)
-    how, results = bring_up_to_date(Run.open(place(str(run.path))))
+    how, results = bring_up_to_date(Run.open(parse_location(str(run.path))))
     assert (how.exit_code, {result.status for result in results.values()}) == (0, {"cached"})
     assert (how.done, how.cached, how.failed) == (4, 4, 0)
 
 
 def test_what_was_made_can_be_asked_for(run, local):
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     opened = Run.open(run.path)
     assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
     assert paths.read(write_report(opened, "html"))
@@ -133,7 +133,7 @@ def test_what_was_made_can_be_asked_for(run, local):
 
 
 def test_a_source_with_other_bytes_is_noticed(run):
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     tile = run.catalog.tiles[1]
     file = tile.paths(tile.layer("dsm"))[0]
     before = paths.stat(file)
@@ -191,7 +191,7 @@ def test_writes_that_fail_from_some_moment_on(run, storage, local, answer, skip)
 def test_storage_that_goes_away_altogether_leaves_what_is_done(run, storage, local):
     storage.fail(Fault("cut", path="/run/", skip=40))
     with pytest.raises(OSError, match=str(run.path)):
-        execute(run, SerialExecutor())
+        run_tiles(run, SerialExecutor())
     storage.fail()
     assert_nothing_half(run)
     how, _ = bring_up_to_date(Run.open(run.path))
@@ -254,28 +254,28 @@ def test_a_photo_with_a_world_file_is_placed_as_on_disk(bucket, tmp_path):
 def test_roads_in_a_bucket_are_those_on_disk(made_survey, survey, storage, tmp_path):
     crs, bounds = "EPSG:25832", (499900.0, 5599900.0, 500200.0, 5600200.0)
     homes = (made_survey, survey.parent)
-    asked = [Asked(home / "roads.gpkg", None, None, ("highway", "width"), None, crs) for home in homes]
+    asked = [Query(home / "roads.gpkg", None, None, ("highway", "width"), None, crs) for home in homes]
     storage.fail(Fault("half", "GET", "gpkg", first=1))
-    theirs, ours = (near(each, bounds) for each in asked)
+    theirs, ours = (read_near(each, bounds) for each in asked)
     assert len(ours) > 3
     assert ours.equals(theirs)
     # Another version is another file; one that cannot be had is a fault of one line.
     write_roads(tmp_path / "one.gpkg", [LineString([(500000, 5600000), (500050, 5600000)])], width=[6])
     paths.write(asked[1].path, (tmp_path / "one.gpkg").read_bytes())
-    assert len(near(asked[1], bounds)) == 1
+    assert len(read_near(asked[1], bounds)) == 1
     for answer in ("error", "half"):
         paths.write(asked[1].path, answer.encode())
         storage.fail(Fault(answer, "GET", "gpkg"))
         with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be read: .*; run again"):
-            near(asked[1], bounds)
+            read_near(asked[1], bounds)
     storage.fail()
     paths.remove(asked[1].path)
     with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be opened .no such file.; put it back"):
-        near(asked[1], bounds)
+        read_near(asked[1], bounds)
 
 
 def test_a_damaged_artefact_is_made_anew(run, local):
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
     whole = paths.read(run.store / name)
     paths.write(run.store / name, whole[:-1])
@@ -288,11 +288,11 @@ def test_a_damaged_artefact_is_made_anew(run, local):
 
 def test_requests_grow_with_the_tiles_only_where_tiles_are_done(run, storage):
     storage.requests()
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     first = storage.requests()
     # Of each file and artefact: looked for, written or read, looked at again.
     assert len(first) / 4 < 45
-    execute(Run.open(run.path), SerialExecutor())
+    run_tiles(Run.open(run.path), SerialExecutor())
     again = [path for _, path in storage.requests()]
     # A list of the products, one of each folder of sources, and the run's own files.
     assert len(again) <= 20

@@ -18,11 +18,11 @@ from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.report.steps import edge_steps
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.runner import execute
-from flexroad.pipeline.run.selection import select
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.selection import rerun_filter
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.artefacts import Store
+from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.pipeline.worker.tile import TileResult
 from tests.conftest import QUICK
@@ -45,7 +45,7 @@ def made(made_survey, tmp_path_factory) -> Path:
     """The folder of a finished run, to be copied."""
     folder = tmp_path_factory.mktemp("made") / "run"
     run = Run.create(folder, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     return folder
 
 
@@ -65,7 +65,7 @@ def computed(results) -> Counter:
 
 def results_of(run, executor, *how) -> list[TileResult]:
     results = []
-    execute(run, executor, *how, watch=results.append)
+    run_tiles(run, executor, *how, watch=results.append)
     return results
 
 
@@ -107,7 +107,7 @@ def test_executors_agree(survey, quick_config, tmp_path, cluster):
     tables = []
     for name, which in (("a", SerialExecutor()), ("b", DaskExecutor(scheduler=cluster.scheduler_address))):
         run = Run.create(tmp_path / name, load_config(quick_config), Catalog.read(survey))
-        execute(run, which)
+        run_tiles(run, which)
         tables.append(read_metrics(run.path).drop(columns="seconds"))
     pd.testing.assert_frame_equal(*tables, check_exact=True)
 
@@ -176,7 +176,7 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
 
     tile = run.catalog.tiles[2]
     tile.paths(tile.layer("dsm"))[0].write_bytes(whole)
-    fixed = results_of(run, executor, select(run, (), failed=True))
+    fixed = results_of(run, executor, rerun_filter(run, (), failed=True))
     # The mended file has another time, so the failure on record is of another graph: it is pending.
     fixed = fixed or results_of(run, executor)
     assert computed(fixed) == times(1)
@@ -185,18 +185,18 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
 
 def test_rerun_means_the_tiles_named_or_failed(run, executor):
     broken, _ = spoil(run, 0)
-    execute(run, executor)
-    assert [r.tile_id for r in results_of(run, executor, select(run, (), failed=True))] == [broken]
+    run_tiles(run, executor)
+    assert [r.tile_id for r in results_of(run, executor, rerun_filter(run, (), failed=True))] == [broken]
     one = run.catalog.tiles[3].id
-    results = results_of(run, executor, select(run, (one,), failed=False))
+    results = results_of(run, executor, rerun_filter(run, (one,), failed=False))
     assert [(r.tile_id, r.status) for r in results] == [(one, "cached")]
     assert len(read_metrics(run.path)) == 12
 
 
 def test_from_a_stage_on_computes_it_and_what_follows(finished, executor):
     one = finished.catalog.tiles[3].id
-    anew = frozenset({"fit", "sample", "evaluate"})
-    results = results_of(finished, executor, select(finished, (one,), failed=False), anew)
+    force = frozenset({"fit", "sample", "evaluate"})
+    results = results_of(finished, executor, rerun_filter(finished, (one,), failed=False), force)
     assert computed(results) == times(1, {"load": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1})
 
 
@@ -225,14 +225,14 @@ def test_a_lost_product_is_written_again(finished, executor):
 
 
 def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
-    put = Store.put
+    put = ArtefactStore.put
 
     def full(self, node, value, seconds):
         if node.stage == "fit" and len(list(self.root.rglob("*.npz"))) > 12:
             raise OSError(28, "No space left on device", str(self.root))
         return put(self, node, value, seconds)
 
-    monkeypatch.setattr(Store, "put", full)
+    monkeypatch.setattr(ArtefactStore, "put", full)
     results = results_of(run, SerialExecutor())
     failed = [r for r in results if r.status == "failed"]
     assert 0 < len(failed) < 4
@@ -278,10 +278,10 @@ def test_a_source_replaced_while_its_tile_is_done(how, run, survey, quick_config
     assert not stored & set(run.graph(tile).nodes)
     if how == "truncated":
         path.write_bytes(whole)
-    how = execute(run, SerialExecutor())
+    how = run_tiles(run, SerialExecutor())
     assert (how.done, how.cached, how.changed) == (4, 3, 1)
     undisturbed = Run.create(tmp_path / "undisturbed", run.config, run.catalog)
-    execute(undisturbed, SerialExecutor())
+    run_tiles(undisturbed, SerialExecutor())
     left, right = (read_metrics(r.path).drop(columns="seconds") for r in (run, undisturbed))
     pd.testing.assert_frame_equal(left, right, check_exact=True)
 
@@ -289,7 +289,7 @@ def test_a_source_replaced_while_its_tile_is_done(how, run, survey, quick_config
 def nothing_to_do(run) -> Summary:
     """Execute a run that is done, and see that it knows."""
     before = read_metrics(run.path)
-    how = execute(run, Meddling(0, lambda: pytest.fail("there was something to do")))
+    how = run_tiles(run, Meddling(0, lambda: pytest.fail("there was something to do")))
     assert (how.done, how.cached) == (4, 4)
     pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
     return how
@@ -313,15 +313,15 @@ def test_a_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatc
 
 @pytest.mark.parametrize("how", ["lost", "damaged", "of before"])
 def test_the_markers_are_the_truth(how, finished):
-    ledger = finished.path / "ledger.sqlite"
-    before = ledger.read_bytes()
+    database = finished.path / "database.sqlite"
+    before = database.read_bytes()
     run = changed(finished, evaluate={"nearest": True})
-    execute(run, SerialExecutor())
+    run_tiles(run, SerialExecutor())
     if how == "lost":
-        ledger.unlink()
+        database.unlink()
     else:
         # As if the client had been killed before it wrote down anything.
-        ledger.write_bytes(before if how == "of before" else before[:5000])
+        database.write_bytes(before if how == "of before" else before[:5000])
     assert summary(run).done == 4
     nothing_to_do(run)
     assert read_metrics(run.path).nearest_road_m.notna().all()
@@ -329,13 +329,13 @@ def test_the_markers_are_the_truth(how, finished):
 
 def test_a_summary_counts_what_is_new_changed_and_vanished(run):
     first = Run.create(run.path, run.config, Catalog(run.catalog.tiles[:3]))
-    how = execute(first, SerialExecutor())
+    how = run_tiles(first, SerialExecutor())
     assert (how.new, how.changed, how.vanished, how.exit_code) == (3, 0, 0, 0)
     tile = run.catalog.tiles[1]
     os.utime(tile.paths(tile.layer("dtm"))[0], (1, 1))
     second = Run.create(run.path, run.config, Catalog(run.catalog.tiles[1:]))
     assert [summary(second).pending, summary(second).done] == [2, 1]
-    how = execute(second, SerialExecutor())
+    how = run_tiles(second, SerialExecutor())
     assert (how.new, how.changed, how.vanished) == (1, 1, 1)
     assert (how.tiles, how.done, how.cached) == (3, 3, 1)
     told = json.loads((run.path / "summary.json").read_text())
@@ -344,7 +344,7 @@ def test_a_summary_counts_what_is_new_changed_and_vanished(run):
     }  # fmt: skip
     assert told["start"] < told["end"]
     assert list(read_metrics(run.path).tile_id.unique()) == [tile.id for tile in second.catalog.tiles]
-    assert execute(second, SerialExecutor()).vanished == 0
+    assert run_tiles(second, SerialExecutor()).vanished == 0
 
 
 def test_an_interruption_leaves_tables_and_a_summary(run):
@@ -352,13 +352,13 @@ def test_an_interruption_leaves_tables_and_a_summary(run):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        execute(run, Meddling(2, interrupt))
+        run_tiles(run, Meddling(2, interrupt))
     told = json.loads((run.path / "summary.json").read_text())
     assert {name: told[name] for name in ("interrupted", "exit_code", "done", "pending")} == {
         "interrupted": True, "exit_code": 130, "done": 2, "pending": 2,
     }  # fmt: skip
     assert read_metrics(run.path).tile_id.nunique() == 2
-    how = execute(run, SerialExecutor())
+    how = run_tiles(run, SerialExecutor())
     assert (how.done, how.cached, how.interrupted, how.exit_code) == (4, 2, False, 0)
 
 
@@ -368,7 +368,7 @@ def test_an_interrupted_run_keeps_no_rows_of_another_configuration(finished):
 
     other = changed(finished, evaluate={"nearest": True})
     with pytest.raises(KeyboardInterrupt):
-        execute(other, Meddling(1, interrupt))
+        run_tiles(other, Meddling(1, interrupt))
     rows = read_metrics(finished.path)
     assert list(rows.tile_id.unique()) == [finished.catalog.tiles[0].id]
     assert rows.nearest_road_m.notna().all()
@@ -381,7 +381,7 @@ def test_products_are_compared_byte_for_byte_on_demand(finished):
     mesh.write_bytes(bytes(len(whole)))
     nothing_to_do(finished)
     results = []
-    execute(finished, SerialExecutor(), watch=results.append, verify=True)
+    run_tiles(finished, SerialExecutor(), watch=results.append, verify=True)
     assert computed(results) == times(1, {"export": 1})
     assert mesh.read_bytes() == whole
 
@@ -391,15 +391,15 @@ def test_gone_sources_count_as_they_were_until_the_tile_is_asked_for(finished):
     tile.paths(tile.layer("dsm"))[0].unlink()
     assert (summary(finished).done, summary(finished).pending) == (4, 0)
     other = finished.catalog.tiles[0].id
-    how = execute(finished, SerialExecutor(), select(finished, (other,), failed=False))
+    how = run_tiles(finished, SerialExecutor(), rerun_filter(finished, (other,), failed=False))
     assert (how.done, how.cached, how.failed) == (4, 1, 0)
-    how = execute(finished, SerialExecutor())
+    how = run_tiles(finished, SerialExecutor())
     assert (how.done, how.cached, how.failed) == (3, 3, 1)
     assert how.failures[0].tile_id == tile.id
 
 
 def test_log_has_one_event_per_tile(run, executor):
-    execute(run, executor)
+    run_tiles(run, executor)
     events = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
     kinds = Counter(event["event"] for event in events)
     assert kinds == {"run": 1, "stage": 4 * len(EACH), "tile": 4, "end": 1}
@@ -417,7 +417,7 @@ def test_item_is_stac_with_checksums(run, executor):
 
     import pystac
 
-    execute(run, executor)
+    run_tiles(run, executor)
     tile = run.catalog.tiles[0]
     folder = run.folder(tile.id).path
     item = pystac.Item.from_file(str(folder / "item.json"))
@@ -431,7 +431,7 @@ def test_item_is_stac_with_checksums(run, executor):
 def test_products_open_as_they_are(run, executor):
     import trimesh
 
-    execute(run, executor)
+    run_tiles(run, executor)
     tile = run.catalog.tiles[0]
     folder = run.folder(tile.id).path
     scene = trimesh.load(folder / f"{tile.id}_flexroad.glb")

@@ -7,11 +7,11 @@ import pytest
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.run.lock import Holder, held, holder
+from flexroad.pipeline.run.lock import Owner, owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import progress
-from flexroad.pipeline.store.database import NAME, Ledger
-from flexroad.pipeline.store.records import Entry, Failure
+from flexroad.pipeline.store.database import NAME, RunDatabase
+from flexroad.pipeline.store.records import Failure, TileRecord
 
 NOW = datetime.now(UTC)
 
@@ -24,17 +24,17 @@ def run(made_survey, quick_config, tmp_path) -> Run:
 
 def test_progress_tells_how_it_stands_and_how_fast_it_goes(run):
     one, two, three, _ = (tile.id for tile in run.catalog.tiles)
-    who = Holder("node7", "m", "b", 4711, 99, (NOW - timedelta(minutes=2)).isoformat(timespec="seconds"), "t")
+    who = Owner("node7", "m", "b", 4711, 99, (NOW - timedelta(minutes=2)).isoformat(timespec="seconds"), "t")
     before, lately = ((NOW - timedelta(minutes=m)).isoformat(timespec="milliseconds") for m in (9, 1))
-    with Ledger.open(run.path / NAME) as ledger:
-        ledger.ask([(tile.id, "pending") for tile in run.catalog.tiles])
-        ledger.record(Entry(one, "done", "f", (), finished=before))
-        ledger.flush()
-        ledger.ask([(one, "cached"), *((tile.id, "pending") for tile in run.catalog.tiles[1:])])
+    with RunDatabase.open(run.path / NAME) as database:
+        database.ask([(tile.id, "pending") for tile in run.catalog.tiles])
+        database.record(TileRecord(one, "done", "f", (), finished=before))
+        database.flush()
+        database.ask([(one, "cached"), *((tile.id, "pending") for tile in run.catalog.tiles[1:])])
         assert progress(run, who)[1] == ""
         for name in (two, three):
-            ledger.record(Entry(name, "done", "f", (), finished=lately))
-        ledger.flush()
+            database.record(TileRecord(name, "done", "f", (), finished=lately))
+        database.flush()
         how, pace = progress(run, who)
     assert (how.tiles, how.done, how.cached, how.failed, how.pending) == (4, 3, 1, 0, 1)
     rate, left = map(float, re.fullmatch(r", (\S+) tiles a minute, about (\S+) min left", pace).groups())
@@ -44,14 +44,14 @@ def test_progress_tells_how_it_stands_and_how_fast_it_goes(run):
 
 def test_a_run_is_seen_while_another_process_writes_it(run, flexroad):
     one, two, *_ = (tile.id for tile in run.catalog.tiles)
-    with held(run.path), Ledger.open(run.path / NAME) as ledger:
-        ledger.ask([(tile.id, "pending") for tile in run.catalog.tiles])
+    with run_lock(run.path), RunDatabase.open(run.path / NAME) as database:
+        database.ask([(tile.id, "pending") for tile in run.catalog.tiles])
         assert "4 tiles: 0 done (0 cached), 0 failed, 4 pending" in flexroad("status", run.path).out
-        ledger.record(Entry(one, "failed", "f", (), (Failure(one, "load", "TaskError", "gone"),)))
-        ledger.record(Entry(two, "done", "f", ()))
-        ledger.flush()
+        database.record(TileRecord(one, "failed", "f", (), (Failure(one, "load", "TaskError", "gone"),)))
+        database.record(TileRecord(two, "done", "f", ()))
+        database.flush()
         said = flexroad("status", run.path).out
-        who = holder(run.path)
+        who = owner(run.path)
         assert "4 tiles: 1 done (0 cached), 1 failed, 2 pending" in said
         assert f"pid {who.pid} on {who.host} at work since {who.since}" in said
         assert f"  {one}: load: TaskError: gone" in said

@@ -11,9 +11,9 @@ from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.graph.graph import tile_graph
 from flexroad.pipeline.store import codec
-from flexroad.pipeline.store.artefacts import DAMAGED, Store
-from flexroad.pipeline.store.products import TileFolder, file_entry
-from flexroad.pipeline.worker.evaluator import Pull
+from flexroad.pipeline.store.artefacts import DAMAGED, ArtefactStore
+from flexroad.pipeline.store.products import TileProducts, file_entry
+from flexroad.pipeline.worker.evaluator import Evaluator
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
@@ -32,7 +32,7 @@ def same(a, b) -> bool:
 @pytest.fixture
 def pull(survey, tmp_path):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
-    return Pull(graph, Store(tmp_path / "store"), keep=True)
+    return Evaluator(graph, ArtefactStore(tmp_path / "store"), keep=True)
 
 
 def test_every_result_comes_back_exactly(pull):
@@ -90,7 +90,7 @@ def test_an_artefact_opens_without_us(pull):
 
 
 def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
-    folder = TileFolder(tmp_path / "tile")
+    folder = TileProducts(tmp_path / "tile")
     item = {"assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
     folder.finish(item, {"mesh.glb": b"abc"})
     assert folder.verified()
@@ -103,7 +103,7 @@ def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
 
 def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeypatch):
     """A run that is killed between two products, or denied the second, leaves a tile that is not done."""
-    folder = TileFolder(tmp_path / "tile")
+    folder = TileProducts(tmp_path / "tile")
     folder.finish({"was": 1}, {"a": b"old", "b": b"old"})
 
     def denied(path, data):
@@ -128,7 +128,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
 
 def test_a_marker_of_another_graph_or_with_a_product_missing_is_not_done(survey, tmp_path):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
-    folder = TileFolder.of(tmp_path, graph.tile.id)
+    folder = TileProducts.of(tmp_path, graph.tile.id)
     item = {
         "properties": {"flexroad:fingerprint": graph.fingerprint, "flexroad:rows": []},
         "assets": {"mesh": {"href": "mesh.glb", "file:size": 3}},
@@ -146,8 +146,8 @@ def test_a_marker_of_another_graph_or_with_a_product_missing_is_not_done(survey,
 
 def test_tile_ids_become_safe_folder_names(tmp_path):
     for odd in ("../up", "a/b", "..", "", "ä b"):
-        folder = TileFolder.of(tmp_path, odd).path
+        folder = TileProducts.of(tmp_path, odd).path
         assert folder.parent == tmp_path / "tiles"
         assert folder.name
-    assert TileFolder.of(tmp_path, "a/b").path != TileFolder.of(tmp_path, "a-b").path
-    assert TileFolder.of(tmp_path, "295500_5629250").path.name == "295500_5629250"
+    assert TileProducts.of(tmp_path, "a/b").path != TileProducts.of(tmp_path, "a-b").path
+    assert TileProducts.of(tmp_path, "295500_5629250").path.name == "295500_5629250"

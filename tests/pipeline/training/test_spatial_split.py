@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.training.spatial_split import Piece, halves, inside, split
+from flexroad.pipeline.training.spatial_split import Block, inside, split, split_tile
 
 
 def piece(col, row, road=10, ground=10, size=100):
     grid = Grid("EPSG:25832", 500000.0 + col * size, 5600000.0 + row * size, 1.0, size, size)
     tile = Tile(f"{col}_{row}", grid, (), "", datetime(2025, 1, 1, tzinfo=UTC))
-    return Piece(tile, grid.bounds, road, ground)
+    return Block(tile, grid.bounds, road, ground)
 
 
 places = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=2, max_size=25, unique=True)
@@ -57,6 +57,6 @@ def test_both_sides_have_labels_of_both_kinds():
 
 def test_a_single_tile_is_parted_along_its_longer_side():
     grid = Grid("EPSG:25832", 0.0, 100.0, 1.0, 50, 100)
-    learn, judge = halves(grid.bounds, 0.3)
+    learn, judge = split_tile(grid.bounds, 0.3)
     assert (inside(grid, learn).sum(), inside(grid, judge).sum()) == (3500, 1500)
     assert not (inside(grid, learn) & inside(grid, judge)).any()

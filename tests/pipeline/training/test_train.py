@@ -14,7 +14,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.training.spatial_split import inside, split
-from flexroad.pipeline.training.train import Asked, Ground, Samples, train
+from flexroad.pipeline.training.train import LabelledTiles, Samples, TrainOptions, train
 from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.mask_cleanup import NOTHING
@@ -55,7 +55,7 @@ def spoilt(catalog, **layers):
 def test_the_report_tells_what_the_segmenter_does_on_the_judged_tiles(land, trained):
     model, told = trained
     right = wrong = missed = 0
-    options = segment.Options(model=model, hygiene=NOTHING)
+    options = segment.Options(model=model, cleanup=NOTHING)
     for tile in Catalog.read(land).select(told["asked"]["judged by"]).tiles:
         data = load.load(tile, load.Options())
         found = segment.segment(data, options).mask
@@ -95,7 +95,9 @@ def test_the_model_runs_by_one_line_of_the_configuration(land, trained, quick_co
 
 
 def test_cells_to_learn_from_keep_off_edges_and_off_the_judged_tiles(land):
-    ground = Ground(Asked("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS)
+    ground = LabelledTiles(
+        TrainOptions("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS
+    )
     catalog = Catalog.read(land)
     pieces = [piece for tile in catalog.tiles for piece in ground.pieces(tile, [tile.grid.bounds])]
     sides = split(pieces, 0.3, 30.0, 0)
@@ -113,7 +115,9 @@ def test_a_single_tile_is_parted(land):
     catalog = Catalog.read(land)
     one = Catalog(catalog.tiles[:1])
     settings = {"rounds": 5, "cells": 1000}
-    outcome = train(one, load_config("paper"), Asked("pixels", "mask", gap_m=10, settings=settings), print)
+    outcome = train(
+        one, load_config("paper"), TrainOptions("pixels", "mask", gap_m=10, settings=settings), print
+    )
     assert outcome.split.train[0].tile == outcome.split.validate[0].tile
     assert outcome.split.train[0].bounds[2] == outcome.split.validate[0].bounds[0]
 
@@ -130,7 +134,7 @@ def test_labels_may_be_vectors(land, tmp_path):
     )
     bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
     drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))))
-    ground = Ground(Asked("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
+    ground = LabelledTiles(TrainOptions("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
     _, road = ground.labelled(drawn)
     assert road[-30:-20].all()
     assert road.sum() == 10 * tile.grid.width
@@ -139,7 +143,12 @@ def test_labels_may_be_vectors(land, tmp_path):
 
 def refused(catalog, match, **asked):
     with pytest.raises(ConfigError, match=match):
-        train(catalog, load_config("paper"), Asked(**{"method": "pixels", "labels": "mask"} | asked), print)
+        train(
+            catalog,
+            load_config("paper"),
+            TrainOptions(**{"method": "pixels", "labels": "mask"} | asked),
+            print,
+        )
 
 
 def test_what_cannot_be_learnt_from_is_refused(land):

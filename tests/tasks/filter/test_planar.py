@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.filter.kit.ground_consistency import OFF, ON, against_known
+from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, INCONSISTENT, against_known
 from flexroad.tasks.filter.kit.planar_patches import flat_patches
 from flexroad.tasks.filter.planar import VERSION, Options, ecsrc
 from flexroad.tasks.synthetic import gerod, make_scene
@@ -25,7 +25,7 @@ def kept(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen)
 def decided(mask, dsm, dtm):
     """Which cells are kept (1), and which have a terrain model that does not count (2)."""
     found = clusters(mask, dsm, dtm, Options(verge_m=4))
-    return found.mask + 2 * found.unsound
+    return found.mask + 2 * found.dtm_invalid
 
 
 def clusters(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen)
@@ -110,7 +110,7 @@ def test_a_hidden_deck_is_told_apart_from_the_valley():
     cars[17:19, 54:58] = cars[17:19, 80:84] = True
     found = clusters(mask, dsm + 1.5 * cars, dtm)
     np.testing.assert_array_equal(found.mask, mask & ~cars)
-    np.testing.assert_array_equal(found.unsound, cars & (np.arange(120) < 66))
+    np.testing.assert_array_equal(found.dtm_invalid, cars & (np.arange(120) < 66))
 
 
 def test_beside_a_street_the_terrain_model_does_not_count():
@@ -125,7 +125,7 @@ def test_beside_a_street_the_terrain_model_does_not_count():
     )
     row = np.indices(mask.shape)[0]
     assert not found.mask[crown].any()
-    np.testing.assert_array_equal(found.unsound, ~mask & (row >= 14) & (row <= 26))
+    np.testing.assert_array_equal(found.dtm_invalid, ~mask & (row >= 14) & (row <= 26))
 
 
 def test_a_roof_in_the_mask_is_dropped_and_a_long_viaduct_kept():
@@ -232,11 +232,16 @@ def test_a_cell_against_the_plane_of_the_known():
     row, col = np.indices((9, 9))
     dsm, unknown = 0.3 * row - 0.2 * col, np.full((9, 9), np.nan)
     known, asked = np.hypot(row - 4, col - 4) > 1.5, (row == 4) & (col == 4)
-    for height, expected in ((0.2, ON), (-0.2, ON), (0.3, OFF), (-0.3, OFF)):
+    for height, expected in (
+        (0.2, CONSISTENT),
+        (-0.2, CONSISTENT),
+        (0.3, INCONSISTENT),
+        (-0.3, INCONSISTENT),
+    ):
         found = against_known(dsm + height * asked, unknown, known, asked, 3, 0.25)
         assert found[4, 4] == expected
     # Beyond the end of what is known, a plane is a guess.
-    assert against_known(dsm, unknown, known & (col > 6), asked, 3, 0.25)[4, 4] == OFF
+    assert against_known(dsm, unknown, known & (col > 6), asked, 3, 0.25)[4, 4] == INCONSISTENT
 
 
 @pytest.mark.parametrize("under", ["as given", "noise"])

@@ -40,8 +40,8 @@ def tile(dsm=None, dtm=None) -> TileData:
     return TileData("made", GRID, GRID, TRUTH + NOISE if dsm is None else dsm, TRUTH if dtm is None else dtm)
 
 
-def told(data, surface, road=STREET, kept=None, unsound=None) -> Quality:
-    clusters = RoadClusters(GRID, (road if kept is None else kept).astype(np.int32), unsound)
+def told(data, surface, road=STREET, kept=None, dtm_invalid=None) -> Quality:
+    clusters = RoadClusters(GRID, (road if kept is None else kept).astype(np.int32), dtm_invalid)
     if surface is None:
         surface = nurbs.fit(data, clusters, FIT)
     return assess(data, RoadMask(GRID, GRID, road, NOWHERE), clusters, surface, Options())
@@ -50,7 +50,7 @@ def told(data, surface, road=STREET, kept=None, unsound=None) -> Quality:
 def test_a_good_surface_raises_no_flag():
     found = told(tile(), None)
     assert found.flags == ()
-    assert found.doubt_m < 0.06
+    assert found.error_estimate_m < 0.06
     assert found.residual_nmad_m == pytest.approx(0.05, abs=0.02)
     assert (found.measured_road, found.inferred_road, found.dropped_road) == (1, 0, 0)
 
@@ -65,7 +65,7 @@ def test_figures_are_those_of_a_surface_known_by_hand():
     assert found.off_dtm_m == pytest.approx(1.1)
     assert found.off_dtm_road == 1
     # The scan is the nearer witness, and even.
-    assert found.doubt_m == pytest.approx(0.1)
+    assert found.error_estimate_m == pytest.approx(0.1)
     assert found.curvature_per_m == pytest.approx(0, abs=0.01)
 
 
@@ -81,7 +81,7 @@ def test_a_hump_in_one_place_is_a_patch():
     hump = STREET & (np.hypot(ROW - 55, COL - 60) < 6)
     found = told(tile(), Shape(TRUTH + 0.8 * hump))
     assert "patch" in found.flags
-    assert found.doubted_m2 == hump.sum()
+    assert found.suspect_m2 == hump.sum()
 
 
 def test_curvature_does_not_depend_on_the_size_of_cells():
@@ -98,8 +98,8 @@ def test_curvature_does_not_depend_on_the_size_of_cells():
 def test_a_filter_that_climbs_a_crown_is_doubted():
     data = tile(dsm=TRUTH + NOISE + np.where(CROWN, DOME, 0))
     climbed, clean = told(data, None), told(data, None, kept=STREET & ~CROWN)
-    assert {"doubt", "patch", "loose", "off-dtm"} <= set(climbed.flags)
-    assert climbed.doubted_m2 == pytest.approx(CROWN.sum(), rel=0.5)
+    assert {"error-estimate", "patch", "loose", "off-dtm"} <= set(climbed.flags)
+    assert climbed.suspect_m2 == pytest.approx(CROWN.sum(), rel=0.5)
     assert clean.flags == ()
     assert clean.dtm_road == pytest.approx(CROWN.sum() / STREET.sum())
 
@@ -109,7 +109,7 @@ def test_a_bridge_deck_is_not_doubted():
     found = told(tile(dsm=TRUTH + 6 * deck + NOISE), Shape(TRUTH + 6 * deck))
     assert "off-dtm" in found.flags
     # But for its ends, where the scan is not even.
-    assert found.doubt_m < 0.3
+    assert found.error_estimate_m < 0.3
 
 
 def test_missing_road_data_is_inferred():
@@ -117,7 +117,7 @@ def test_missing_road_data_is_inferred():
     found = told(
         tile(dsm=np.where(gap, np.nan, TRUTH), dtm=np.where(gap, np.nan, TRUTH)), None, kept=STREET & ~gap
     )
-    assert {"inferred", "doubt"} <= set(found.flags)
+    assert {"inferred", "error-estimate"} <= set(found.flags)
     assert found.inferred_road == pytest.approx(gap.sum() / STREET.sum())
     np.testing.assert_array_equal(found.support == Support.INFERRED, gap)
     assert told(tile(), None, kept=STREET & (COL < 40)).flags == ("dropped",)
@@ -126,8 +126,8 @@ def test_missing_road_data_is_inferred():
 def test_doubt_grows_with_what_is_inferred():
     data = tile(dsm=np.where(CROWN, TRUTH + DOME, TRUTH + NOISE))
     believed = told(data, None, kept=STREET & ~CROWN)
-    inferred = told(data, None, kept=STREET & ~CROWN, unsound=CROWN)
-    assert inferred.doubt_m > believed.doubt_m + 0.3 * CROWN.sum() / STREET.sum() - 0.01
+    inferred = told(data, None, kept=STREET & ~CROWN, dtm_invalid=CROWN)
+    assert inferred.error_estimate_m > believed.error_estimate_m + 0.3 * CROWN.sum() / STREET.sum() - 0.01
 
 
 def test_weights_at_a_bound_are_counted():
@@ -144,18 +144,18 @@ def test_other_surfaces_tell_what_they_can():
     flat = plane.fit(tile(), RoadClusters(GRID, STREET.astype(np.int32)), plane.Options())
     found = told(tile(), flat)
     assert np.isnan(found.bounded_weights)
-    assert "doubt" in found.flags
+    assert "error-estimate" in found.flags
     assert np.isfinite([getattr(found, name) for name in FLOATS if name != "bounded_weights"]).all()
 
 
 def test_nothing_to_tell_of_is_no_fault():
     empty = told(tile(), Shape(TRUTH), road=NOWHERE)
     assert empty.flags == (NO_ROAD,)
-    assert np.isnan([getattr(empty, name) for name in FLOATS if name != "doubted_m2"]).all()
+    assert np.isnan([getattr(empty, name) for name in FLOATS if name != "suspect_m2"]).all()
     unknown = np.full(GRID.shape, np.nan)
     blind = told(tile(unknown, unknown), Shape(TRUTH), kept=NOWHERE)
-    assert {"inferred", "doubt", "dropped"} <= set(blind.flags)
-    assert told(tile(), Shape(unknown)).doubt_m != 0
+    assert {"inferred", "error-estimate", "dropped"} <= set(blind.flags)
+    assert told(tile(), Shape(unknown)).error_estimate_m != 0
 
 
 def test_neither_truth_nor_the_land_around_matters():

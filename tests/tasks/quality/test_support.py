@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.support import Support, of_faces, support
-from flexroad.tasks.roads.dtm_validity import REACH_M, continuation, unsound, without_unsound
+from flexroad.tasks.roads.dtm_validity import REACH_M, extrapolated_plane, invalid_dtm, without_invalid_dtm
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
@@ -25,8 +25,8 @@ def street(mask=STREET, outside=NOWHERE) -> RoadMask:
     return RoadMask(GRID, GRID, mask, outside)
 
 
-def kept(mask, unsound=None) -> RoadClusters:
-    return RoadClusters(GRID, mask.astype(np.int32), unsound)
+def kept(mask, dtm_invalid=None) -> RoadClusters:
+    return RoadClusters(GRID, mask.astype(np.int32), invalid_dtm)
 
 
 def test_every_cell_rests_on_what_the_fit_takes_there():
@@ -52,8 +52,8 @@ def test_a_dtm_that_is_not_sound_supports_nothing():
     crown = STREET & (COL > 20) & (COL < 30)
     data, clusters = tile(dsm=RAMP + 6 * crown), kept(STREET & ~crown, crown)
     assert (support(data, street(), clusters)[crown] == Support.INFERRED).all()
-    np.testing.assert_array_equal(np.isnan(without_unsound(data, clusters).dtm), crown)
-    assert without_unsound(data, kept(STREET)) is data
+    np.testing.assert_array_equal(np.isnan(without_invalid_dtm(data, clusters).dtm), crown)
+    assert without_invalid_dtm(data, kept(STREET)) is data
 
 
 def test_faces_take_the_cell_under_their_centroid():
@@ -70,23 +70,23 @@ def test_faces_take_the_cell_under_their_centroid():
 def test_a_plane_goes_on_as_it_is(by_row, by_col, level):
     plane = level + by_row * ROW + by_col * COL
     known = STREET & ((COL < 22) | (COL > 30))
-    found, scatter = continuation(np.where(known, plane, 1e4), known, 1.0)
+    found, scatter = extrapolated_plane(np.where(known, plane, 1e4), known, 1.0)
     told = np.isfinite(found)
     np.testing.assert_allclose(found[told], plane[told], atol=1e-5)
     assert scatter[told].max() < 1e-3
 
 
 def test_nothing_goes_on_from_a_line():
-    found, _ = continuation(RAMP, ROW == 25, 1.0)
+    found, _ = extrapolated_plane(RAMP, ROW == 25, 1.0)
     assert np.isnan(found).all()
-    found, _ = continuation(RAMP, (ROW == 25) | (ROW == 26), 1.0)
+    found, _ = extrapolated_plane(RAMP, (ROW == 25) | (ROW == 26), 1.0)
     np.testing.assert_allclose(found[30], RAMP[30], atol=1e-6)
 
 
 def test_continuation_is_a_weighted_plane_fit():
     rng = np.random.default_rng(1)
     heights, known = rng.normal(0, 1, GRID.shape), rng.random(GRID.shape) < 0.3
-    found, _ = continuation(heights, known, 1.0)
+    found, _ = extrapolated_plane(heights, known, 1.0)
     r, c = 20, 31
     near = known & (np.abs(ROW - r) <= 15) & (np.abs(COL - c) <= 15)
     x = np.column_stack([np.ones(near.sum()), ROW[near] - r, COL[near] - c])
@@ -100,20 +100,20 @@ def test_the_road_beside_a_gap_judges_the_dtm_in_it(off, believed):
     gap = STREET & (COL > 25) & (COL < 35)
     rng = np.random.default_rng(0)
     data = tile(dsm=RAMP + 0.05 * rng.standard_normal(GRID.shape), dtm=RAMP + off * gap)
-    found = unsound(data, street(), STREET & ~gap)
+    found = invalid_dtm(data, street(), STREET & ~gap)
     assert not found[~gap].any()
     assert found[gap].mean() == (0 if believed else 1)
 
 
 def test_far_from_any_road_that_is_seen_the_dtm_is_believed():
     seen = STREET & (COL < 10)
-    found = unsound(tile(dtm=RAMP + 9.0), street(), seen)
+    found = invalid_dtm(tile(dtm=RAMP + 9.0), street(), seen)
     assert found[STREET & (COL > 10) & (COL < 20)].all()
     assert not found[COL >= 9 + REACH_M + 1].any()
-    assert not unsound(tile(dtm=RAMP + 9.0), street(), NOWHERE).any()
+    assert not invalid_dtm(tile(dtm=RAMP + 9.0), street(), NOWHERE).any()
 
 
 def test_under_a_crown_on_a_bridge_the_deck_goes_on():
     deck, crown = STREET & (COL > 10) & (COL < 50), STREET & (COL > 27) & (COL < 34)
-    found = unsound(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
+    found = invalid_dtm(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
     np.testing.assert_array_equal(found, crown)

@@ -8,7 +8,7 @@ from flexroad.catalog import Grid
 from flexroad.tasks.roads.coregistration import note, pair, shift
 from flexroad.tasks.synthetic import block, make_scene
 from flexroad.tasks.synthetic.orthophoto import SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG, orthophoto
-from flexroad.tasks.types import Photo, TileData
+from flexroad.tasks.types import Orthophoto, TileData
 
 GSD = 0.5
 
@@ -20,17 +20,17 @@ def scene(seed=3):
     data = TileData("t", grid, grid, layers["dsm"].astype(float), layers["dtm"].astype(float))
     colour = orthophoto(grid, seed, "urban", gsd=GSD)
     fine = Grid.covering(grid.crs, grid.bounds, GSD)
-    return data, Photo(fine, colour, np.ones(fine.shape, bool))
+    return data, Orthophoto(fine, colour, np.ones(fine.shape, bool))
 
 
-def moved(photo: Photo, east_m: float, north_m: float) -> Photo:
+def moved(photo: Orthophoto, east_m: float, north_m: float) -> Orthophoto:
     """What a camera saw, laid down elsewhere; unknown where that leaves nothing."""
     grid = photo.grid
     col, row = round(east_m / grid.cell), round(-north_m / grid.cell)
     known = np.roll(photo.known, (row, col), (0, 1))
     known[: max(row, 0)] = known[grid.height + min(row, 0) :] = False
     known[:, : max(col, 0)] = known[:, grid.width + min(col, 0) :] = False
-    return Photo(grid, np.roll(photo.colour, (row, col), (1, 2)) * known, known)
+    return Orthophoto(grid, np.roll(photo.colour, (row, col), (1, 2)) * known, known)
 
 
 @pytest.mark.parametrize("seed", [3, 4])

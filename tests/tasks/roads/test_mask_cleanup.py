@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Hygiene, clean, close, drop, fill, within
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean, close, drop, fill, within
 from flexroad.tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
@@ -105,8 +105,8 @@ def test_a_road_in_fragments_counts_as_one():
     mask[18:22, 5:55] = True
     mask[:, 10::6] = False  # joints of one metre
     data = tile(mask.shape)
-    assert not clean(mask, data, Hygiene(close_m=0, drop_m2=25)).any()
-    whole = clean(mask, data, Hygiene(close_m=2, drop_m2=25))
+    assert not clean(mask, data, Cleanup(close_m=0, drop_m2=25)).any()
+    whole = clean(mask, data, Cleanup(close_m=2, drop_m2=25))
     assert whole[18:22, 6:54].all()
 
 
@@ -115,7 +115,7 @@ def test_nothing_is_added_beyond_the_survey():
     mask[:, 9:11] = False
     void = np.zeros_like(mask)
     void[:, 9] = True
-    found = clean(mask, tile(mask.shape, void=void), Hygiene(close_m=3))
+    found = clean(mask, tile(mask.shape, void=void), Cleanup(close_m=3))
     np.testing.assert_array_equal(found[5:-5], ~void[5:-5])
 
 
@@ -154,7 +154,7 @@ def test_a_corridor_is_measured_between_cell_centres(mask, cell, reach):
 def test_a_second_source_that_is_missing_is_named():
     mask = np.ones((4, 4), bool)
     with pytest.raises(TaskError, match=r"union needs roads.*--roads"):
-        clean(mask, tile(mask.shape), Hygiene(fuse="union"))
+        clean(mask, tile(mask.shape), Cleanup(fuse="union"))
 
 
 def test_roads_of_the_catalog_are_such_a_source(tmp_path):
@@ -166,6 +166,6 @@ def test_roads_of_the_catalog_are_such_a_source(tmp_path):
     west, south, east, _ = data.grid.bounds
     path = tmp_path / "roads.gpkg"
     geopandas.GeoDataFrame(geometry=[box(west, south + 5, east, south + 9)], crs=data.grid.crs).to_file(path)
-    found = clean(mask, replace(data, roads=Source("roads", (path,))), Hygiene(fuse="union"))
+    found = clean(mask, replace(data, roads=Source("roads", (path,))), Cleanup(fuse="union"))
     np.testing.assert_array_equal(found[:, 0], [*[False] * 11, *[True] * 4, *[False] * 5])
     assert (found == found[:, :1]).all()

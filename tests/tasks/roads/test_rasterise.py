@@ -14,7 +14,7 @@ from flexroad.catalog import Grid
 from flexroad.catalog.crs import transformer
 from flexroad.tasks import TaskError
 from flexroad.tasks.io import vectors
-from flexroad.tasks.roads.rasterise import Options, burn, cells, roads
+from flexroad.tasks.roads.rasterise import Options, cells, rasterise_roads, roads
 from tests.make_roads import GRID, on_grid, tile, write, write_osm
 
 WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
@@ -28,7 +28,7 @@ def area(*paths, **options):
 def test_a_line_is_as_wide_as_it_says_and_ends_where_it_ends(tmp_path):
     path = write(tmp_path / "r.gpkg", [WEST_EAST], width=["24'"])
     assert area(path) == pytest.approx(80 * 7.3152)
-    mask = burn(tile(path))
+    mask = rasterise_roads(tile(path))
     truth = np.zeros(GRID.shape, bool)
     truth[46:54, 10:90] = True  # centres within 3.66 m of the line, 0.5 to 3.5 m
     np.testing.assert_array_equal(mask, truth)
@@ -96,23 +96,23 @@ def test_ways_for_walkers_and_ways_to_come_are_out(tmp_path, column):
         "construction",
         "track",
     ]
-    mask = burn(tile(strips(tmp_path, column, classes)))
+    mask = rasterise_roads(tile(strips(tmp_path, column, classes)))
     assert kept(mask, 9) == [True] + [False] * 7 + [True]
-    chosen = burn(tile(tmp_path / "r.gpkg"), Options(left_out=("track",)))
+    chosen = rasterise_roads(tile(tmp_path / "r.gpkg"), Options(left_out=("track",)))
     assert kept(chosen, 9) == [True] * 8 + [False]
 
 
 def test_features_of_osm_without_highway_are_no_roads_others_need_no_class(tmp_path):
-    assert kept(burn(tile(strips(tmp_path, "highway", ["service", None]))), 2) == [True, False]
-    assert kept(burn(tile(strips(tmp_path, "class", ["lane", None]))), 2) == [True, True]
+    assert kept(rasterise_roads(tile(strips(tmp_path, "highway", ["service", None]))), 2) == [True, False]
+    assert kept(rasterise_roads(tile(strips(tmp_path, "class", ["lane", None]))), 2) == [True, True]
 
 
 def test_what_lies_under_something_is_out_unless_asked_for(tmp_path):
     values = ["yes", "building_passage", "no", None, "culvert", "F", "T"]
     path = strips(tmp_path, "tunnel", values)
-    assert kept(burn(tile(path)), 7) == [False, False, True, True, False, True, False]
-    assert kept(burn(tile(path), Options(tunnels=True)), 7) == [True] * 7
-    assert kept(burn(tile(strips(tmp_path, "covered", ["yes", "no"]))), 2) == [False, True]
+    assert kept(rasterise_roads(tile(path)), 7) == [False, False, True, True, False, True, False]
+    assert kept(rasterise_roads(tile(path), Options(tunnels=True)), 7) == [True] * 7
+    assert kept(rasterise_roads(tile(strips(tmp_path, "covered", ["yes", "no"]))), 2) == [False, True]
 
 
 def test_bridges_are_kept_and_flagged(tmp_path):
@@ -217,7 +217,7 @@ def test_a_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
     masks = []
     for i in range(8):
         grid = Grid(crs, 399_600 + 100 * i, 5_700_050, 1.0, 100, 100)
-        masks.append(burn(tile(path, grid=grid)))
+        masks.append(rasterise_roads(tile(path, grid=grid)))
     assert all(mask.sum() == 600 for mask in masks)
     squares = 4 if suffix == "gpkg" else 1
     assert 1 <= len(readings) <= squares

@@ -5,7 +5,7 @@ from hypothesis.extra.numpy import arrays
 
 from flexroad.catalog import Grid
 from flexroad.tasks import TaskError
-from flexroad.tasks.roads.extent import outside
+from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.mask import Options, segment
 from flexroad.tasks.types import TileData
 
@@ -58,16 +58,16 @@ def test_only_voids_that_reach_the_edge_are_outside():
     want = void.copy()
     want[1, 1] = False  # touches the corner's void by a corner only
     want[2:4, 3:5] = False
-    np.testing.assert_array_equal(outside(data(void)), want)
+    np.testing.assert_array_equal(beyond_extent(data(void)), want)
 
 
 def test_a_cell_that_has_one_of_both_heights_is_inside():
     void, other = np.zeros((6, 8), bool), np.zeros((6, 8), bool)
     void[:3] = True
     other[3:] = True
-    assert not outside(data(void, dtm_void=other)).any()
+    assert not beyond_extent(data(void, dtm_void=other)).any()
     other[2] = True
-    np.testing.assert_array_equal(np.flatnonzero(outside(data(void, dtm_void=other)).all(axis=1)), [2])
+    np.testing.assert_array_equal(np.flatnonzero(beyond_extent(data(void, dtm_void=other)).all(axis=1)), [2])
 
 
 @given(arrays(bool, (6, 8)))
@@ -80,4 +80,4 @@ def test_outside_is_what_water_from_the_edge_would_reach(void):
     for _ in range(void.size):
         spread = np.pad(wet, 1)
         wet |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
-    np.testing.assert_array_equal(outside(data(void)), wet)
+    np.testing.assert_array_equal(beyond_extent(data(void)), wet)

@@ -3,7 +3,7 @@ import pytest
 from shapely import LineString, box
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.roads.mask_cleanup import Hygiene
+from flexroad.tasks.roads.mask_cleanup import Cleanup
 from flexroad.tasks.segment.vector import VERSION, Options, segment
 from tests.make_roads import GRID, on_grid, tile, write
 
@@ -49,7 +49,7 @@ def test_hygiene_tidies_what_is_asked_for(tmp_path):
     lines = [LINE, LineString(on_grid((20, 80), (24, 80)))]
     path = write(tmp_path / "r.gpkg", lines, width=[6, 4])
     assert segment(tile(path), Options()).mask[:40].any()
-    assert not segment(tile(path), Options(hygiene=Hygiene(drop_m2=20))).mask[:40].any()
+    assert not segment(tile(path), Options(cleanup=Cleanup(drop_m2=20))).mask[:40].any()
 
 
 def test_a_road_beside_the_tile_reaches_in_by_its_half_width(tmp_path):

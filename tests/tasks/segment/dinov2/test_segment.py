@@ -65,7 +65,7 @@ def heads(backbones, sample, tmp_path_factory) -> dict[int, Path]:
 
 
 def found(data: TileData, model: Path, **options):
-    return segment(data, Options(model=model, **({"hygiene": NOTHING} | options)))
+    return segment(data, Options(model=model, **({"cleanup": NOTHING} | options)))
 
 
 def iou(one, other) -> float:
@@ -329,7 +329,7 @@ def test_the_same_weights_elsewhere_serve(backbones, heads, sample, tmp_path):
     moved.mkdir()
     for file in backbones[0].iterdir():
         (moved / file.name).write_bytes(file.read_bytes())
-    options = Options(model=heads[0], backbone=str(moved), hygiene=NOTHING)
+    options = Options(model=heads[0], backbone=str(moved), cleanup=NOTHING)
     np.testing.assert_array_equal(
         segment(sample.data, options).probability, found(sample.data, heads[0]).probability
     )

@@ -4,7 +4,7 @@ from scipy.ndimage import gaussian_filter
 
 from flexroad.catalog import Grid
 from flexroad.tasks.segment.pixels.features import CUT, REACH_M, features, mean
-from flexroad.tasks.types import Photo, TileData
+from flexroad.tasks.types import Orthophoto, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 rng = np.random.default_rng(0)
@@ -14,10 +14,10 @@ def tile(dsm, dtm, grid=GRID, core=GRID) -> TileData:
     return TileData("a", grid, core, dsm, dtm)
 
 
-def photo(grid=GRID, colour=None, known=None) -> Photo:
+def photo(grid=GRID, colour=None, known=None) -> Orthophoto:
     fine = Grid(grid.crs, grid.west, grid.north, grid.cell / 2, 2 * grid.width, 2 * grid.height)
     colour = rng.integers(0, 256, (3, *fine.shape)).astype(np.uint8) if colour is None else colour
-    return Photo(fine, colour, np.ones(fine.shape, bool) if known is None else known)
+    return Orthophoto(fine, colour, np.ones(fine.shape, bool) if known is None else known)
 
 
 def named(data, seen=None):

@@ -75,7 +75,7 @@ def without_photo(sample):
 
 
 def test_roads_of_a_tile_never_seen(samples, model, trained):
-    found = segment(samples[5].data, Options(model=model, hygiene=NOTHING))
+    found = segment(samples[5].data, Options(model=model, cleanup=NOTHING))
     road = samples[5].road
     threshold = read_model(model).about.threshold
     np.testing.assert_array_equal(found.mask, found.probability >= threshold)
@@ -93,12 +93,12 @@ def test_heights_alone(samples, tmp_path, model):
     bare = [without_photo(sample) for sample in samples]
     path = written(training.train(bare[:4], bare[4:5], QUICK), tmp_path)
     assert not read_model(path).about.photo
-    found = segment(bare[5].data, Options(model=path, hygiene=NOTHING))
+    found = segment(bare[5].data, Options(model=path, cleanup=NOTHING))
     # A photo that the model never saw counts for nothing.
     np.testing.assert_array_equal(
-        found.probability, segment(samples[5].data, Options(model=path, hygiene=NOTHING)).probability
+        found.probability, segment(samples[5].data, Options(model=path, cleanup=NOTHING)).probability
     )
-    with_colours = segment(samples[5].data, Options(model=model, hygiene=NOTHING))
+    with_colours = segment(samples[5].data, Options(model=model, cleanup=NOTHING))
     assert 0.2 < iou(found.mask, samples[5].road) < iou(with_colours.mask, samples[5].road)
 
 
@@ -128,7 +128,7 @@ def test_one_tile_is_enough_to_train_on(samples, tmp_path):
 
 def test_a_threshold_of_ones_own(samples, model):
     few, many = (
-        segment(samples[5].data, Options(model=model, threshold=t, hygiene=NOTHING)).mask for t in (0.9, 0.1)
+        segment(samples[5].data, Options(model=model, threshold=t, cleanup=NOTHING)).mask for t in (0.9, 0.1)
     )
     assert few.sum() < many.sum()
     assert (many | ~few).all()
