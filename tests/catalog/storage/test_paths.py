@@ -10,7 +10,7 @@ from flexroad.catalog.storage.paths import StatCache, parse_location
 from tests.s3_server import Fault
 
 
-@pytest.fixture(params=["disk", "bucket"])
+@pytest.fixture(params=["disk", pytest.param("bucket", marks=pytest.mark.slow)])
 def folder(request, tmp_path):
     return tmp_path if request.param == "disk" else request.getfixturevalue("bucket")
 

@@ -576,6 +576,7 @@ def test_a_catalog_of_files_that_moved(run, flexroad, survey, tmp_path):
 # --- the life of a run --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sources_that_are_gone_take_nothing_from_what_is_done(run, flexroad, survey, tmp_path):
     tile = Catalog.read(survey).tiles[0]
     points = tmp_path / "points.csv"
