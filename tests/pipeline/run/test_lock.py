@@ -17,8 +17,8 @@ from flexroad.pipeline.run.lock import Heartbeat, Owner, at_work, owner, run_loc
 HOLD = """
 import sys, time
 from pathlib import Path
-from flexroad.pipeline.run.lock import held
-with held(Path(sys.argv[1])):
+from flexroad.pipeline.run.lock import run_lock
+with run_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
@@ -138,9 +138,9 @@ def test_a_damaged_lock_is_refused_while_young_and_then_taken_over(tmp_path):
 @pytest.mark.parametrize("stale", [False, True])
 def test_of_many_that_race_exactly_one_wins(stale, tmp_path):
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom flexroad.pipeline.run.lock import held\n"
+        "import sys, time\nfrom pathlib import Path\nfrom flexroad.pipeline.run.lock import run_lock\n"
         "print('ready', flush=True); sys.stdin.readline()\n"
-        "with held(Path(sys.argv[1])):\n    print('won', flush=True); sys.stdin.readline()"
+        "with run_lock(Path(sys.argv[1])):\n    print('won', flush=True); sys.stdin.readline()"
     )
     many = [
         subprocess.Popen(

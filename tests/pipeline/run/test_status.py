@@ -13,8 +13,6 @@ from flexroad.pipeline.run.status import progress
 from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.records import Failure, TileRecord
 
-NOW = datetime.now(UTC)
-
 
 @pytest.fixture
 def run(made_survey, quick_config, tmp_path) -> Run:
@@ -23,9 +21,10 @@ def run(made_survey, quick_config, tmp_path) -> Run:
 
 
 def test_progress_tells_how_it_stands_and_how_fast_it_goes(run):
+    now = datetime.now(UTC)
     one, two, three, _ = (tile.id for tile in run.catalog.tiles)
-    who = Owner("node7", "m", "b", 4711, 99, (NOW - timedelta(minutes=2)).isoformat(timespec="seconds"), "t")
-    before, lately = ((NOW - timedelta(minutes=m)).isoformat(timespec="milliseconds") for m in (9, 1))
+    who = Owner("node7", "m", "b", 4711, 99, (now - timedelta(minutes=2)).isoformat(timespec="seconds"), "t")
+    before, lately = ((now - timedelta(minutes=m)).isoformat(timespec="milliseconds") for m in (9, 1))
     with RunDatabase.open(run.path / NAME) as database:
         database.ask([(tile.id, "pending") for tile in run.catalog.tiles])
         database.record(TileRecord(one, "done", "f", (), finished=before))

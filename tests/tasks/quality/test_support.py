@@ -26,7 +26,7 @@ def street(mask=STREET, outside=NOWHERE) -> RoadMask:
 
 
 def kept(mask, dtm_invalid=None) -> RoadClusters:
-    return RoadClusters(GRID, mask.astype(np.int32), invalid_dtm)
+    return RoadClusters(GRID, mask.astype(np.int32), dtm_invalid)
 
 
 def test_every_cell_rests_on_what_the_fit_takes_there():
