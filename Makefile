@@ -58,7 +58,7 @@ MADE := $(filter-out $(MESHED),$(wildcard tasks/synthetic/*.py))
 runs/synthetic-$(TILES)-$(SEED)/survey/catalog.parquet: $(MADE) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset gerod -o $(@D) --tiles $(TILES) --seed $(SEED)
 
-$(SCENES): $(wildcard tasks/synthetic/*.py tasks/acquire/*.py pipeline/prepare/*.py) | $(STAMP)
+$(SCENES): $(wildcard tasks/synthetic/*.py tasks/acquire/*.py tasks/acquire/*/*.py pipeline/prepare/*.py) | $(STAMP)
 	$(BIN)/flexroad catalog synthetic --preset dsc3d -o $(@D) --seed $(SEED)
 
 runs/gerod/survey/catalog.parquet: configs/gerod.yaml | $(STAMP)
