@@ -180,6 +180,9 @@ class Session(Generic[J, R]):
             future.result()
         elif future.status == "finished":
             yield from self._fetched(future, flight)
+        elif self.client.status == "running":
+            # Cancelled by a scheduler that is there: the worker died with the result before it was fetched.
+            self.quarantined.append(flight.job)
         else:
             raise self._gone()
 
@@ -190,7 +193,9 @@ class Session(Generic[J, R]):
             # The worker died between doing the job and handing over the result.
             yield from self._died(flight, error)
         except (CancelledError, OSError) as error:
-            raise self._gone() from error
+            if self.client.status != "running":
+                raise self._gone() from error
+            self.quarantined.append(flight.job)
         else:
             if fault:
                 raise ConfigError(fault)
