@@ -1,7 +1,7 @@
 """Filter the road mask: ECSRC, the paper's step B ("Road and Terrain Point Cloud Extraction", Algorithm 1).
 
 Three parts, as in the algorithm: growth over neighbouring cells (Eq. neighbors), `mergeClusters`,
-`cleanClusters`. What holds on streets with trees and cars, where this one does not, is `tasks.filter.planar`.
+`cleanClusters`. For streets with trees and cars, where this filter fails, see `tasks.filter.planar`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VERSION = 1
 
 
 class Options(base.Options):
-    """What counts as one road."""
+    """Method and thresholds of the filter."""
 
     method: Literal["paper", "off"] = Field(
         "paper",
@@ -44,12 +44,12 @@ class Options(base.Options):
     )
     min_area_m2: float = Field(50.0, ge=0, description="smaller clusters are dropped (m2)")
     keep_largest: int | None = Field(
-        10, ge=1, description="of the rest, keep so many of the largest; null keeps all"
+        10, ge=1, description="number of the largest remaining clusters to keep; null keeps all"
     )
 
 
 def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
-    """Label the road cells that hang together in plan and height; drop the rest (Algorithm 1).
+    """Label the clusters of road cells connected in plan and height; drop the rest (Algorithm 1).
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Where a surface model is flat as a road is: small square patches that a plane fits.
+"""Flat patches of a surface model: small squares of cells to which a plane fits, as on a road.
 
-All comes from differences of heights inside a patch, so a constant or a plane added to the heights changes
-nothing.
+Only height differences inside a patch are used, so the result does not change if a constant or a plane is
+added to the heights.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flexroad.tasks.types import Bools, Floats
 PATCH_M = 3.0
 """Side of a patch (m); at least three cells."""
 STREET_M = 5.0
-"""Half side of the square around a patch whose patches tell the street's slope (m)."""
+"""Half side of the square around a patch over which the street's slope is averaged (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,27 +26,27 @@ class Patches:
     """The flat patches of a tile, by their centres."""
 
     centres: Bools
-    """``(H, W)``."""
+    """Cells that are the centre of a flat patch, ``(H, W)``."""
     trend: Floats
-    """Slope of the street at a centre by row and column, ``(H, W, 2)``, m per cell; 0 elsewhere."""
+    """Slope of the street along rows and columns at each centre, ``(H, W, 2)``, m per cell; 0 elsewhere."""
     reach: int
-    """Cells from a centre to the edge of its patch."""
+    """Number of cells from a centre to the edge of its patch."""
 
 
 def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Patches:
     """Find the flat patches.
 
     A patch is flat if the residuals to its least-squares plane have a root mean square (over the degrees of
-    freedom) of at most ``roughness_m``, and its slope differs from its street's, the mean of the patches
-    nearby, by at most ``bend``. The second throws out patches over a step: a plane that leans on a car hides
-    half the car's height.
+    freedom) of at most ``roughness_m``, and if its slope differs from the street's by at most ``bend``; the
+    street's slope is the mean over the patches nearby. The second condition excludes patches across a step: a
+    plane tilted up to the roof of a car has small residuals.
 
     Parameters
     ----------
     heights : (H, W) array
         Surface model (m).
     points : (H, W) array of bool
-        Cells that may belong to a patch; all cells of a patch do.
+        Cells that may belong to a patch; a patch has no other cells.
     cell : float
         Size of a cell (m).
     roughness_m : float
@@ -63,7 +63,7 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
 
 @compiled()
 def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return slopes by row and column (m per cell), ``(H, W, 2)``, and where a plane fits a whole patch."""
+    """Return slopes along rows and columns (m per cell), ``(H, W, 2)``, and the centres of smooth patches."""
     rows, cols = heights.shape
     slopes, smooth = np.zeros((rows, cols, 2)), np.zeros((rows, cols), np.bool_)
     side = 2 * reach + 1

@@ -1,7 +1,7 @@
 """Clusters of cells as a union-find forest.
 
-A cluster is a tree whose root is its first cell in row-major order, so that nothing depends on the order of
-the merges.
+A cluster is a tree whose root is its first cell in row-major order, so the result does not depend on the
+order of the merges.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools
 
 Roots = NDArray[np.int32]
-"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent, -1 is no member."""
+"""Flat index of each cell's parent, ``(H * W,)``; a root is its own parent; -1 if the cell is no member."""
 
 
 def init(members: Bools) -> Roots:
@@ -25,8 +25,8 @@ def init(members: Bools) -> Roots:
 def forward_offsets(radius: float) -> NDArray[np.int64]:
     """Return the (row, col) steps of up to ``radius`` cells that go forward in row-major order, ``(n, 2)``.
 
-    A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc are the same pairs of
-    cells seen from their other end. Short steps come first: they leave fewer sets for the long ones.
+    A radius of 1.5 gives the 8-neighbourhood A(i, j). The other half of the disc would give the same pairs of
+    cells again. Short steps come first, so that fewer sets are left for the long ones.
     """
     reach = int(radius + 1e-9)
     row, col = np.mgrid[0 : reach + 1, -reach : reach + 1].reshape(2, -1)
@@ -38,7 +38,7 @@ def forward_offsets(radius: float) -> NDArray[np.int64]:
 
 @compiled()
 def find(roots: Roots, i: int) -> int:
-    """Return the root of a cell, and shorten the way to it."""
+    """Return the root of a cell and shorten the path to it."""
     while roots[i] != i:
         roots[i] = roots[roots[i]]
         i = roots[i]
@@ -47,8 +47,8 @@ def find(roots: Roots, i: int) -> int:
 
 @compiled()
 def compress(roots: Roots) -> Roots:
-    """Let every member point at its root, in place."""
-    # A parent comes before its children, so it already points at the root.
+    """Make the root of every member its parent, in place."""
+    # A parent has a lower index than its children, so its own parent is already the root.
     for i in range(roots.size):
         if roots[i] >= 0:
             roots[i] = roots[roots[i]]
@@ -72,6 +72,6 @@ def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArra
 
 
 def least_cells(area_m2: float, cell: float) -> float:
-    """Return how many cells make an area."""
-    # A cell's area has rounding errors where its size is no binary fraction: 5000 cells of 0.1 m are 50 m2.
+    """Return the number of cells in an area."""
+    # Without the tolerance, rounding errors of the cell size would count: 5000 cells of 0.1 m are 50 m2.
     return area_m2 / cell**2 * (1 - 1e-9)

@@ -1,10 +1,10 @@
-"""Algorithm 1 of the paper, line by line, with Python's sets: what `tasks.filter.ecsrc` must agree with."""
+"""Oracle for `tasks.filter.ecsrc`: Algorithm 1 of the paper, line by line, with Python sets."""
 
 import math
 
 
 def grow(heights: dict, theta_z: float) -> dict:
-    """Lines 3 to 14: label by label, from every point not yet visited."""
+    """Lines 3 to 14: grow one cluster from each point not yet visited."""
     neighbours = {
         (i, j): {
             (i + di, j + dj)
@@ -31,16 +31,16 @@ def grow(heights: dict, theta_z: float) -> dict:
 
 
 def merge(heights: dict, labels: dict, theta_xy: float, theta_z: float, cell: float) -> dict:
-    """Line 15: clusters become one while any two of their points are near in plan and in height."""
+    """Line 15: merge clusters while any two of their points are near in plan and in height."""
     n = int(theta_xy / cell + 1e-6)
     span = range(-n, n + 1)
     steps = [(di, dj) for di in span for dj in span if math.hypot(di, dj) * cell <= theta_xy + 1e-9]
     touching = {label: set() for label in set(labels.values())}
     for (i, j), z in heights.items():
         for di, dj in steps:
-            other = (i + di, j + dj)
-            if other in heights and abs(heights[other] - z) <= theta_z:
-                touching[labels[i, j]].add(labels[other])
+            neighbour = (i + di, j + dj)
+            if neighbour in heights and abs(heights[neighbour] - z) <= theta_z:
+                touching[labels[i, j]].add(labels[neighbour])
     merged = {}
     for label in sorted(touching):
         queue = {label} - merged.keys()
@@ -52,7 +52,7 @@ def merge(heights: dict, labels: dict, theta_xy: float, theta_z: float, cell: fl
 
 
 def clean(labels: dict, cell: float, min_area: float, keep: int | None) -> dict:
-    """Line 16: large clusters only, of these the k largest, numbered by their first points."""
+    """Line 16: keep the k largest of the large clusters, numbered in the order of their first points."""
     clusters = {}
     for point in sorted(labels):
         clusters.setdefault(labels[point], []).append(point)
@@ -76,9 +76,9 @@ def points(mask, dsm) -> dict:
 
 
 def labels(mask, dsm, cell: float, options) -> list[list[int]]:
-    """Algorithm 1 as a whole; rows of labels."""
+    """Whole Algorithm 1; returns rows of labels."""
     heights = points(mask, dsm)
-    found = grow(heights, options.theta_z_m)
-    found = merge(heights, found, options.theta_xy_m, options.theta_z_m, cell)
-    found = clean(found, cell, options.min_area_m2, options.keep_largest)
-    return [[found.get((i, j), 0) for j in range(mask.shape[1])] for i in range(mask.shape[0])]
+    result = grow(heights, options.theta_z_m)
+    result = merge(heights, result, options.theta_xy_m, options.theta_z_m, cell)
+    result = clean(result, cell, options.min_area_m2, options.keep_largest)
+    return [[result.get((i, j), 0) for j in range(mask.shape[1])] for i in range(mask.shape[0])]

@@ -1,4 +1,4 @@
-"""The filter for real streets on made ground whose answer is known, and what must not change it."""
+"""The planar filter on synthetic ground with known result, and its invariances."""
 
 import hashlib
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, INCONSISTENT, against_known
+from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, INCONSISTENT, ground_consistency
 from flexroad.tasks.filter.kit.planar_patches import flat_patches
 from flexroad.tasks.filter.planar import VERSION, Options, ecsrc
 from flexroad.tasks.synthetic import gerod, make_scene
@@ -22,10 +22,10 @@ def kept(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen)
     return clusters(mask, dsm, dtm, options, cell).mask
 
 
-def decided(mask, dsm, dtm):
-    """Which cells are kept (1), and which have a terrain model that does not count (2)."""
-    found = clusters(mask, dsm, dtm, Options(verge_m=4))
-    return found.mask + 2 * found.dtm_invalid
+def classified(mask, dsm, dtm):
+    """Return 1 for kept cells plus 2 for cells with an invalid DTM."""
+    result = clusters(mask, dsm, dtm, Options(verge_m=4))
+    return result.mask + 2 * result.dtm_invalid
 
 
 def clusters(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen)
@@ -35,15 +35,15 @@ def clusters(mask, dsm, dtm, options=Options(), cell=1.0):  # noqa: B008 (frozen
 
 
 def street(slope=(0.0, 0.0), shape=(40, 120), seed=0):
-    """A street of 8 m along the rows' middle: mask, DSM with noise, DTM."""
+    """Return mask, DSM with noise and DTM of a street 8 m wide along the middle rows."""
     row, col = np.indices(shape)
     ground = 150 + slope[0] * row + slope[1] * col
     noise = NOISE_M * np.random.default_rng(seed).standard_normal(shape)
     return np.abs(row - shape[0] // 2) < 4, ground + noise, ground
 
 
-def spoiled(seed, n=90):
-    """A crossing with crowns, cars and steps, on humps: mask, DSM, DTM, all random."""
+def random_crossing(seed, n=90):
+    """Return mask, DSM and DTM of a crossing on humps, with random crowns, cars and steps."""
     rng = np.random.default_rng(seed)
     row, col = np.indices((n, n))
     ground = 150 + 0.5 * np.sin(row / 17 + seed) + 0.5 * np.sin(col / 13)
@@ -60,41 +60,41 @@ def spoiled(seed, n=90):
 
 
 @pytest.mark.parametrize("slope", [(0, 0), (0, 0.15), (0.1, 0.05)])
-def test_steep_and_banked_streets_stay_whole(slope):
+def test_planar_steep_or_banked_street_is_kept(slope):
     mask, dsm, dtm = street(slope)
     np.testing.assert_array_equal(kept(mask, dsm, dtm), mask)
 
 
 @pytest.mark.parametrize("height", [0.6, 1.5])
-def test_cars_on_a_slope_are_dropped(height):
+def test_planar_cars_on_slope_are_dropped(height):
     mask, dsm, dtm = street((0, 0.12))
     car = np.zeros_like(mask)
     car[17:19, 30:34] = car[17:19, 40:45] = car[21:23, 60:64] = True
-    found = kept(mask, dsm + height * car, dtm)
-    np.testing.assert_array_equal(found, mask & ~car)
+    result = kept(mask, dsm + height * car, dtm)
+    np.testing.assert_array_equal(result, mask & ~car)
 
 
-def test_a_crown_down_to_the_road_is_not_climbed():
+def test_planar_crown_reaching_road_is_dropped():
     mask, dsm, dtm = street()
     row, col = np.indices(mask.shape)
     away = np.hypot(row - 16, col - 60)
     rng = np.random.default_rng(1)
     crown = np.where(away < 6, 0.4 + 1.2 * (6 - away) + rng.normal(0, 0.3, mask.shape), 0)
     hidden = crown > 0.4
-    found = kept(mask, dsm + np.maximum(crown, 0), dtm)
-    assert not found[hidden].any()
-    assert found[mask & (away > 6)].all()
+    result = kept(mask, dsm + np.maximum(crown, 0), dtm)
+    assert not result[hidden].any()
+    assert result[mask & (away > 6)].all()
 
 
 @pytest.mark.parametrize("under", ["valley", "unknown", "interpolated"])
-def test_a_deck_goes_on_from_the_street(under):
+def test_planar_deck_is_kept(under):
     mask, dsm, dtm = street()
     below = {"valley": dtm - 6, "unknown": np.full_like(dtm, np.nan), "interpolated": dtm + 0.2}[under]
     dtm[:, 50:62] = below[:, 50:62]
     np.testing.assert_array_equal(kept(mask, dsm, dtm), mask)
 
 
-def test_a_deck_behind_a_lorry_still_goes_on():
+def test_planar_deck_behind_lorry_is_kept():
     mask, dsm, dtm = street((0, 0.05))
     dtm[:, 50:66] -= 6
     lorry = np.zeros_like(mask)
@@ -102,59 +102,59 @@ def test_a_deck_behind_a_lorry_still_goes_on():
     np.testing.assert_array_equal(kept(mask, dsm + 3 * lorry, dtm), mask & ~lorry)
 
 
-def test_a_hidden_deck_is_told_apart_from_the_valley():
-    """Below a car on a bridge the DTM must not stand in; below one on the street it may."""
+def test_planar_car_on_deck_invalidates_dtm():
+    """The DTM is invalid under a car on a bridge, and valid under a car on the street."""
     mask, dsm, dtm = street()
     dtm[:, 50:66] -= 6
     cars = np.zeros_like(mask)
     cars[17:19, 54:58] = cars[17:19, 80:84] = True
-    found = clusters(mask, dsm + 1.5 * cars, dtm)
-    np.testing.assert_array_equal(found.mask, mask & ~cars)
-    np.testing.assert_array_equal(found.dtm_invalid, cars & (np.arange(120) < 66))
+    result = clusters(mask, dsm + 1.5 * cars, dtm)
+    np.testing.assert_array_equal(result.mask, mask & ~cars)
+    np.testing.assert_array_equal(result.dtm_invalid, cars & (np.arange(120) < 66))
 
 
-def test_beside_a_street_the_terrain_model_does_not_count():
-    """Up to the verge, also beside what hides the street's edge; but not beside a stain of the mask."""
+def test_verge_invalidates_dtm_beside_streets():
+    """The DTM is invalid up to `verge_m`, also beside objects at the edge; not beside dropped mask parts."""
     mask, dsm, dtm = street()
     crown = np.zeros_like(mask)
     crown[16:19, 50:56] = True
     mask[33:35, 90:93] = True
     rough = np.where(crown, 5 + np.random.default_rng(2).normal(0, 1, mask.shape), 0.0)
-    found = clusters(
+    result = clusters(
         mask, dsm + rough + 4 * (np.indices(mask.shape)[0] >= 33) * mask, dtm, Options(verge_m=3)
     )
     row = np.indices(mask.shape)[0]
-    assert not found.mask[crown].any()
-    np.testing.assert_array_equal(found.dtm_invalid, ~mask & (row >= 14) & (row <= 26))
+    assert not result.mask[crown].any()
+    np.testing.assert_array_equal(result.dtm_invalid, ~mask & (row >= 14) & (row <= 26))
 
 
-def test_a_roof_in_the_mask_is_dropped_and_a_long_viaduct_kept():
+def test_planar_roof_is_dropped_and_long_viaduct_kept():
     mask, dsm, dtm = street()
     mask[28:38, 50:62] = True
     dsm[28:38, 50:62] += 4
-    found = kept(mask, dsm, dtm)
-    assert not found[28:38, 50:62].any()
-    assert found[mask & (dsm < 152)].all()
+    result = kept(mask, dsm, dtm)
+    assert not result[28:38, 50:62].any()
+    assert result[mask & (dsm < 152)].all()
     high, dsm, dtm = street(shape=(40, 200))
     np.testing.assert_array_equal(kept(high, dsm, dtm - 8), high)
 
 
-def test_a_terrain_model_that_is_off_costs_nothing_on_a_street():
+def test_planar_wrong_dtm_keeps_street():
     mask, dsm, dtm = street()
     dtm[:, 40:70] += 0.7
     np.testing.assert_array_equal(kept(mask, dsm, dtm), mask)
 
 
-def test_what_no_patch_covers_is_held_against_the_ground_around():
+def test_planar_cells_outside_patches_are_compared_with_ground():
     mask, dsm, dtm = street((0, 0.1))
     mask[10:16, 50] = True
     dsm[10:13, 50] += 1
-    found = kept(mask, dsm, dtm)
-    assert found[13:16, 50].all()
-    assert not found[10:13, 50].any()
+    result = kept(mask, dsm, dtm)
+    assert result[13:16, 50].all()
+    assert not result[10:13, 50].any()
 
 
-def test_cells_count_in_metres():
+def test_planar_thresholds_are_in_metres():
     mask, dsm, dtm = street()
     fine = [np.repeat(np.repeat(a, 2, 0), 2, 1) for a in (mask, dsm, dtm)]
     car = np.zeros_like(fine[0])
@@ -166,7 +166,7 @@ def test_cells_count_in_metres():
     assert kept(small, dsm, dtm, Options(min_area_m2=49)).sum() == 49
 
 
-def test_labels_part_at_gaps_and_count_from_the_first_cell():
+def test_labels_split_at_gaps_in_order_of_first_cell():
     mask, dsm, dtm = street()
     mask[:, 50:58] = False
     mask[:, 80:92] = False
@@ -180,42 +180,43 @@ def test_labels_part_at_gaps_and_count_from_the_first_cell():
 
 
 @pytest.mark.parametrize("mask", [np.zeros((9, 9), bool), np.eye(9, dtype=bool), np.ones((2, 2), bool)])
-def test_too_little_leaves_nothing(mask):
+def test_planar_tiny_mask_keeps_nothing(mask):
     assert not kept(mask, np.zeros(mask.shape), np.zeros(mask.shape)).any()
 
 
 @given(st.integers(0, 10_000), st.sampled_from([np.flipud, np.fliplr, np.transpose]))
 @settings(max_examples=20, deadline=None)
-def test_a_mirrored_tile_is_decided_alike(seed, turn):
-    case = spoiled(seed)
-    np.testing.assert_array_equal(turn(decided(*case)), decided(*(turn(layer) for layer in case)))
+def test_planar_mirrored_tile_gives_mirrored_result(seed, mirror):
+    case = random_crossing(seed)
+    np.testing.assert_array_equal(mirror(classified(*case)), classified(*(mirror(layer) for layer in case)))
 
 
 @given(st.integers(0, 10_000), st.integers(-400, 4000), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
 @settings(max_examples=20, deadline=None)
-def test_a_constant_and_a_plane_change_nothing(seed, constant, south, east):
-    mask, dsm, dtm = spoiled(seed)
+def test_planar_plane_added_keeps_result(seed, constant, south, east):
+    mask, dsm, dtm = random_crossing(seed)
     row, col = np.indices(mask.shape)
     plane = constant + south * row + east * col
-    np.testing.assert_array_equal(decided(mask, dsm, dtm), decided(mask, dsm + plane, dtm + plane))
+    np.testing.assert_array_equal(classified(mask, dsm, dtm), classified(mask, dsm + plane, dtm + plane))
 
 
 @given(st.integers(0, 10_000), st.tuples(*[st.integers(0, 12)] * 4))
 @settings(max_examples=20, deadline=None)
-def test_a_shifted_tile_decides_the_same_cells_alike(seed, cut):
-    case = spoiled(seed)
+def test_planar_cropped_tile_gives_same_result(seed, cut):
+    case = random_crossing(seed)
     rows, cols = slice(cut[0], 90 - cut[1]), slice(cut[2], 90 - cut[3])
     np.testing.assert_array_equal(
-        decided(*case)[rows, cols], decided(*(np.ascontiguousarray(layer[rows, cols]) for layer in case))
+        classified(*case)[rows, cols],
+        classified(*(np.ascontiguousarray(layer[rows, cols]) for layer in case)),
     )
 
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=10, deadline=None)
-def test_flat_patches_are_those_of_least_squares(seed):
-    mask, dsm, _ = spoiled(seed, n=40)
+def test_flat_patches_equal_least_squares(seed):
+    mask, dsm, _ = random_crossing(seed, n=40)
     mask = np.isfinite(dsm) & (np.random.default_rng(seed).random(dsm.shape) < 0.97)
-    found = flat_patches(dsm, mask, 1.0, 0.1, 1e9).centres
+    result = flat_patches(dsm, mask, 1.0, 0.1, 1e9).centres
     row, col = np.mgrid[-1:2, -1:2]
     design = np.column_stack([np.ones(9), row.ravel(), col.ravel()])
     for r, c in np.ndindex(dsm.shape):
@@ -223,30 +224,30 @@ def test_flat_patches_are_those_of_least_squares(seed):
         whole = min(r, c) > 0 and mask[window].shape == (3, 3) and mask[window].all()
         if whole:
             residual = np.linalg.lstsq(design, dsm[window].ravel(), rcond=None)[1][0]
-            assert found[r, c] == (residual / 6 <= 0.1**2)
+            assert result[r, c] == (residual / 6 <= 0.1**2)
         else:
-            assert not found[r, c]
+            assert not result[r, c]
 
 
-def test_a_cell_against_the_plane_of_the_known():
+def test_ground_consistency_compares_with_plane():
     row, col = np.indices((9, 9))
     dsm, unknown = 0.3 * row - 0.2 * col, np.full((9, 9), np.nan)
-    known, asked = np.hypot(row - 4, col - 4) > 1.5, (row == 4) & (col == 4)
+    ground, candidate = np.hypot(row - 4, col - 4) > 1.5, (row == 4) & (col == 4)
     for height, expected in (
         (0.2, CONSISTENT),
         (-0.2, CONSISTENT),
         (0.3, INCONSISTENT),
         (-0.3, INCONSISTENT),
     ):
-        found = against_known(dsm + height * asked, unknown, known, asked, 3, 0.25)
-        assert found[4, 4] == expected
-    # Beyond the end of what is known, a plane is a guess.
-    assert against_known(dsm, unknown, known & (col > 6), asked, 3, 0.25)[4, 4] == INCONSISTENT
+        result = ground_consistency(dsm + height * candidate, unknown, ground, candidate, 3, 0.25)
+        assert result[4, 4] == expected
+    # The plane is too uncertain outside the ground cells.
+    assert ground_consistency(dsm, unknown, ground & (col > 6), candidate, 3, 0.25)[4, 4] == INCONSISTENT
 
 
 @pytest.mark.parametrize("under", ["as given", "noise"])
-def test_precision_and_recall_on_a_tile_of_the_benchmark(under):
-    """Seed 3 is neither the one the options were chosen on nor the one they are reported on."""
+def test_planar_benchmark_tile_reaches_precision_and_recall(under):
+    """Seed 3 was used neither to choose the options nor to report results."""
     places = gerod.survey(12, 3)
     scene = next(
         scene
@@ -255,27 +256,27 @@ def test_precision_and_recall_on_a_tile_of_the_benchmark(under):
     )
     rng = np.random.default_rng(0)
     dtm = scene.dtm + (0.1 * rng.standard_normal(scene.dtm.shape) if under == "noise" else 0)
-    found = kept(scene.road_mask, scene.dsm, dtm)
+    result = kept(scene.road_mask, scene.dsm, dtm)
     sound = np.isin(scene.kind, BARE) | (np.abs(scene.dsm - scene.reference) <= 0.15)
     deck = scene.road_mask & (scene.kind == Kind.DECK)
-    assert np.mean(sound[found]) > 0.98
-    assert np.mean(found[scene.road_mask & sound]) > 0.97
-    assert np.mean(found[deck]) > 0.95
+    assert np.mean(sound[result]) > 0.98
+    assert np.mean(result[scene.road_mask & sound]) > 0.97
+    assert np.mean(result[deck]) > 0.95
 
 
-def test_output_is_pinned_with_the_version():
-    labels = clusters(*spoiled(7)).labels
+def test_planar_output_is_pinned_to_version():
+    labels = clusters(*random_crossing(7)).labels
     digest = hashlib.sha256(labels.tobytes()).hexdigest()[:16]
     assert (VERSION, np.bincount(labels.ravel()).tolist(), digest) == (2, [7164, 936], "bb5fe3cd9d3c165b")
 
 
-def test_every_option_has_its_bounds():
+def test_options_out_of_bounds_are_refused():
     for wrong in ({"theta_z_m": 0}, {"roughness_m": 0}, {"bend": 0}, {"raised_m2_per_m": -1}, {"theta_z": 1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Options(**wrong)
 
 
-def test_a_small_patch_on_high_ground_needs_area_for_its_height():
+def test_raised_cluster_needs_area_for_its_height():
     mask, dsm, dtm = street(shape=(40, 80))
     raised = Options(raised_m2_per_m=0)
     assert not kept(mask, dsm, dtm - 30).any()
