@@ -1,1 +1,1 @@
-"""The NURBS surface, its loss, and what minimises it."""
+"""The NURBS surface, its loss functions, and their solvers."""

@@ -1,4 +1,4 @@
-"""Adam within bounds, and when it may stop early (the paper's "Implementation Details").
+"""Adam within bounds, with early stopping (the paper's "Implementation Details").
 
 Kingma and Ba, "Adam: a method for stochastic optimization", 2015, Algorithm 1, and a projection on the
 bounds after each step.
@@ -18,19 +18,19 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
 @dataclass(frozen=True)
 class Schedule:
-    """How far to go."""
+    """Step size, largest number of steps, and rule for early stopping."""
 
     rate: float
     """Learning rate, in units of the variables."""
     iterations: int
-    """Most steps."""
+    """Largest number of steps."""
     tolerance: float
-    """Stop when the loss changed by less than this part of it ..."""
+    """Stop when the loss changed by at most this share of it over ``window`` steps."""
     window: int
-    """... over so many steps."""
+    """Number of steps over which the change of the loss is taken."""
 
     def has_finished(self, losses: Sequence[float]) -> bool:
-        """Tell whether to stop, by the loss at the start and after each step so far."""
+        """Return whether to stop, from the losses at the start and after each step so far."""
         steps = len(losses) - 1
         if steps >= self.iterations or steps < self.window:
             return steps >= self.iterations
@@ -41,10 +41,10 @@ class Schedule:
 def minimise(
     objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, schedule: Schedule
 ) -> tuple[Floats, list[float]]:
-    """Take Adam steps from ``start`` and return the best variables on the way.
+    """Take Adam steps from ``start`` and return the variables with the lowest loss of all steps.
 
-    A step is as long as the rate however small the gradient is, so the last one need not be the best: from a
-    start that fits exactly, each step leads away.
+    The length of a step does not fall with the gradient, so the last step need not be the best: from a start
+    that fits exactly, every step raises the loss.
 
     Parameters
     ----------
@@ -55,6 +55,7 @@ def minimise(
     limit : ndarray
         Bound on the variables' absolute values, broadcast against ``start``.
     schedule : Schedule
+        Learning rate and stopping rule.
 
     Returns
     -------

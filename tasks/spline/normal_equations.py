@@ -1,8 +1,8 @@
 """Normal equations of a tensor-product spline, kept as a band and solved by Cholesky.
 
-Control heights ``z``, ``(m, n)``, in row-major order: two basis functions overlap only if they are at most
-a degree apart along both axes, so ``B^T W B`` has non-zeros only near its diagonal. It is put together by two
-products with sparse matrices, first along v, then along u.
+The unknowns are the control heights ``z``, ``(m, n)``, in row-major order. Two basis functions overlap only
+if their indices differ by at most the degree along both axes, so ``B^T W B`` has non-zeros only near its
+diagonal. It is computed by two products with sparse matrices, first along v, then along u.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 RIDGE = 1e-9
-"""Part of the diagonal's mean added to it: control points that nothing holds then stay where they are."""
+"""Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
 
 
 def pairs(basis: Floats, lags: int) -> scipy.sparse.csr_array:
-    """Return each function times itself and the next ones, ``(points * lags, N)``.
+    """Return the products of each function with itself and the following ones, ``(points * lags, N)``.
 
     Parameters
     ----------
     basis : ndarray, (N, points)
         Basis functions, or derivatives of them, at the cells of one axis.
     lags : int
-        One more than the distance up to which functions are paired.
+        Number of partners of a function: itself and the next ``lags - 1``.
     """
     points = basis.shape[1]
     out = np.zeros((points, lags, len(basis)))
@@ -42,8 +42,8 @@ def gram(
     Returns
     -------
     ndarray, (m, lags, n, lags)
-        ``[i, k, j, l]``: functions i and i + k along v, j and j + l along u. By symmetry also i and i + k
-        with j + l and j.
+        ``[i, k, j, l]`` is the sum for functions i and i + k along v, j and j + l along u; by symmetry also
+        for i and i + k along v, j + l and j along u.
     """
     along_v = np.ascontiguousarray((pairs_v @ weight).T)
     product = (pairs_u @ along_v).T
@@ -63,7 +63,7 @@ def band(products: Floats) -> Floats:
 
 
 def factor(lower: Floats) -> Floats:
-    """Return the Cholesky factor of a lower band, in its place.
+    """Return the Cholesky factor of a lower band; the band is overwritten.
 
     Raises
     ------
@@ -74,13 +74,13 @@ def factor(lower: Floats) -> Floats:
     factored, failed = scipy.linalg.lapack.dpbtrf(lower.T, lower=1, overwrite_ab=1)
     if failed:
         raise TaskError(
-            f"control point {failed} of the surface is undetermined; take fewer (a larger fit.spacing_m), "
-            "or raise fit.bending_m3"
+            f"control point {failed} of the surface is undetermined; use fewer control points (a larger "
+            "fit.spacing_m), or raise fit.bending_m3"
         )
     return np.asarray(factored)
 
 
 def solve(factored: Floats, right: Floats) -> Floats:
-    """Solve for one right-hand side, in its shape."""
+    """Return the solution for one right-hand side, in the shape of that."""
     solution, _ = scipy.linalg.lapack.dpbtrs(factored, right.ravel(), lower=1)
     return np.asarray(solution.reshape(right.shape))

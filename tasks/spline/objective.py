@@ -1,4 +1,4 @@
-"""What the NURBS fit minimises (the paper's section "Surface Fitting"): the loss and its gradient.
+"""The loss of the NURBS fit and its gradient (the paper's section "Surface Fitting").
 
 ``L = L_road + lambda_terrain * L_terrain + lambda_reg * L_reg`` (Eqs. loss_terrain, loss_ctrl). The data
 terms add up absolute height differences, to the DSM on filtered road cells and to the DTM elsewhere; both
@@ -23,21 +23,22 @@ NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1,
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Targets, their factors and the basis at the raster's cell centres; the part that no step changes."""
+    """Targets, their factors and the basis at the raster's cell centres; constant during the fit."""
 
     target: Floats
-    """Height above the datum each cell is drawn to, ``(H, W)``, m; 0 where the factor is."""
+    """Target height of each cell above the datum, ``(H, W)``, m; 0 where the factor is 0."""
     factor: Floats
-    """Cost of a metre of difference, ``(H, W)``: 1 / cells on the road, lambda_terrain / cells elsewhere."""
+    """Loss per metre of difference, ``(H, W)``: 1 / cells on the road, lambda_terrain / cells elsewhere."""
     start_u: Starts
     """First basis function at each column, ``(W,)``."""
     along_u: Floats
     """Basis functions at the columns, ``(p + 1, W)``."""
     start_v: Starts
-    """First basis function at each row, ``(H,)``; falls with the row, for row 0 is in the north."""
+    """First basis function at each row, ``(H,)``; decreasing, because row 0 is in the north."""
     along_v: Floats
     """Basis functions at the rows, ``(H, q + 1)``."""
     lambda_reg: float
+    """Weight of the regulariser (1/m)."""
     free_weights: bool
     """Whether rho is a variable; if not, its gradient is 0."""
 
@@ -70,13 +71,15 @@ def objective(
     Parameters
     ----------
     heights : ndarray, (H, W)
-        Heights above the datum (m); NaN cells leave the loss.
+        Heights above the datum (m); NaN cells are ignored.
     factor : ndarray, (H, W)
-        Cost of a metre of difference in each cell, before the division by the number of cells.
+        Loss per metre of difference in each cell, before the division by the number of cells.
     space : tuple
         Knots along easting and northing, and the degrees (p, q).
     lambda_reg : float
+        Weight of the regulariser (1/m).
     free_weights : bool
+        Whether the weights are variables.
     """
     valid = np.isfinite(heights)
     rows, cols = heights.shape
@@ -102,8 +105,9 @@ def _data_terms(
 ) -> float:  # fmt: skip
     """Return the road and terrain terms and add their gradient by A and W to ``by_a`` and ``by_w``.
 
-    Separable: contract along u once per control row, then along v once per cell; the gradient goes the same
-    way back. Inner loops run along a raster row, so that the compiler can use vector instructions.
+    The sums are separable: along u once per control row, then along v once per cell; the gradient is computed
+    in the reverse order. Inner loops run along a raster row, so that the compiler can use vector
+    instructions.
     """
     rows, cols = target.shape
     a_u, w_u = _along_u(a, start_u, along_u), _along_u(w, start_u, along_u)

@@ -23,35 +23,35 @@ def points_at_spacing(grid: Grid, degree: int, spacing_m: float) -> tuple[int, i
 
 
 def spline_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
-    """Return the knots and degrees of the surface over a grid's hull.
+    """Return knots and degrees of the surface over a grid's hull.
 
     Raises
     ------
     TaskError
-        If the grid is a single row or column, or has fewer cells than there would be control points.
+        If the grid is a single row or column, or has fewer cells than control points.
     """
     if min(grid.shape) < 2:
         raise TaskError(f"a surface needs at least 2 x 2 cells, not {grid.width} x {grid.height}")
-    # Before anything is allocated: a spacing in the wrong unit would ask for more than there is memory.
-    _enough(grid.width * grid.height, f"{grid.width} x {grid.height} cells", points)
+    # Checked before arrays are allocated: a spacing in the wrong unit would need more memory than there is.
+    _check_enough(grid.width * grid.height, f"{grid.width} x {grid.height} cells", points)
     n, m = points
     return clamped_knots(n, degree), clamped_knots(m, degree), (degree, degree)
 
 
 def cells_with_height(data: TileData, road: Bools, points: tuple[int, int]) -> int:
-    """Return the number of cells that have a height to fit: the DSM's on the road, else the DTM's.
+    """Return the number of cells with a height to fit: the DSM's on the road, the DTM's elsewhere.
 
     Raises
     ------
     TaskError
-        If they are fewer than the control points.
+        If there are fewer of them than control points.
     """
     cells = int(np.count_nonzero(np.isfinite(np.where(road, data.dsm, data.dtm))))
-    _enough(cells, f"{cells} cells with a height", points)
+    _check_enough(cells, f"{cells} cells with a height", points)
     return cells
 
 
-def _enough(cells: int, name: str, points: tuple[int, int]) -> None:
+def _check_enough(cells: int, name: str, points: tuple[int, int]) -> None:
     n, m = points
     if cells < n * m:
         raise TaskError(
@@ -62,13 +62,13 @@ def _enough(cells: int, name: str, points: tuple[int, int]) -> None:
 def start_heights(data: TileData, road: Bools, space: Space, terrain: bool = True) -> tuple[Floats, float]:
     """Return the control heights to start from, ``(m, n)`` with row 0 in the south, and their mean (m).
 
-    The DTM at the Greville abscissae; without DTM support the least-squares plane through the road, for the
-    DTM may not leak in through the start.
+    With DTM support they are the DTM at the Greville abscissae, else the least-squares plane through the
+    road: the start may not depend on the DTM then.
 
     Raises
     ------
     TaskError
-        If there is no height to start from.
+        If neither the DTM nor the road has a height to start from.
     """
     u, v = (greville(knots, degree) for knots, degree in zip(space[:2], space[2], strict=True))
     cols, rows = u * (data.grid.width - 1), (1 - v) * (data.grid.height - 1)

@@ -4,7 +4,7 @@ The surface is a graph: easting is affine in u, northing in v, and the height is
 ``z(u, v) = datum + A(u, v) / W(u, v)`` with the coefficients ``A = weight * (height - datum)`` and
 ``W = weight``. Coefficient arrays are ``(m, n)``: row i belongs to the i-th basis function along v, so
 **row 0 is in the south** (rasters have row 0 in the north), column j to the j-th along u, from west to
-east. Nothing here reads files or optimises.
+east.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flexroad.tasks.types import Floats
 Starts = NDArray[np.intp]
 
 MAX_LOG_WEIGHT = math.log(10)
-"""Bound on abs(ln w): without it Adam reaches negative weights, that is poles, on real streets."""
+"""Bound on abs(ln w). Unbounded weights became negative on real streets, which gives the surface poles."""
 
 
 def clamped_knots(points: int, degree: int) -> Floats:
@@ -32,7 +32,7 @@ def clamped_knots(points: int, degree: int) -> Floats:
     Raises
     ------
     ValueError
-        If there are not more control points than the degree.
+        If the number of control points does not exceed the degree.
     """
     if not 1 <= degree < points:
         raise ValueError(f"degree {degree} needs at least {degree + 1} control points, not {points}")
@@ -54,7 +54,7 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     knots : ndarray, (points + degree + 1,)
     degree : int
     u : ndarray, (N,)
-        Parameters in [0, 1]. At a knot the span to its right counts, at the last knot the one to its left.
+        Parameters in [0, 1]. A knot belongs to the span on its right, the last knot to the span on its left.
 
     Returns
     -------
@@ -68,8 +68,8 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     span = np.clip(np.searchsorted(knots, u, side="right") - 1, degree, last)
     values = share = np.ones((len(u), 1))
     for k in range(1, degree + 1):
-        # Each function of degree k - 1 gives a rising part to one of degree k, a falling one to its left
-        # neighbour. Its support holds the span, which is not empty: the division is safe.
+        # Each function of degree k - 1 adds a rising part to one of degree k and a falling part to its left
+        # neighbour. Its support contains the span, which is not empty, so the divisor is positive.
         i = span + np.arange(1 - k, 1)
         left, right = knots[i], knots[i + k]
         share = values / (right - left)
@@ -102,7 +102,8 @@ def dense(start: Starts, values: Floats, points: int) -> Floats:
 class NurbsSurface:
     """A NURBS height field over a rectangle (Eq. nurbs); satisfies `tasks.types.Surface`.
 
-    Beyond its domain it goes on linearly: the first-order Taylor expansion about the nearest domain point.
+    Beyond its domain it is extrapolated linearly: first-order Taylor expansion about the nearest domain
+    point.
     """
 
     crs: str
@@ -179,8 +180,8 @@ class NurbsSurface:
     def control_points(self) -> Floats:
         """Control points at the Greville abscissae, ``(m, n, 4)``: easting, northing, height (m), weight.
 
-        With unit weights they are those of the surface; with others the plan position of a point moves
-        when its weight does, and `exact` is what other programs need.
+        With unit weights these are the control points of the surface. With other weights they are not,
+        because the position of a point in plan depends on the weights: use `exact` to export the surface.
         """
         west, south, east, north = self.bounds
         x = west + greville(self.knots_u, self.degree[0]) * (east - west)
@@ -259,7 +260,7 @@ def _contract(
 
 @dataclass(frozen=True, eq=False)
 class ExactNurbs:
-    """The same surface as a NURBS with control points in space, as other programs read it."""
+    """The same surface as a NURBS with control points in space, the form that other programs read."""
 
     degree: tuple[int, int]
     """Degree along u (easting) and v (northing)."""
@@ -272,7 +273,7 @@ class ExactNurbs:
 
 
 def exact(surface: NurbsSurface) -> ExactNurbs:
-    """Return the surface as an ordinary NURBS, without approximation.
+    """Return the surface as an ordinary NURBS; the conversion is exact.
 
     Plan coordinates are affine in the parameters, so ``x * W`` and ``y * W`` have one degree more than
     ``W`` and the same smoothness: with ``A`` and ``W`` they lie in the spline space of degree p + 1 with

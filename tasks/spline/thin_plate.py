@@ -1,8 +1,8 @@
-"""The bending energy of a B-spline height field, that of a thin plate of its shape.
+"""The bending energy of a B-spline height field, as of a thin plate of that shape.
 
-``E = sum over cells of stiffness * (z_xx^2 + 2 z_xy^2 + z_yy^2)``, derivatives by metres, so that it depends
-neither on the tile's size nor on the number of control points; planes have none. The sum is over the cells
-because the stiffness may differ from cell to cell: a road is stiffer than the ground beside it.
+``E = sum over cells of stiffness * (z_xx^2 + 2 z_xy^2 + z_yy^2)`` with derivatives per metre, so that it does
+not depend on the number of control points; it is 0 for planes. The sum is over cells because the stiffness
+may differ from cell to cell: a road is stiffer than the ground beside it.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class BendingEnergy:
     """The bending energy of a thin plate over a raster."""
 
     stiffness: Floats
-    """Cost of squared curvature in each cell, ``(H, W)``, m3."""
+    """Weight of the squared curvature in each cell, ``(H, W)``, m3."""
     along_u: Derivatives
-    """At the columns, by metres."""
+    """Basis functions at the columns and their derivatives per metre."""
     along_v: Derivatives
-    """At the rows, by metres."""
+    """Basis functions at the rows and their derivatives per metre."""
 
     def __call__(self, z: Floats) -> tuple[float, Floats]:
-        """Return the energy (m) of control heights ``(m, n)`` and its gradient."""
+        """Return the energy (m) of control heights ``(m, n)``, and its gradient."""
         loss, gradient = 0.0, np.zeros_like(z)
         for times, along_v, along_u in self._parts():
             curvature = along_v @ z @ along_u.T
@@ -63,9 +63,9 @@ def bending_energy(
     Parameters
     ----------
     stiffness : ndarray, (H, W)
-        Cost of squared curvature in each cell (m3).
+        Weight of the squared curvature in each cell (m3).
     space : tuple
-        Knots along easting and northing, and the degrees, 2 and more.
+        Knots along easting and northing, and the degrees, each at least 2.
     spans_m : tuple
         Extent of the domain along easting and northing (m).
     """
@@ -77,18 +77,18 @@ def bending_energy(
 
 
 def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Derivatives:
-    """Evaluate the basis functions at ``u`` and their derivatives by metres.
+    """Return the basis functions at ``u`` and their first and second derivatives per metre.
 
     A derivative is a spline of one degree less over the knots without the outermost (de Boor, "A practical
     guide to splines", chapter X).
     """
     points = len(knots) - degree - 1
-    coefficients, found = np.eye(points), []
+    coefficients, derivatives = np.eye(points), []
     for order in range(3):
         inner, lower = knots[order : len(knots) - order], degree - order
         start, values, _ = basis(inner, lower, u)
-        found.append(dense(start, values, points - order) @ coefficients / span_m**order)
+        derivatives.append(dense(start, values, points - order) @ coefficients / span_m**order)
         if lower:
             rate = lower / (inner[lower + 1 : -1] - inner[1 : points - order])
             coefficients = rate[:, None] * np.diff(coefficients, axis=0)
-    return found[0], found[1], found[2]
+    return derivatives[0], derivatives[1], derivatives[2]

@@ -1,4 +1,4 @@
-"""The NURBS fit in torch, differentiated by autograd: for GPUs, and to check the gradient written by hand."""
+"""The NURBS fit in torch with autograd: for GPUs, and to test the hand-written gradient."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TorchObjective:
     Raises
     ------
     TaskError
-        If the device is not there.
+        If the device is not available.
     """
 
     def __init__(self, objective: Objective, shape: tuple[int, int], device: str) -> None:
@@ -74,7 +74,7 @@ class TorchObjective:
 def minimise(
     objective: Objective, start: Floats, limit: Floats, schedule: Schedule, device: str
 ) -> tuple[Floats, list[float]]:
-    """Do what `tasks.spline.adam.minimise` does, with torch's Adam and autograd, on ``device``."""
+    """Minimise like `tasks.spline.adam.minimise`, with torch's Adam and autograd, on ``device``."""
     import torch
 
     loss_at = TorchObjective(objective, (start.shape[1], start.shape[2]), device)

@@ -1,4 +1,4 @@
-"""The convex solver against exact optima, its parts against plain matrices and integrals."""
+"""The convex solver against exact optima; its parts against dense matrices and known integrals."""
 
 from dataclasses import replace
 
@@ -20,16 +20,16 @@ from flexroad.tasks.spline.thin_plate import bending_energy
 from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0
-PLAIN = {"lambda_terrain": 1.0, "huber_m": 0.0, "bending_m3": 100.0}
-"""Absolute differences, all alike."""
+UNIFORM_L1 = {"lambda_terrain": 1.0, "huber_m": 0.0, "bending_m3": 100.0}
+"""Options of an L1 loss with equal weights for road and terrain."""
 
 
 def space(n, m, degree=3):
     return clamped_knots(n, degree), clamped_knots(m, degree), (degree, degree)
 
 
-def spiky(shape, seed=0):
-    """Waves, noise, spoilers and a hole."""
+def noisy_heights(shape, seed=0):
+    """Return heights of waves with noise, outliers and a hole."""
     rng = np.random.default_rng(seed)
     heights = np.sin(np.indices(shape) / 4).sum(axis=0) + rng.normal(0, 0.05, shape)
     heights[rng.random(shape) < 0.1] += 2
@@ -37,13 +37,13 @@ def spiky(shape, seed=0):
     return heights
 
 
-def convex(shape=(24, 20), n=7, m=8, degree=3, **kind):
-    where = space(n, m, degree)
+def convex_loss(shape=(24, 20), n=7, m=8, degree=3, **kind):
+    spline_space = space(n, m, degree)
     factors = np.where(np.random.default_rng(1).random(shape) < 0.5, 1.0, 0.3)
-    return irls.HuberObjective(objective(spiky(shape), factors, where), (m, n), **kind)
+    return irls.HuberObjective(objective(noisy_heights(shape), factors, spline_space), (m, n), **kind)
 
 
-def full(lower):
+def dense_matrix(lower):
     size, width = lower.shape
     matrix = np.zeros((size, size))
     for d in range(min(width, size)):
@@ -52,7 +52,7 @@ def full(lower):
 
 
 @pytest.mark.parametrize(("degree", "lags"), [(1, 3), (2, 3), (3, 4), (5, 6)])
-def test_the_band_is_the_normal_matrix(degree, lags):
+def test_band_equals_normal_matrix(degree, lags):
     rng = np.random.default_rng(degree)
     weight = rng.random((30, 26))
     knots_u, knots_v, _ = space(degree + 4, degree + 3, degree)
@@ -62,7 +62,7 @@ def test_the_band_is_the_normal_matrix(degree, lags):
     lower = band(gram(weight, pairs(along_v, lags), pairs(along_u, lags), lags))
     design = np.kron(along_v, along_u)
     normal = design.T @ (weight.ravel()[:, None] * design)
-    np.testing.assert_allclose(full(lower), normal, atol=1e-12)
+    np.testing.assert_allclose(dense_matrix(lower), normal, atol=1e-12)
     right = rng.random((along_v.shape[1], along_u.shape[1]))
     normal += 0.1 * np.eye(len(normal))
     lower[:, 0] += 0.1
@@ -71,75 +71,81 @@ def test_the_band_is_the_normal_matrix(degree, lags):
     )
 
 
-def test_what_nothing_determines_is_an_error():
+def test_factor_undetermined_point_raises():
     with pytest.raises(TaskError, match="control point 2 of the surface is undetermined"):
         factor(np.array([[1.0, 3.0], [1.0, 0.0]]))
 
 
 @pytest.mark.parametrize("cells", [(40, 31), (80, 61)])
-def test_the_plate_measures_curvature_in_metres(cells):
+def test_bending_energy_uses_curvature_in_metres(cells):
     """z = 0.01 x^2 + 0.02 xy - 0.03 y^2 has z_xx = 0.02, z_xy = 0.02, z_yy = -0.06 everywhere."""
     rows, cols = cells
     spans = 2.0 * (cols - 1), 2.0 * (rows - 1)
-    where = space(9, 11)
+    spline_space = space(9, 11)
     x, y = np.meshgrid(2.0 * np.arange(cols), 2.0 * np.arange(rows)[::-1])
-    along_u = basis_matrix(where[0], 3, np.linspace(0, 1, cols))[0]
-    along_v = basis_matrix(where[1], 3, np.linspace(1, 0, rows))[0]
+    along_u = basis_matrix(spline_space[0], 3, np.linspace(0, 1, cols))[0]
+    along_v = basis_matrix(spline_space[1], 3, np.linspace(1, 0, rows))[0]
     stiffness = np.full(cells, 5.0)
     stiffness[:, : cols // 2] = 1.0
-    bent = bending_energy(stiffness, where, spans)
+    bending = bending_energy(stiffness, spline_space, spans)
     for ground, curvature in (
         (0.01 * x**2 + 0.02 * x * y - 0.03 * y**2, 0.02**2 + 2 * 0.02**2 + 0.06**2),
         (3 + 0.1 * x - 0.2 * y, 0.0),
     ):
         z = np.linalg.pinv(along_v) @ ground @ np.linalg.pinv(along_u).T
-        assert bent(z)[0] == pytest.approx(stiffness.sum() * curvature, rel=1e-6, abs=1e-9)
+        assert bending(z)[0] == pytest.approx(stiffness.sum() * curvature, rel=1e-6, abs=1e-9)
 
 
-def test_the_plates_derivatives():
-    bent = bending_energy(np.random.default_rng(0).random((20, 24)), space(7, 6), (23.0, 19.0))
+def test_bending_energy_derivatives_are_exact():
+    bending = bending_energy(np.random.default_rng(0).random((20, 24)), space(7, 6), (23.0, 19.0))
     rng = np.random.default_rng(1)
-    z, way = rng.normal(size=(2, 6, 7))
-    energy, slope = bent(z)
-    assert np.vdot(slope, z) == pytest.approx(2 * energy)
-    np.testing.assert_allclose(full(band(bent.hessian(4))) @ way.ravel(), bent(way)[1].ravel(), atol=1e-12)
-    thrice = replace(bent, stiffness=3 * bent.stiffness)
+    z, direction = rng.normal(size=(2, 6, 7))
+    energy, gradient = bending(z)
+    assert np.vdot(gradient, z) == pytest.approx(2 * energy)
+    np.testing.assert_allclose(
+        dense_matrix(band(bending.hessian(4))) @ direction.ravel(),
+        bending(direction)[1].ravel(),
+        atol=1e-12,
+    )
+    thrice = replace(bending, stiffness=3 * bending.stiffness)
     assert thrice(z)[0] == pytest.approx(3 * energy)
 
 
-def test_the_least_absolute_loss_is_found():
+def test_irls_l1_reaches_linear_programming_optimum():
     """Against the exact optimum by linear programming."""
-    wanted = convex()
-    found = irls.minimise(wanted, np.zeros(wanted.shape), 100, 1e-7)
-    o = wanted.objective
-    design, size = np.kron(wanted.along_v, wanted.along_u), np.prod(wanted.shape)
+    loss = convex_loss()
+    result = irls.minimise(loss, np.zeros(loss.shape), 100, 1e-7)
+    o = loss.objective
+    design, size = np.kron(loss.along_v, loss.along_u), np.prod(loss.shape)
     sides = np.hstack([design, np.eye(len(design)), -np.eye(len(design))])
     cost = np.concatenate([np.zeros(size), o.factor.ravel(), o.factor.ravel()])
     free = [(None, None)] * size + [(0, None)] * (2 * len(design))
     exact = linprog(cost, A_eq=sides, b_eq=o.target.ravel(), bounds=free).fun
-    assert exact <= found.losses[-1] <= 1.003 * exact
-    assert wanted(found.z) == pytest.approx(found.losses[-1], rel=1e-9)
+    assert exact <= result.losses[-1] <= 1.003 * exact
+    assert loss(result.z) == pytest.approx(result.losses[-1], rel=1e-9)
 
 
-def test_a_wide_huber_is_least_squares():
-    wanted = convex(huber_m=1e4)
-    found = irls.minimise(wanted, np.zeros(wanted.shape), 20, 1e-12)
-    root = np.sqrt(wanted.objective.factor.ravel())
-    design = root[:, None] * np.kron(wanted.along_v, wanted.along_u)
-    exact = np.linalg.lstsq(design, root * wanted.objective.target.ravel(), rcond=None)[0]
-    np.testing.assert_allclose(found.z.ravel(), exact, atol=1e-4)
+def test_irls_wide_huber_equals_least_squares():
+    loss = convex_loss(huber_m=1e4)
+    result = irls.minimise(loss, np.zeros(loss.shape), 20, 1e-12)
+    root = np.sqrt(loss.objective.factor.ravel())
+    design = root[:, None] * np.kron(loss.along_v, loss.along_u)
+    exact = np.linalg.lstsq(design, root * loss.objective.target.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(result.z.ravel(), exact, atol=1e-4)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 6])
-def test_it_goes_below_adam(degree):
-    """On the paper's loss without its regulariser; Adam with ten times its steps, each a tenth as long."""
-    wanted = convex((40, 44), degree + 6, degree + 7, degree)
-    found = irls.minimise(wanted, np.zeros(wanted.shape), 100, 1e-6)
-    start, limit = np.zeros((2, *wanted.shape)), np.full((2, 1, 1), np.inf)
-    _, losses = adam.minimise(wanted.objective, start, limit, adam.Schedule(0.01, 2000, 0, 20))
-    assert found.losses[-1] < 1.0005 * min(losses)
-    assert wanted.objective(np.stack([found.z, np.zeros_like(found.z)]))[0] == pytest.approx(found.losses[-1])
-    assert (np.diff(found.losses) <= 0).all()
+def test_irls_reaches_loss_of_long_adam_run(degree):
+    """The paper's loss without its regulariser; Adam takes ten times as many steps at a tenth of the rate."""
+    loss = convex_loss((40, 44), degree + 6, degree + 7, degree)
+    result = irls.minimise(loss, np.zeros(loss.shape), 100, 1e-6)
+    start, limit = np.zeros((2, *loss.shape)), np.full((2, 1, 1), np.inf)
+    _, losses = adam.minimise(loss.objective, start, limit, adam.Schedule(0.01, 2000, 0, 20))
+    assert result.losses[-1] < 1.0005 * min(losses)
+    assert loss.objective(np.stack([result.z, np.zeros_like(result.z)]))[0] == pytest.approx(
+        result.losses[-1]
+    )
+    assert (np.diff(result.losses) <= 0).all()
 
 
 def tile(ground, noise=0.0, size=90):
@@ -153,7 +159,7 @@ def tile(ground, noise=0.0, size=90):
 
 
 def fitted(data, clusters, **changes):
-    options = smoothing_spline.Options(**{"spacing_m": 89 / 24, **PLAIN, **changes})
+    options = smoothing_spline.Options(**{"spacing_m": 89 / 24, **UNIFORM_L1, **changes})
     return smoothing_spline.fit(data, clusters, options)
 
 
@@ -165,7 +171,7 @@ def on_cells(surface, data):
     return surface.lattice(data.grid.eastings, data.grid.northings)
 
 
-def test_a_plane_is_kept_and_goes_on_under_a_void():
+def test_fit_plane_is_reproduced_across_void():
     data, clusters, truth = tile(lambda e, s: 160 + 0.1 * e - 0.05 * s)
     data.dtm[:30, 20:60] = np.nan
     surface = fitted(data, clusters)
@@ -173,43 +179,43 @@ def test_a_plane_is_kept_and_goes_on_under_a_void():
     np.testing.assert_array_equal(surface.W, 1.0)
 
 
-def test_a_void_elsewhere_changes_nothing():
+def test_fit_void_has_no_effect_elsewhere():
     data, clusters, _ = tile(lambda e, s: 160 + np.sin(e / 9), noise=0.1)
     whole = on_cells(fitted(data, clusters), data)
     data.dtm[65:] = np.nan
     assert abs(on_cells(fitted(data, clusters), data) - whole)[:50].max() < 2e-3
 
 
-def test_bending_smooths_a_noisy_road_better_than_the_papers_fit():
+def test_fit_noisy_road_is_smoother_than_paper_fit():
     def roughness(heights):
         return np.abs(np.diff(heights[40:50], 2, axis=1)).mean()
 
     data, clusters, truth = tile(lambda e, s: 160 + 2 * np.sin(e / 25) + np.cos(s / 30), noise=0.1)
-    bent = on_cells(fitted(data, clusters), data)
-    papers = on_cells(fitted_by_adam(data, clusters), data)
-    off = [abs(heights - truth)[40:50].mean() for heights in (bent, papers)]
-    assert off[0] < 0.75 * off[1]
-    assert roughness(bent) < 0.75 * roughness(papers)
+    by_irls = on_cells(fitted(data, clusters), data)
+    by_adam = on_cells(fitted_by_adam(data, clusters), data)
+    errors = [abs(heights - truth)[40:50].mean() for heights in (by_irls, by_adam)]
+    assert errors[0] < 0.75 * errors[1]
+    assert roughness(by_irls) < 0.75 * roughness(by_adam)
 
 
-def test_the_terrain_beside_a_stiff_road_stays_free():
-    """A bank of 2 m beside the road: stiff all over, it would be smeared into the road's side."""
+def test_fit_soft_terrain_follows_bank_beside_road():
+    """A bank of 2 m beside the road: with uniform stiffness it would be smoothed into the road's edge."""
     data, clusters, truth = tile(lambda e, s: 160 + 2 / (1 + np.exp(-(s - 58) / 1.5)) + 0 * e)
-    beside = np.s_[52:66]
+    bank = np.s_[52:66]
     soft, stiff = (
-        abs(on_cells(fitted(data, clusters, bending_m3=1000, bending_terrain=t), data) - truth)[beside].mean()
+        abs(on_cells(fitted(data, clusters, bending_m3=1000, bending_terrain=t), data) - truth)[bank].mean()
         for t in (0.01, 1)
     )
     assert soft < 0.5 * stiff
 
 
-def test_without_road_or_terrain():
+def test_fit_without_road_or_terrain_follows_other_data():
     data, clusters, truth = tile(lambda e, s: 160 + np.sin(e / 20), noise=0.02)
-    bare = RoadClusters(data.grid, np.zeros_like(clusters.labels))
-    assert abs(on_cells(fitted(data, bare), data) - truth).mean() < 0.05
-    alone = on_cells(fitted(data, clusters, lambda_terrain=0), data)
-    assert abs(alone - truth)[clusters.mask].mean() < 0.05
-    assert np.isfinite(alone).all()
+    no_road = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    assert abs(on_cells(fitted(data, no_road), data) - truth).mean() < 0.05
+    road_only = on_cells(fitted(data, clusters, lambda_terrain=0), data)
+    assert abs(road_only - truth)[clusters.mask].mean() < 0.05
+    assert np.isfinite(road_only).all()
 
 
 @pytest.mark.parametrize(
@@ -223,8 +229,8 @@ def test_without_road_or_terrain():
 )
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**31), road=st.floats(0, 1), missing=st.floats(0, 0.8), scale=st.floats(-3, 3))
-def test_no_pole_and_no_weight_beyond_its_bounds(method, options, seed, road, missing, scale):
-    """Any mask and DSM: the surface stays within its control heights, and these near the data."""
+def test_fit_any_input_has_no_pole_and_bounded_weights(method, options, seed, road, missing, scale):
+    """Any mask and DSM: the surface stays within its control heights, and those stay near the data."""
     rng = np.random.default_rng(seed)
     data, clusters, _ = tile(lambda e, s: 160 + 0 * e, size=40)
     heights = np.clip(10**scale * rng.standard_t(2, (2, 40, 40)), -3000, 3000)
@@ -235,18 +241,18 @@ def test_no_pole_and_no_weight_beyond_its_bounds(method, options, seed, road, mi
     assert surface.W.min() >= 0.1 - 1e-12
     assert surface.W.max() <= 10 + 1e-12
     control = surface.A / surface.W + surface.datum
-    found = surface.lattice(np.linspace(WEST, WEST + 40, 157), np.linspace(NORTH, NORTH - 40, 157)[3:-3])
-    inside = found[:, 3:-3]
+    result = surface.lattice(np.linspace(WEST, WEST + 40, 157), np.linspace(NORTH, NORTH - 40, 157)[3:-3])
+    inner = result[:, 3:-3]
     slack = 1e-9 * (1 + np.abs(control).max())
-    assert control.min() - slack <= inside.min()
-    assert inside.max() <= control.max() + slack
+    assert control.min() - slack <= inner.min()
+    assert inner.max() <= control.max() + slack
     spread = np.nanmax(heights) - np.nanmin(heights)
     steps = options.iterations if method is nurbs else 0
     assert np.abs(control - np.nanmedian(heights)).max() <= 3 * spread + steps
 
 
 @pytest.mark.parametrize("wrong", [{"iterations": 0}, {"degree": 1}, {"bending_m3": 0}, {"weights": "free"}])
-def test_options_that_cannot_be_are_refused(wrong):
+def test_options_out_of_bounds_are_refused(wrong):
     (name,) = wrong
     with pytest.raises(ValidationError, match=name):
         smoothing_spline.Options(**wrong)

@@ -1,4 +1,4 @@
-"""The basis against SciPy, the exported surface against geomdl, the rest against algebra."""
+"""The basis against SciPy, the exported surface against geomdl, other properties against algebra."""
 
 from dataclasses import fields
 
@@ -36,13 +36,13 @@ def surface(degree=(3, 3), points=(12, 14), seed=0, weights=True):
     )
 
 
-def inside(seed, count=200):
+def points_inside(seed, count=200):
     rng = np.random.default_rng(seed)
     return rng.uniform(BOUNDS[0], BOUNDS[2], count), rng.uniform(BOUNDS[1], BOUNDS[3], count)
 
 
 @given(spaces, parameters)
-def test_basis_is_a_partition_of_unity(space, u):
+def test_basis_sums_to_one(space, u):
     degree, points = space
     start, values, slopes = basis(clamped_knots(points, degree), degree, u)
     assert (start >= 0).all()
@@ -65,7 +65,7 @@ def test_greville_heights_reproduce_a_line(space, u):
 @pytest.mark.parametrize("degree", DEGREES)
 def test_basis_and_slopes_equal_scipy(degree):
     knots = clamped_knots(degree + 9, degree)
-    # Without the inner knots: there the derivative of degree 1 jumps, and either side is right.
+    # Inner knots are left out: there the derivative of degree 1 is discontinuous.
     u = np.concatenate([[0.0, 1.0], np.random.default_rng(degree).uniform(0, 1, 100)])
     values, slopes = basis_matrix(knots, degree, u)
     peer = BSpline(knots, np.eye(degree + 9), degree)
@@ -73,18 +73,18 @@ def test_basis_and_slopes_equal_scipy(degree):
     np.testing.assert_allclose(slopes, peer.derivative()(u), atol=1e-10)
 
 
-def test_too_few_control_points_are_refused():
+def test_clamped_knots_too_few_points_raises():
     with pytest.raises(ValueError, match="degree 5 needs at least 6 control points, not 5"):
         clamped_knots(5, 5)
 
 
-def test_surface_satisfies_the_protocol_and_holds_plain_fields():
+def test_surface_satisfies_protocol_with_plain_fields():
     s = surface()
     assert isinstance(s, Surface)
     assert all(isinstance(getattr(s, f.name), np.ndarray | str | int | float | tuple) for f in fields(s))
 
 
-def test_row_zero_is_in_the_south():
+def test_coefficients_row_zero_is_in_south():
     s = surface(weights=False)
     west, south, east, north = BOUNDS
     corners = s.lattice(np.array([west, east]), np.array([south, north])) - s.datum
@@ -92,9 +92,9 @@ def test_row_zero_is_in_the_south():
 
 
 @pytest.mark.parametrize("degree", [(1, 1), (3, 3), (2, 5), (10, 10)])
-def test_points_lattice_and_definition_agree(degree):
+def test_height_and_lattice_equal_definition(degree):
     s = surface(degree)
-    e, n = (np.sort(x)[:40] for x in inside(1))
+    e, n = (np.sort(x)[:40] for x in points_inside(1))
     lattice = s.lattice(e, n)
     assert lattice.shape == (40, 40)
     np.testing.assert_allclose(s.height(e[None, :], n[:, None]), lattice, atol=1e-11)
@@ -121,9 +121,9 @@ def test_slopes_equal_finite_differences(p, q, seed):
     )
 
 
-def test_normals_are_upward_and_orthogonal_to_the_surface():
+def test_normals_are_upward_and_orthogonal_to_surface():
     s = surface()
-    e, n = inside(2)
+    e, n = points_inside(2)
     normals = s.normal(e, n)
     by_e, by_n = s.slope(e, n)
     zero, one = np.zeros_like(e), np.ones_like(e)
@@ -133,7 +133,7 @@ def test_normals_are_upward_and_orthogonal_to_the_surface():
         np.testing.assert_allclose((normals * np.stack(tangent, -1)).sum(-1), 0, atol=1e-12)
 
 
-def test_beyond_the_domain_it_goes_on_linearly():
+def test_height_beyond_domain_is_linear():
     s = surface()
     west, south, east, north = BOUNDS
     by_e, by_n = s.slope(east, north)
@@ -147,7 +147,7 @@ def test_beyond_the_domain_it_goes_on_linearly():
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_exact_export_is_the_surface(degree):
+def test_exact_equals_surface(degree):
     s = surface((degree, degree), points=(35, 20))
     patch = exact(s)
     n, m = s.A.shape[::-1]
@@ -169,7 +169,7 @@ def test_exact_export_is_the_surface(degree):
 
 
 @pytest.mark.parametrize("degree", [1, 3])
-def test_geomdl_reads_the_exported_surface(degree):
+def test_exact_evaluated_by_geomdl_equals_surface(degree):
     s = surface((degree, degree), points=(9, 7))
     patch = exact(s)
     peer = NURBS.Surface()
@@ -185,7 +185,7 @@ def test_geomdl_reads_the_exported_surface(degree):
         assert x == pytest.approx(0.5 + 249 * u, abs=1e-10)
 
 
-def test_control_points_with_unit_weights_are_those_of_the_surface():
+def test_control_points_unit_weights_define_surface():
     s = surface(weights=False)
     points = s.control_points
     assert points.shape == (*s.A.shape, 4)
