@@ -1,7 +1,7 @@
 """Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
 
-Adam moves the heights and weights of a fixed grid of control points, from the DTM on, to where the loss
-`tasks.spline.objective` is least. The surface is `tasks.spline.surface`.
+Adam optimises the heights and weights of a fixed grid of control points under the loss of
+`tasks.spline.objective`, starting from the DTM. The surface is that of `tasks.spline.surface`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ VERSION = 1
 
 
 class Options(BaseOptions):
-    """How the surface is fitted; the defaults are the paper's."""
+    """Options of the NURBS fit; the defaults are the paper's."""
 
     method: Literal["nurbs"] = "nurbs"
     degree: int = Field(3, ge=1, le=10, description="degree of the basis along easting and northing, p = q")
@@ -32,7 +32,7 @@ class Options(BaseOptions):
         (35, 35), description="number of control points along easting and along northing"
     )
     spacing_m: float | None = Field(
-        None, gt=0, description="distance of control points (m); if given, in place of control_points"
+        None, gt=0, description="distance of control points (m); if given, control_points is ignored"
     )
     lambda_terrain: float = Field(1.0, ge=0, description="weight of the terrain term")
     lambda_reg: float = Field(
@@ -40,22 +40,26 @@ class Options(BaseOptions):
     )
     terrain: bool = Field(
         True,
-        description="false: no DTM support; the terrain term is off and the start a plane through the road",
+        description="false: no DTM support: no terrain term, and the start is a plane through the road",
     )
     weights: Literal["free", "unit"] = Field(
         "free", description="free: weights are optimised between 1/10 and 10; unit: all are 1"
     )
-    learning_rate: float = Field(0.1, gt=0, description="Adam's step, m for heights, 1 for ln w")
-    iterations: int = Field(200, ge=0, description="most Adam steps")
-    stop_tolerance: float = Field(1e-4, ge=0, description="stop when the loss changes by less than this part")
-    stop_window: int = Field(20, ge=1, description="steps over which that change is taken")
-    engine: Literal["numba", "torch"] = Field("numba", description="what computes the gradient")
+    learning_rate: float = Field(
+        0.1, gt=0, description="learning rate of Adam (m for heights, no unit for ln w)"
+    )
+    iterations: int = Field(200, ge=0, description="largest number of Adam steps")
+    stop_tolerance: float = Field(
+        1e-4, ge=0, description="stop when the relative change of the loss is below this"
+    )
+    stop_window: int = Field(20, ge=1, description="number of steps over which that change is taken")
+    engine: Literal["numba", "torch"] = Field("numba", description="library that computes the gradient")
     device: str = Field(
         "cpu", pattern=r"^(cpu|cuda(:\d+)?)$", description="cpu; with torch also cuda, cuda:1"
     )
 
     @model_validator(mode="after")
-    def _possible(self) -> Options:
+    def _check_consistent(self) -> Options:
         if self.spacing_m is None and min(self.control_points) <= self.degree:
             n, m = self.control_points
             raise ValueError(f"degree {self.degree} needs more control points each way than {n} x {m}")
@@ -65,13 +69,13 @@ class Options(BaseOptions):
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
-    """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere, where that is valid.
+    """Fit the surface to the DSM on filtered road cells and to the valid DTM elsewhere.
 
     Raises
     ------
     TaskError
-        If there are fewer cells with a height than control points, if there is nothing to start from, or if
-        the device is not there.
+        If there are fewer cells with a height than control points, if neither the DTM nor the road has a
+        height to start from, or if the device is not available.
     """
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
     from flexroad.tasks.spline.space import start_heights
@@ -85,12 +89,12 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
 
 
 def space_of(data: TileData, options: Options) -> Space:
-    """Return the knots and degrees of the surface over a tile.
+    """Return knots and degrees of the surface over a tile.
 
     Raises
     ------
     TaskError
-        If the grid has fewer cells than there would be control points.
+        If the grid has fewer cells than control points.
     """
     from flexroad.tasks.spline.space import points_at_spacing, spline_space
 
@@ -101,12 +105,12 @@ def space_of(data: TileData, options: Options) -> Space:
 
 
 def objective_of(data: TileData, road: Bools, space: Space, datum: float, options: Options) -> Objective:
-    """Return the loss for this tile.
+    """Return the loss function of a tile.
 
     Raises
     ------
     TaskError
-        If fewer cells have a height than there are control points.
+        If there are fewer cells with a height than control points.
     """
     from flexroad.tasks.spline.objective import objective
     from flexroad.tasks.spline.space import cells_with_height
@@ -119,7 +123,7 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
 
 
 def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
-    """Return control heights above the datum (m) and weights."""
+    """Return the optimised control heights above the datum (m) and the weights."""
     from flexroad.tasks.spline import adam, torch_engine
     from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT
 

@@ -17,7 +17,7 @@ VERSION = 1
 
 
 class Options(BaseOptions):
-    """A plane leaves nothing to choose."""
+    """The plane has no options."""
 
     method: Literal["plane"] = "plane"
 
@@ -36,7 +36,7 @@ class PlaneSurface:
     slope: tuple[float, float]
     """Rise (m/m) towards east and towards north."""
     from_dtm: bool
-    """True if no road cell had a height and the DTM stood in."""
+    """Whether the plane was fitted to the DTM because no road cell had a height."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
@@ -60,7 +60,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> PlaneSurfac
     Raises
     ------
     TaskError
-        If neither has a height.
+        If neither the road nor the DTM has a height.
     """
     heights = np.where(clusters.mask, data.dsm, np.nan)
     from_dtm = not np.isfinite(heights).any()

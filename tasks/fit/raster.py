@@ -1,6 +1,6 @@
-"""Take the raster itself as surface: the regular grid triangulation of the paper's Tables I and II (RGT).
+"""Use the raster itself as surface: the regular grid triangulation of the paper's Tables I and II (RGT).
 
-In place of step C. With the DSM on roads and the DTM elsewhere this is the ablation "w/o NURBS".
+It replaces step C. With the DSM on roads and the DTM elsewhere this is the ablation "w/o NURBS".
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1
 STORED = False
-"""Heights that `load` reads anyway are not worth a copy in the store."""
+"""The surface is not stored: its heights are those that `load` reads."""
 
 SNAP = 1e-6
-"""Part of a cell: closer to a cell centre a point is on it, so that nodata beside does not reach it."""
+"""Share of a cell: points this close to a cell centre are moved onto it, so nodata beside has no effect."""
 
 
 class Options(BaseOptions):
@@ -36,10 +36,10 @@ class Options(BaseOptions):
 class RasterSurface:
     """Cell centres joined by triangles; satisfies `tasks.types.Surface`.
 
-    Each quad of four centres is cut along its diagonal from south-west to north-east, as in
-    `tasks.sample`: triangles (sw, se, ne) and (sw, ne, nw). Heights are linear on a triangle; they are NaN
-    where one of its corners is, except on the edges and corners that have heights. Around the outer centres
-    stands a ring of linearly extrapolated ones.
+    Each quad of four centres is cut along its diagonal from south-west to north-east, as in `tasks.sample`:
+    triangles (sw, se, ne) and (sw, ne, nw). Heights are linear on a triangle; they are NaN if a corner is
+    NaN, except on edges and corners that have heights. The outer centres are surrounded by a ring of linearly
+    extrapolated ones.
     """
 
     crs: str
@@ -66,7 +66,7 @@ class RasterSurface:
     def _interpolated(self, easting: Floats, northing: Floats) -> Floats:
         """Return height (m) and its rise per cell towards east and north, ``(..., 3)``."""
         west, _, _, north = self.bounds
-        # Columns and rows of the grid with its ring, counted from the ring's centres.
+        # Column and row in the grid with its ring; 0 is the centre of a ring cell.
         col = 1 + (np.asarray(easting, dtype=np.float64) - west) / self.grid.cell
         row = 1 + (north - np.asarray(northing, dtype=np.float64)) / self.grid.cell
         cols, rows = np.broadcast_arrays(col, row)
@@ -80,11 +80,11 @@ def _on_triangles(heights: Floats, cols: Floats, rows: Floats) -> Floats:
     out = np.empty((cols.size, 3))
     for k in range(cols.size):
         col, row = _snapped(cols[k]), _snapped(rows[k])
-        left = int(min(max(np.floor(col), 0), heights.shape[1] - 2))
-        upper = int(min(max(np.floor(row), 0), heights.shape[0] - 2))
-        nw, ne = heights[upper, left], heights[upper, left + 1]
-        sw, se = heights[upper + 1, left], heights[upper + 1, left + 1]
-        x, y = col - left, upper + 1 - row
+        west_col = int(min(max(np.floor(col), 0), heights.shape[1] - 2))
+        north_row = int(min(max(np.floor(row), 0), heights.shape[0] - 2))
+        nw, ne = heights[north_row, west_col], heights[north_row, west_col + 1]
+        sw, se = heights[north_row + 1, west_col], heights[north_row + 1, west_col + 1]
+        x, y = col - west_col, north_row + 1 - row
         if x >= y:
             out[k, 0] = _part(1 - x, sw) + _part(x - y, se) + _part(y, ne)
             out[k, 1], out[k, 2] = se - sw, ne - se
@@ -102,12 +102,12 @@ def _snapped(position: float) -> float:
 
 @compiled()
 def _part(share: float, height: float) -> float:
-    """Return what a corner adds; nothing, not NaN, if the point lies on the opposite edge."""
+    """Return the share of a corner in the height; 0, not NaN, if the point lies on the opposite edge."""
     return 0.0 if share == 0 else share * height
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> RasterSurface:
-    """Return the rasters' own heights as a surface: one source on filtered road cells, one elsewhere."""
+    """Return a surface with the heights of one raster on filtered road cells and of one elsewhere."""
     source = {"dsm": data.dsm, "dtm": data.dtm}
     heights = np.where(clusters.mask, source[options.road], source[options.terrain])
     return RasterSurface(crs=data.grid.crs, bounds=data.grid.hull, grid=data.grid, heights=heights)

@@ -1,8 +1,8 @@
-"""Fit a smoothing spline to road and terrain: production's step C.
+"""Fit a smoothing spline to road and terrain: step C in production.
 
 The surface is the NURBS graph of `tasks.spline.surface` with unit weights. It minimises Huber's function of
-the height differences plus the bending energy of a thin plate, stiffer on roads than beside them; that
-problem is convex, and `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
+the height differences plus the bending energy of a thin plate that is stiffer on roads than beside them. The
+problem is convex; `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
 """
 
 from __future__ import annotations
@@ -22,30 +22,33 @@ VERSION = 1
 
 
 class Options(BaseOptions):
-    """How stiff the surface is and what it is drawn to; the defaults are production's (docs/fit.md)."""
+    """Stiffness of the surface and weights of its data; the defaults are production's (docs/fit.md)."""
 
     method: Literal["smoothing_spline"] = "smoothing_spline"
     degree: int = Field(3, ge=2, le=10, description="degree of the basis along easting and northing")
     spacing_m: float = Field(3.6, gt=0, description="distance of control points (m)")
     lambda_terrain: float = Field(0.3, ge=0, description="weight of the terrain's height differences")
     huber_m: float = Field(
-        0.1, ge=0, description="differences below it (m) count by their square, larger ones linearly; 0 is L1"
+        0.1, ge=0, description="differences below this (m) are squared, larger ones count linearly; 0 is L1"
     )
     bending_m3: float = Field(30.0, gt=0, description="weight of the road's squared curvature (m3)")
     bending_terrain: float = Field(
-        0.02, gt=0, le=1000, description="the terrain's weight as a part of the road's"
+        0.02, gt=0, le=1000, description="weight of the terrain's squared curvature, as a share of the road's"
     )
-    iterations: int = Field(200, ge=1, description="most steps of reweighted least squares")
-    stop_tolerance: float = Field(1e-4, ge=0, description="stop when the loss falls by less than this part")
+    iterations: int = Field(200, ge=1, description="largest number of steps of reweighted least squares")
+    stop_tolerance: float = Field(
+        1e-4, ge=0, description="stop when the relative decrease of the loss is below this"
+    )
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
-    """Fit the surface to the DSM on filtered road cells and to the DTM elsewhere, where that is valid.
+    """Fit the surface to the DSM on filtered road cells and to the valid DTM elsewhere.
 
     Raises
     ------
     TaskError
-        If there are fewer cells with a height than control points, or if there is nothing to start from.
+        If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
+        height to start from.
     """
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
     from flexroad.tasks.spline import space
@@ -62,7 +65,8 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     heights = np.where(road, data.dsm, data.dtm) - datum
     loss = objective(heights, np.where(road, 1.0, options.lambda_terrain), knots)
     west, south, east, north = data.grid.hull
-    # Per cell that has a height, like the differences: voids do not make the rest of the tile softer.
+    # Divided by the number of cells with a height, like the differences, so that voids do not change the
+    # balance.
     stiffness = options.bending_m3 * (np.where(road, 1.0, options.bending_terrain) / cells)
     bending = bending_energy(stiffness, knots, (east - west, north - south))
     convex = HuberObjective(loss, start.shape, options.huber_m, bending)

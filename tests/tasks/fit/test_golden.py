@@ -1,4 +1,4 @@
-"""What each fit gives for one small tile. If a number here changes, raise that method's VERSION with it."""
+"""Pinned output of each fit for one small tile; a changed number needs a higher VERSION of that method."""
 
 import numpy as np
 import pytest
@@ -40,11 +40,11 @@ GOLDEN = {
         [163.6825637, 0.50739, 162.5043978, 163.7913188, 163.6567454, -0.0807542, 0.1040818, 0.9912849],
     ),
 }
-"""Name: method, its VERSION, options, and what `summary` gave."""
+"""Method, its VERSION, options, and expected result of `summary`, by name."""
 
 
 def tile():
-    """A bumpy slope with kerbs, cars and a hole; integers modulo a prime stand for noise on any platform."""
+    """Return a bumpy slope with kerbs, cars and a hole; the noise is made of integers modulo a prime."""
     e, n = np.meshgrid(GRID.eastings - GRID.west, GRID.northings - GRID.south)
     rows, cols = np.indices(GRID.shape)
     noise = (rows * 7919 + cols * 104729 + rows * cols * 31) % 1009 / 1009 - 0.5
@@ -63,9 +63,9 @@ def summary(surface):
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_output_changes_only_with_the_version(name):
+def test_fit_output_is_pinned_to_version(name):
     method, version, options, expected = GOLDEN[name]
     data, clusters = tile()
     assert version == method.VERSION
-    found = summary(method.fit(data, clusters, method.Options(**options)))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    result = summary(method.fit(data, clusters, method.Options(**options)))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-6)

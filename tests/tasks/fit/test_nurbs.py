@@ -1,4 +1,4 @@
-"""The fit against known ground, its gradient against autograd and finite differences."""
+"""The NURBS fit on known ground; its gradient against autograd and finite differences."""
 
 import math
 from dataclasses import replace
@@ -57,8 +57,8 @@ def random_objective(degree=3, free=True, rows=40, cols=33):
     return objective(heights, factor, space, 0.3, free), start
 
 
-def test_loss_is_the_papers():
-    """Eqs. loss_terrain and loss_ctrl, cell by cell and point by point, on the surface that comes out."""
+def test_loss_equals_paper_equations():
+    """Eqs. loss_terrain and loss_ctrl, summed cell by cell and point by point on the fitted surface."""
     data, clusters, _ = tile(noise=0.1)
     data.dsm[50, 10:20] = np.nan
     data.dtm[3, 4] = np.nan
@@ -87,9 +87,9 @@ def test_loss_is_the_papers():
 @pytest.mark.parametrize("free", [True, False])
 @pytest.mark.parametrize("degree", [1, 2, 3, 6, 10])
 def test_gradient_equals_autograd(degree, free):
-    written, at = random_objective(degree, free)
-    loss, gradient = written(at)
-    torch_objective = torch_engine.TorchObjective(written, at.shape[1:], "cpu")
+    loss_function, at = random_objective(degree, free)
+    loss, gradient = loss_function(at)
+    torch_objective = torch_engine.TorchObjective(loss_function, at.shape[1:], "cpu")
     variables = torch_objective.tensor(at).requires_grad_()
     peer = torch_objective(variables)
     peer.backward()
@@ -99,17 +99,17 @@ def test_gradient_equals_autograd(degree, free):
 
 
 def test_gradient_equals_finite_differences():
-    written, at = random_objective()
-    _, gradient = written(at)
+    loss_function, at = random_objective()
+    _, gradient = loss_function(at)
     rng = np.random.default_rng(1)
     h = 1e-7
     for _ in range(10):
-        way = rng.normal(size=at.shape)
-        numeric = (written(at + h * way)[0] - written(at - h * way)[0]) / (2 * h)
-        assert numeric == pytest.approx((gradient * way).sum(), rel=1e-5)
+        direction = rng.normal(size=at.shape)
+        numeric = (loss_function(at + h * direction)[0] - loss_function(at - h * direction)[0]) / (2 * h)
+        assert numeric == pytest.approx((gradient * direction).sum(), rel=1e-5)
 
 
-def test_engines_agree():
+def test_fit_engines_give_same_surface():
     data, clusters, _ = tile(noise=0.05)
     a, b = (fitted(data, clusters, engine=engine, iterations=100) for engine in ("numba", "torch"))
     np.testing.assert_allclose(on_cells(a, data), on_cells(b, data), atol=1e-5)
@@ -117,7 +117,7 @@ def test_engines_agree():
     assert not np.allclose(a.W, 1)
 
 
-def test_loss_decreases_and_ends_low():
+def test_adam_lowers_loss():
     data, clusters, _ = tile(noise=0.05)
     opts = options()
     space = nurbs.space_of(data, opts)
@@ -128,7 +128,7 @@ def test_loss_decreases_and_ends_low():
     assert losses[-1] < 0.15 < 1 < losses[0]
 
 
-def test_it_stops_when_the_loss_has_settled():
+def test_adam_stops_when_loss_is_stable():
     schedule = adam.Schedule(rate=0.1, iterations=50, tolerance=1e-4, window=5)
     steps = []
 
@@ -143,32 +143,32 @@ def test_it_stops_when_the_loss_has_settled():
 
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
-def test_the_best_of_the_way_is_returned(engine):
-    written, at = random_objective()
+def test_minimise_returns_variables_of_lowest_loss(engine):
+    loss_function, at = random_objective()
     limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20)
     if engine == "torch":
-        best, losses = torch_engine.minimise(written, at, limit, schedule, "cpu")
+        best, losses = torch_engine.minimise(loss_function, at, limit, schedule, "cpu")
     else:
-        best, losses = adam.minimise(written, at, limit, schedule)
+        best, losses = adam.minimise(loss_function, at, limit, schedule)
     assert len(losses) == 21
     assert losses[-1] > min(losses)
-    assert written(best)[0] == pytest.approx(min(losses), rel=1e-12)
+    assert loss_function(best)[0] == pytest.approx(min(losses), rel=1e-12)
 
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
-def test_weights_stay_within_bounds(engine):
+def test_fit_free_weights_stay_within_bounds(engine):
     data, clusters, _ = tile(noise=1.0)
     surface = fitted(data, clusters, engine=engine, learning_rate=1.0, iterations=60, stop_tolerance=0)
     assert surface.W.max() == pytest.approx(10)
     assert surface.W.min() == pytest.approx(0.1)
 
 
-def test_unit_weights_stay_one():
+def test_fit_unit_weights_are_one():
     data, clusters, _ = tile(noise=0.1)
     np.testing.assert_array_equal(fitted(data, clusters, weights="unit").W, 1.0)
 
 
-def test_ground_that_the_start_fits_is_kept():
+def test_fit_exact_start_is_kept():
     for slope, reg in ((0, 0.01), (0.02, 0)):
         data, clusters, truth = tile(
             lambda e, n, slope=slope: 163 + slope * (e - WEST) - slope / 2 * (n - NORTH)
@@ -179,13 +179,13 @@ def test_ground_that_the_start_fits_is_kept():
         np.testing.assert_allclose(surface.normal(WEST + 50, NORTH - 50), expected, atol=1e-9)
 
 
-def test_the_regulariser_takes_little_from_a_slope():
+def test_fit_regulariser_keeps_slope():
     data, clusters, truth = tile(lambda e, n: 163 + 0.1 * (e - WEST))
     assert abs(on_cells(fitted(data, clusters), data) - truth).mean() < 0.01
 
 
 @pytest.mark.parametrize("degree", range(1, 11))
-def test_a_wave_is_recovered_at_any_degree(degree):
+def test_fit_any_degree_recovers_wave(degree):
     data, clusters, truth = tile(noise=0.02)
     surface = fitted(data, clusters, degree=degree, control_points=(20, 24), iterations=120)
     assert surface.degree == (degree, degree)
@@ -193,8 +193,8 @@ def test_a_wave_is_recovered_at_any_degree(degree):
     assert abs(on_cells(surface, data) - truth).mean() < 0.03
 
 
-def test_it_follows_the_road_where_road_and_terrain_differ():
-    """A bridge: the DTM runs 1.5 m below the road, which is wider than a few control points are apart."""
+def test_fit_bridge_follows_road():
+    """A bridge: the DTM is 1.5 m below the road, and the road is several control points wide."""
     data, clusters, truth = tile(lambda e, n: 160 + 0 * e)
     clusters.labels[35:65] = 1
     data = replace(data, dsm=np.where(clusters.mask, truth + 1.5, truth + 8))
@@ -203,15 +203,15 @@ def test_it_follows_the_road_where_road_and_terrain_differ():
     assert heights[:15].mean() == pytest.approx(160, abs=0.05)
 
 
-def test_outliers_on_the_road_count_little():
-    """The L1 norm: one car roof in twenty cells."""
+def test_fit_outliers_on_road_have_little_effect():
+    """The L1 norm with one car roof in twenty cells."""
     data, clusters, truth = tile()
     rng = np.random.default_rng(3)
     data = replace(data, dsm=truth + np.where(rng.random(truth.shape) < 0.05, 1.5, 0))
     assert abs(on_cells(fitted(data, clusters), data) - truth)[clusters.mask].mean() < 0.02
 
 
-def test_nodata_does_not_poison():
+def test_fit_nodata_has_only_local_effect():
     data, clusters, truth = tile(noise=0.02)
     whole = on_cells(fitted(data, clusters), data)
     data.dtm[:30, :40] = np.nan
@@ -219,13 +219,13 @@ def test_nodata_does_not_poison():
     data.dtm[50:, 97:] = np.nan
     holed = on_cells(fitted(data, clusters), data)
     assert np.isfinite(holed).all()
-    known = np.ones(truth.shape, bool)
-    known[:40, :50] = False
-    known[45:, 90:] = False
-    assert abs(holed - whole)[known].max() < 0.05
+    unaffected = np.ones(truth.shape, bool)
+    unaffected[:40, :50] = False
+    unaffected[45:, 90:] = False
+    assert abs(holed - whole)[unaffected].max() < 0.05
 
 
-def test_heights_and_place_do_not_matter():
+def test_fit_shifted_tile_gives_shifted_surface():
     data, clusters, _ = tile(noise=0.05)
     moved_grid = replace(data.grid, west=WEST + 320000, north=NORTH - 5e6)
     moved = replace(data, grid=moved_grid, core=moved_grid, dsm=data.dsm + 2000, dtm=data.dtm + 2000)
@@ -234,7 +234,7 @@ def test_heights_and_place_do_not_matter():
     np.testing.assert_allclose(b - 2000, a, atol=1e-6)
 
 
-def test_equal_inputs_give_equal_surfaces():
+def test_fit_equal_inputs_give_equal_surfaces():
     data, clusters, _ = tile(noise=0.05)
     a, b = (fitted(data, clusters) for _ in range(2))
     np.testing.assert_array_equal(a.A, b.A)
@@ -243,7 +243,7 @@ def test_equal_inputs_give_equal_surfaces():
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(10, 60), st.integers(10, 60), st.integers(1, 4), st.integers(5, 8), st.integers(5, 8))
-def test_any_shape_of_tile_and_grid(rows, cols, degree, n, m):
+def test_fit_any_tile_shape_and_grid(rows, cols, degree, n, m):
     data, clusters, truth = tile(shape=(rows, cols))
     surface = fitted(data, clusters, degree=degree, control_points=(n, m), iterations=30)
     assert surface.A.shape == (m, n)
@@ -251,7 +251,7 @@ def test_any_shape_of_tile_and_grid(rows, cols, degree, n, m):
     assert abs(on_cells(surface, data) - truth).mean() < 0.5
 
 
-def test_terrain_alone_and_a_road_of_one_cell():
+def test_fit_no_road_or_single_road_cell_follows_dtm():
     data, clusters, truth = tile(noise=0.02)
     empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
     one = RoadClusters(data.grid, np.zeros_like(clusters.labels))
@@ -260,10 +260,10 @@ def test_terrain_alone_and_a_road_of_one_cell():
         assert abs(on_cells(fitted(data, road), data) - truth).mean() < 0.03
 
 
-def test_without_terrain_the_dtm_does_not_leak_in():
+def test_fit_without_terrain_ignores_dtm():
     data, clusters, truth = tile(noise=0.02)
-    other = replace(data, dtm=data.dtm + 50 * np.random.default_rng(5).random(data.dtm.shape))
-    a, b = (fitted(d, clusters, terrain=False) for d in (data, other))
+    other_dtm = replace(data, dtm=data.dtm + 50 * np.random.default_rng(5).random(data.dtm.shape))
+    a, b = (fitted(d, clusters, terrain=False) for d in (data, other_dtm))
     np.testing.assert_array_equal(a.A, b.A)
     assert a.datum == b.datum
     assert abs(on_cells(a, data) - truth)[clusters.mask].mean() < 0.05
@@ -272,32 +272,32 @@ def test_without_terrain_the_dtm_does_not_leak_in():
     np.testing.assert_allclose(on_cells(fitted(data, one, terrain=False), data), data.dsm[50, 50], atol=1e-9)
 
 
-def test_a_missing_dtm_starts_from_the_road():
+def test_fit_missing_dtm_starts_from_road():
     data, clusters, truth = tile(noise=0.02)
     data.dtm[:] = np.nan
     surface = fitted(data, clusters)
     assert abs(on_cells(surface, data) - truth)[clusters.mask].mean() < 0.05
 
 
-def test_control_points_by_spacing():
+def test_fit_spacing_sets_number_of_control_points():
     data, clusters, _ = tile(shape=(81, 41))
     assert fitted(data, clusters, spacing_m=10, iterations=1).A.shape == (9, 5)
     assert fitted(data, clusters, spacing_m=40, iterations=1).A.shape == (4, 4)
 
 
-def test_what_cannot_be_fitted_is_an_error_of_one_line():
+def test_fit_impossible_input_raises():
     data, clusters, _ = tile(size=10)
     with pytest.raises(TaskError, match="10 x 10 cells are fewer than 15 x 15 control points"):
         fitted(data, clusters)
     with pytest.raises(TaskError, match="10 x 10 cells are fewer than 9000001 x 9000001 control points"):
         fitted(data, clusters, spacing_m=1e-6)
-    few = replace(data, dsm=data.dsm.copy(), dtm=data.dtm.copy())
-    few.dsm[5:], few.dtm[5:] = np.nan, np.nan
+    few_heights = replace(data, dsm=data.dsm.copy(), dtm=data.dtm.copy())
+    few_heights.dsm[5:], few_heights.dtm[5:] = np.nan, np.nan
     with pytest.raises(TaskError, match="50 cells with a height are fewer than 8 x 8 control points"):
-        fitted(few, clusters, control_points=(8, 8))
-    none = replace(data, dsm=np.full((10, 10), np.nan), dtm=np.full((10, 10), np.nan))
+        fitted(few_heights, clusters, control_points=(8, 8))
+    no_heights = replace(data, dsm=np.full((10, 10), np.nan), dtm=np.full((10, 10), np.nan))
     with pytest.raises(TaskError, match="no filtered road cell has a DSM height to start from.* empty too"):
-        fitted(none, clusters, control_points=(4, 4))
+        fitted(no_heights, clusters, control_points=(4, 4))
     empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
     with pytest.raises(TaskError, match=r"the DTM is not to be used \(fit.terrain\)"):
         fitted(data, empty, terrain=False, control_points=(4, 4))
@@ -306,7 +306,7 @@ def test_what_cannot_be_fitted_is_an_error_of_one_line():
         fitted(row, road, control_points=(4, 4))
 
 
-def test_a_device_that_is_not_there_is_an_error_of_one_line():
+def test_fit_missing_device_raises():
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():
         pytest.skip("this machine has the device")
@@ -315,7 +315,7 @@ def test_a_device_that_is_not_there_is_an_error_of_one_line():
         fitted(data, clusters, engine="torch", device="cuda")
 
 
-def test_options_that_cannot_be_are_refused():
+def test_options_inconsistent_or_out_of_bounds_are_refused():
     with pytest.raises(ValidationError, match="degree 5 needs more control points each way than 5 x 35"):
         nurbs.Options(degree=5, control_points=(5, 35))
     with pytest.raises(ValidationError, match="device cuda needs engine torch"):

@@ -1,4 +1,4 @@
-"""The plane against planes."""
+"""The fitted plane against known planes."""
 
 import math
 
@@ -25,7 +25,7 @@ def road(rows=slice(10, 20)):
     return labels
 
 
-def test_it_is_the_plane_of_the_road_cells():
+def test_fit_road_on_plane_returns_that_plane():
     dsm = np.where(road() > 0, TRUTH, np.nan)
     dsm[12, 3:9] = np.nan
     surface = fitted(dsm, TRUTH + 100, road())
@@ -38,31 +38,31 @@ def test_it_is_the_plane_of_the_road_cells():
     np.testing.assert_allclose(surface.normal(E, N), np.broadcast_to(expected, (*E.shape, 3)), atol=1e-9)
 
 
-def test_no_other_plane_is_nearer():
+def test_fit_residuals_satisfy_normal_equations():
     noisy = TRUTH + np.random.default_rng(0).normal(0, 0.3, GRID.shape)
     surface = fitted(noisy, TRUTH, road(slice(None)))
     residual = noisy - surface.height(E, N)
-    # Normal equations: residuals are orthogonal to everything a plane can add.
-    for way in (np.ones_like(E), E - E.mean(), N - N.mean()):
-        assert (residual * way).mean() == pytest.approx(0, abs=1e-9)
+    # Normal equations: residuals are orthogonal to every plane.
+    for plane_term in (np.ones_like(E), E - E.mean(), N - N.mean()):
+        assert (residual * plane_term).mean() == pytest.approx(0, abs=1e-9)
 
 
-def test_without_road_heights_the_dtm_stands_in_and_it_is_told():
+def test_fit_without_road_heights_uses_dtm_and_sets_flag():
     for dsm, labels in ((TRUTH + 5, road(slice(0))), (np.full(GRID.shape, np.nan), road())):
         surface = fitted(dsm, TRUTH, labels)
         assert surface.from_dtm
         np.testing.assert_allclose(surface.height(E, N), TRUTH, atol=1e-9)
 
 
-def test_one_cell_gives_a_level_plane_and_a_line_one_level_across():
-    one = road(slice(0))
-    one[7, 8] = 1
-    np.testing.assert_allclose(fitted(TRUTH, TRUTH, one).height(E, N), TRUTH[7, 8], atol=1e-9)
+def test_fit_degenerate_road_is_level_where_undetermined():
+    one_cell = road(slice(0))
+    one_cell[7, 8] = 1
+    np.testing.assert_allclose(fitted(TRUTH, TRUTH, one_cell).height(E, N), TRUTH[7, 8], atol=1e-9)
     across = fitted(TRUTH, TRUTH, road(slice(7, 8)))
     np.testing.assert_allclose(across.slope, (0.03, 0), atol=1e-9)
 
 
-def test_no_height_at_all_is_an_error():
-    nothing = np.full(GRID.shape, np.nan)
+def test_fit_without_heights_raises():
+    no_heights = np.full(GRID.shape, np.nan)
     with pytest.raises(TaskError, match="neither the DSM on the road nor the DTM has a height"):
-        fitted(nothing, nothing, road())
+        fitted(no_heights, no_heights, road())

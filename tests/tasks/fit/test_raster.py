@@ -25,7 +25,7 @@ def points(count=500):
 
 
 def peer():
-    """The triangles (sw, se, ne) and (sw, ne, nw) of each quad, on local coordinates."""
+    """Return matplotlib's interpolator on the triangles (sw, se, ne) and (sw, ne, nw), local coordinates."""
     index = np.arange(DSM.size).reshape(DSM.shape)
     nw, ne, sw, se = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     triangles = np.concatenate([np.stack([sw, se, ne], 1), np.stack([sw, ne, nw], 1)])
@@ -36,7 +36,7 @@ def peer():
 @pytest.mark.parametrize(
     ("road", "terrain"), [("dsm", "dsm"), ("dsm", "dtm"), ("dtm", "dtm"), ("dtm", "dsm")]
 )
-def test_sources(road, terrain):
+def test_fit_takes_heights_from_chosen_rasters(road, terrain):
     labels = np.zeros(GRID.shape, np.int32)
     labels[3:5] = 2
     data = TileData("t", GRID, GRID, DSM, DTM)
@@ -47,14 +47,14 @@ def test_sources(road, terrain):
     np.testing.assert_array_equal(fitted.heights[5:], source[terrain][5:])
 
 
-def test_between_centres_it_is_linear_on_the_two_triangles():
+def test_height_between_centres_is_linear_on_triangles():
     e, n = points()
     heights = peer()(e - WEST, n - SOUTH)
     assert not np.ma.is_masked(heights)
     np.testing.assert_allclose(surface().height(e, n), heights, atol=1e-6)
 
 
-def test_normals_are_those_of_the_triangles():
+def test_normal_equals_triangle_normal():
     e, n = points()
     by_e, by_n = peer().gradient(e - WEST, n - SOUTH)
     expected = np.stack([-by_e, -by_n, np.ones_like(by_e)], -1)
@@ -62,7 +62,7 @@ def test_normals_are_those_of_the_triangles():
     np.testing.assert_allclose(surface().normal(e, n), expected, atol=1e-6)
 
 
-def test_at_the_centres_it_is_the_raster_also_beside_nodata():
+def test_height_at_centres_equals_raster_beside_nodata():
     heights = DSM.copy()
     heights[RNG.random(GRID.shape) < 0.4] = np.nan
     np.testing.assert_array_equal(surface(heights).lattice(GRID.eastings, GRID.northings), heights)
@@ -71,19 +71,19 @@ def test_at_the_centres_it_is_the_raster_also_beside_nodata():
     np.testing.assert_allclose(shifted.lattice(large.eastings, large.northings), heights, atol=1e-6)
 
 
-def test_nodata_takes_the_triangles_it_is_a_corner_of_and_no_more():
+def test_height_is_nan_only_on_triangles_with_nodata_corner():
     heights = DSM.copy()
     heights[4, 6] = np.nan
     e, n = points(2000)
-    lost = np.isnan(surface(heights).height(e, n))
+    missing = np.isnan(surface(heights).height(e, n))
     x, y = (e - GRID.eastings[6]) / GRID.cell, (n - GRID.northings[4]) / GRID.cell
     # The six triangles around a centre: the square of neighbours without its nw and se corner triangles.
     hexagon = (np.abs(x) < 1) & (np.abs(y) < 1) & (np.abs(x - y) < 1)
-    np.testing.assert_array_equal(lost, hexagon)
+    np.testing.assert_array_equal(missing, hexagon)
     np.testing.assert_array_equal(np.isnan(surface(heights).normal(e, n)).any(axis=-1), hexagon)
 
 
-def test_to_the_tiles_edge_it_goes_on_linearly():
+def test_height_up_to_tile_edge_is_linear():
     e, n = np.meshgrid(GRID.eastings, GRID.northings)
     plane = surface(100 + 0.2 * (e - WEST) - 0.1 * (n - SOUTH))
     west, south, east, north = GRID.bounds
@@ -96,7 +96,7 @@ def test_to_the_tiles_edge_it_goes_on_linearly():
         assert a == pytest.approx(b, abs=0.02)
 
 
-def test_one_row_and_one_cell():
+def test_height_single_row_or_cell():
     row = Grid(GRID.crs, WEST, NORTH, 1.0, 4, 1)
     one = Grid(GRID.crs, WEST, NORTH, 1.0, 1, 1)
     for grid, heights in ((row, np.arange(4.0)[None, :]), (one, np.array([[7.0]]))):
