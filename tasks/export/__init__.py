@@ -1,5 +1,5 @@
-"""What users open elsewhere, one file per format: values in, bytes out.
+"""Export formats, one module each: pure functions from values to bytes.
 
-A format's file has `VERSION`; the name or names of what it makes, as the part that follows tile and variant
-(`NAME`); the media type (`MEDIA_TYPE`); and pure functions that turn values into bytes.
+A module has `VERSION`, `NAME` (the end of the file name, after tile and variant; one constant per kind of
+file), `MEDIA_TYPE`, and functions that encode values as bytes.
 """

@@ -1,4 +1,4 @@
-"""Heights, road mask and support of a tile as cloud-optimised GeoTIFF: the paper's R^S for any GIS."""
+"""Heights (the paper's R^S), road mask and support of a tile as cloud-optimised GeoTIFF."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
 
 
 def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
-    """Return what each cell rests on, ``(H, W)``, as GeoTIFF: uint8 by `Support`; 0 is nodata.
+    """Return the `Support` of each cell, ``(H, W)``, as GeoTIFF: uint8; 0 is nodata.
 
     Raises
     ------

@@ -1,8 +1,7 @@
-"""The paper's final mesh as binary glTF: two nodes, road and terrain, in small numbers.
+"""The paper's final mesh as binary glTF with two nodes, road and terrain.
 
-glTF is Y up and viewers compute in float32, so vertices stay relative to the tile's whole-metre origin and
-the node above them moves the tile to its place in the run. What that drops, origin and CRS, is in the
-scene's ``extras``.
+glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
+and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ MEDIA_TYPE = "model/gltf-binary"
 
 ROAD_COLOUR = (11, 11, 13, 255)
 TERRAIN_COLOUR = (141, 131, 108, 255)
-"""Asphalt and dry ground; red, green, blue, alpha in linear light as glTF wants (sRGB #3a3a40, #c4beae)."""
+"""Red, green, blue and alpha in linear light, as glTF requires (sRGB #3a3a40 and #c4beae)."""
 
 
 def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
@@ -33,13 +32,14 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
     mesh : Mesh
         The mesh of one tile, with at least one face.
     run_origin : tuple of float
-        Whole-metre (easting, northing, height) shared by all tiles of a run; the scene's zero.
+        Whole-metre (easting, northing, height) shared by all tiles of a run; the origin of the scene.
 
     Returns
     -------
     bytes
-        Node ``tile``, moved by the tile's origin minus the run's, over nodes ``road`` and ``terrain`` (a
-        class without faces has no node). Axes: x east, y up, z south; metres. Equal input, equal bytes.
+        Node ``tile``, translated by the tile's origin minus the run's, with child nodes ``road`` and
+        ``terrain`` (a class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs
+        give equal bytes.
     """
     import trimesh
 
@@ -56,7 +56,7 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
 
 
 def _y_up(points: Floats) -> Floats:
-    """Turn (east, north, up) into glTF's (east, up, -north): a rotation, so faces keep their side."""
+    """Rotate (east, north, up) to glTF's (east, up, -north); the orientation of faces is kept."""
     east, north, up = np.moveaxis(points, -1, 0)
     return np.stack([east, up, -north], axis=-1)
 
@@ -71,7 +71,7 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
 
 
 def _part(whole: trimesh.Trimesh, faces: Bools, name: str, colour: tuple[int, ...]) -> trimesh.Trimesh:
-    """Cut one class out, with the normals of the whole: no seam in the shading along the road's edge."""
+    """Return the faces of one class with the whole mesh's vertex normals, so that shading shows no seam."""
     import trimesh
 
     used, corners = np.unique(whole.faces[faces], return_inverse=True)

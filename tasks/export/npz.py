@@ -1,7 +1,7 @@
-"""The fitted surface itself (the paper's parameters Theta) as NumPy archive, for use without the run.
+"""The fitted surface (the paper's parameters Theta) as NumPy archive, usable without the run.
 
-Any NumPy reads it; `decode` gives the `NurbsSurface` back, and `tasks.spline.surface.exact` from it what CAD
-programs read.
+NumPy reads it. `decode` returns the `NurbsSurface`; `tasks.spline.surface.exact` converts that to the form
+that CAD programs read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NAME = "_surface.npz"
 MEDIA_TYPE = "application/zip"
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""What reading a file that is cut, changed, or something else can raise."""
+"""Exceptions raised by reading a file that is truncated, changed, or of another format."""
 
 
 def encode(surface: NurbsSurface) -> bytes:
@@ -48,12 +48,12 @@ def encode(surface: NurbsSurface) -> bytes:
 
 
 def decode(source: bytes | Path | str) -> NurbsSurface:
-    """Return the surface that `encode` wrote, from its bytes or its file.
+    """Return the surface written by `encode`, from its bytes or its file.
 
     Raises
     ------
     TaskError
-        If the file is missing, damaged, no surface, or of a later version.
+        If the file is missing, damaged, not a surface, or of a newer version.
     """
     name = "these bytes" if isinstance(source, bytes) else str(source)
     try:
@@ -61,7 +61,9 @@ def decode(source: bytes | Path | str) -> NurbsSurface:
             arrays = {key: npz[key] for key in npz.files}
         version = int(arrays["version"])
         if version > VERSION:
-            message = f"{name}: surface of version {version}, known up to {VERSION}; update FlexRoad"
+            message = (
+                f"{name}: surface of version {version}, this program reads up to {VERSION}; update FlexRoad"
+            )
             raise TaskError(message, name)
         return _surface(arrays)
     except DAMAGED as error:

@@ -1,7 +1,7 @@
 """The paper's final mesh as binary PLY, with class and support per face: for CloudCompare, QGIS and scripts.
 
-Coordinates are absolute and float64. trimesh and VTK write float32 vertices, which are 0.5 m apart at a
-northing of 5.6 million; hence the ten lines of header here.
+Coordinates are absolute and float64. trimesh and VTK write float32 vertices, whose resolution is 0.5 m at a
+northing of 5.6 million; therefore the file is written here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NAME = ".ply"
 MEDIA_TYPE = "application/octet-stream"
 
 ROAD, GROUND = 11, 2
-"""Classes of faces: the ASPRS codes that LAS files use for road surface and ground."""
+"""Classes of faces: the ASPRS codes of LAS files for road surface and ground."""
 
 FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1"), ("support", "u1")])
 
@@ -41,10 +41,10 @@ end_header
 
 
 def encode(mesh: Mesh, support: NDArray[np.uint8]) -> bytes:
-    """Return a mesh as PLY, with what each face rests on (`tasks.quality.support.Support`, ``(F,)``).
+    """Return a mesh as PLY with the support of each face (`tasks.quality.support.Support`, ``(F,)``).
 
-    Vertices are (easting, northing, height) in metres in the CRS that a comment of the header names;
-    ``origin`` there is the tile's whole-metre origin, a good shift for programs that compute in float32.
+    Vertices are (easting, northing, height) in metres. Header comments give the CRS and, as ``origin``, the
+    tile's whole-metre origin, which programs that compute in float32 can subtract.
     """
     header = HEADER.format(
         crs=" ".join(mesh.crs.split()),  # WKT may hold line breaks, which would end the comment

@@ -16,7 +16,7 @@ def plane(grid: Grid) -> np.ndarray:
     return heights
 
 
-def test_heights_read_back_in_place():
+def test_encode_height_reads_back_in_place():
     with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
         assert raster.dtypes == ("float32",)
         assert np.isnan(raster.nodata)
@@ -29,21 +29,21 @@ def test_heights_read_back_in_place():
     assert value == pytest.approx(100 + 0.01 * 400.5 + 0.02 * 200.5, abs=1e-5)
 
 
-def test_road_reads_back():
+def test_encode_mask_reads_back():
     road = plane(GRID) > 104
     with MemoryFile(cog.encode_mask(road, GRID)) as file, file.open() as raster:
         assert raster.dtypes == ("uint8",)
         np.testing.assert_array_equal(raster.read(1), road)
 
 
-def test_it_is_cloud_optimised():
+def test_encode_height_is_cloud_optimised():
     with MemoryFile(cog.encode_height(plane(GRID), GRID)) as file, file.open() as raster:
         structure = raster.tags(ns="IMAGE_STRUCTURE")
         assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
         assert raster.overviews(1) == [2]
 
 
-def test_wkt_is_kept():
+def test_encode_mask_keeps_wkt():
     wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=7 +ellps=GRS80 +units=m").to_wkt()
     grid = Grid(wkt, 0.0, 20.0, 0.5, 40, 40)
     with MemoryFile(cog.encode_mask(np.ones(grid.shape, bool), grid)) as file, file.open() as raster:
@@ -54,10 +54,10 @@ def test_wkt_is_kept():
         assert raster.res == (0.5, 0.5)
 
 
-def test_a_wrong_shape_is_refused():
+def test_encode_height_wrong_shape_raises():
     with pytest.raises(TaskError, match=r"\(250, 599\).*\(250, 600\)"):
         cog.encode_height(plane(GRID)[:, 1:], GRID)
 
 
-def test_equal_arrays_give_equal_bytes():
+def test_encode_height_equal_arrays_give_equal_bytes():
     assert cog.encode_height(plane(GRID), GRID) == cog.encode_height(plane(GRID), GRID)

@@ -13,8 +13,8 @@ ORIGIN = (295500.0, 5629250.0, 150.0)
 RUN_ORIGIN = (295000.0, 5629000.0, 100.0)
 
 
-def rolling(n: int = 21, road_columns: int = 4) -> Mesh:
-    """A 10 m square of rolling ground; its western columns of faces are road."""
+def hills(n: int = 21, road_columns: int = 4) -> Mesh:
+    """Return a 10 m square of hills whose western columns of faces are road."""
     x, y = np.meshgrid(np.linspace(0, 10, n), np.linspace(0, 10, n))
     z = 3.2 + np.sin(x / 3) + 0.1 * y
     i = np.arange(n * n).reshape(n, n)
@@ -25,8 +25,8 @@ def rolling(n: int = 21, road_columns: int = 4) -> Mesh:
     return Mesh("EPSG:25832", ORIGIN, vertices, faces, road)
 
 
-def tree(data: bytes) -> dict:
-    """The JSON chunk, read by the GLB layout of the glTF standard."""
+def gltf_json(data: bytes) -> dict:
+    """Return the JSON chunk, parsed by the GLB layout of the glTF standard."""
     magic, version, length, json_length, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
     return json.loads(data[20 : 20 + json_length])
@@ -41,57 +41,57 @@ def placed(scene: trimesh.Scene, node: str) -> trimesh.Trimesh:
     return scene.geometry[geometry].copy().apply_transform(transform)
 
 
-def back(points: np.ndarray) -> np.ndarray:
-    """From glTF's axes to easting, northing, height."""
+def to_world(points: np.ndarray) -> np.ndarray:
+    """Convert glTF's axes to easting, northing, height."""
     x, y, z = points.T
     return np.c_[x, -z, y] + RUN_ORIGIN
 
 
-def test_reads_back_within_float32():
-    mesh = rolling()
+def test_encode_reads_back_within_float32():
+    mesh = hills()
     scene = read(glb.encode(mesh, RUN_ORIGIN))
     for node, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
-        corners = back(placed(scene, node).triangles.reshape(-1, 3))
+        corners = to_world(placed(scene, node).triangles.reshape(-1, 3))
         truth = (mesh.vertices + ORIGIN)[mesh.faces[faces]].reshape(-1, 3)
         np.testing.assert_allclose(corners, truth, rtol=0, atol=2e-6)
 
 
-def test_stored_vertices_are_small_and_the_tile_node_moves_them():
-    data = glb.encode(rolling(), RUN_ORIGIN)
-    nodes = {node["name"]: node for node in tree(data)["nodes"]}
+def test_encode_vertices_are_local_and_tile_node_moves_them():
+    data = glb.encode(hills(), RUN_ORIGIN)
+    nodes = {node["name"]: node for node in gltf_json(data)["nodes"]}
     assert set(nodes) == {"tile", "road", "terrain"}
     assert np.reshape(nodes["tile"]["matrix"], (4, 4))[3].tolist() == [500.0, 50.0, -250.0, 1.0]
     assert "matrix" not in nodes["road"]
-    children = [tree(data)["nodes"][i]["name"] for i in nodes["tile"]["children"]]
+    children = [gltf_json(data)["nodes"][i]["name"] for i in nodes["tile"]["children"]]
     assert sorted(children) == ["road", "terrain"]
-    positions = [a for a in tree(data)["accessors"] if a["type"] == "VEC3"]
+    positions = [a for a in gltf_json(data)["accessors"] if a["type"] == "VEC3"]
     assert max(np.abs([*a["min"], *a["max"]]).max() for a in positions) <= 10.0
 
 
-def test_georeference_is_in_the_extras():
-    extras = tree(glb.encode(rolling(), RUN_ORIGIN))["scenes"][0]["extras"]
+def test_encode_extras_have_georeference():
+    extras = gltf_json(glb.encode(hills(), RUN_ORIGIN))["scenes"][0]["extras"]
     assert extras["crs"] == "EPSG:25832"
     assert extras["origin"] == list(ORIGIN)
     assert extras["run_origin"] == list(RUN_ORIGIN)
 
 
-def test_north_is_minus_z_and_up_is_y():
+def test_encode_north_is_minus_z_and_up_is_y():
     spike = np.array([[0, 0, 0], [1, 0, 0], [0, 7, 0], [0, 0, 3]], float)
     mesh = Mesh("EPSG:25832", ORIGIN, spike, np.array([[0, 1, 2], [0, 1, 3]], np.int32), np.zeros(2, bool))
     terrain = placed(read(glb.encode(mesh, ORIGIN)), "terrain")
     np.testing.assert_allclose(terrain.bounds, [[0, 0, -7], [1, 3, 0]])
 
 
-def test_faces_and_normals_look_up():
-    scene = read(glb.encode(rolling(), RUN_ORIGIN))
+def test_encode_faces_and_normals_point_up():
+    scene = read(glb.encode(hills(), RUN_ORIGIN))
     for node in ("road", "terrain"):
         part = placed(scene, node)
         assert (part.face_normals[:, 1] > 0).all()
         assert (part.vertex_normals[:, 1] > 0).all()
 
 
-def test_shading_has_no_seam_at_the_road_edge():
-    mesh = rolling()
+def test_encode_shading_has_no_seam_at_road_edge():
+    mesh = hills()
     scene = read(glb.encode(mesh, RUN_ORIGIN))
     edge = 2.0
     for node in ("road", "terrain"):
@@ -105,17 +105,17 @@ def test_shading_has_no_seam_at_the_road_edge():
 
 
 @pytest.mark.parametrize(("columns", "nodes"), [(0, {"terrain"}), (20, {"road"})])
-def test_a_class_without_faces_has_no_node(columns, nodes):
-    scene = read(glb.encode(rolling(road_columns=columns), RUN_ORIGIN))
+def test_encode_class_without_faces_has_no_node(columns, nodes):
+    scene = read(glb.encode(hills(road_columns=columns), RUN_ORIGIN))
     assert set(scene.graph.nodes_geometry) == nodes
 
 
-def test_equal_meshes_give_equal_bytes():
-    assert glb.encode(rolling(), RUN_ORIGIN) == glb.encode(rolling(), RUN_ORIGIN)
+def test_encode_equal_meshes_give_equal_bytes():
+    assert glb.encode(hills(), RUN_ORIGIN) == glb.encode(hills(), RUN_ORIGIN)
 
 
-def test_a_wkt_name_beyond_ascii_survives():
-    mesh = rolling(3)
+def test_encode_keeps_non_ascii_wkt():
+    mesh = hills(3)
     named = Mesh('PROJCRS["Réunion"]', mesh.origin, mesh.vertices, mesh.faces, mesh.road)
     data = glb.encode(named, RUN_ORIGIN)
-    assert tree(data)["scenes"][0]["extras"]["crs"] == 'PROJCRS["Réunion"]'
+    assert gltf_json(data)["scenes"][0]["extras"]["crs"] == 'PROJCRS["Réunion"]'

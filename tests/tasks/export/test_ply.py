@@ -15,11 +15,11 @@ def roof(crs: str = "EPSG:25832") -> Mesh:
     return Mesh(crs, (295500.0, 5629250.0, 150.0), vertices, faces, np.array([False, True, False]))
 
 
-RESTS_ON = np.array([1, 2, 3], np.uint8)
+SUPPORT = np.array([1, 2, 3], np.uint8)
 
 
 def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Header lines, vertices and faces, by the PLY description alone."""
+    """Return header lines, vertices and faces, parsed by the PLY specification."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
     kinds = {"double": "<f8", "uchar": "u1", "int": "<i4"}
@@ -37,20 +37,20 @@ def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
     return lines, vertices, faces
 
 
-def test_coordinates_are_absolute_and_exact():
+def test_encode_coordinates_are_absolute_and_exact():
     mesh = roof()
-    _, vertices, faces = parse(ply.encode(mesh, RESTS_ON))
+    _, vertices, faces = parse(ply.encode(mesh, SUPPORT))
     truth = mesh.vertices + np.array(mesh.origin)
     for axis, name in enumerate("xyz"):
         np.testing.assert_array_equal(vertices[name], truth[:, axis])
     assert (faces["count"] == 3).all()
     np.testing.assert_array_equal(faces["vertex_indices"], mesh.faces)
     np.testing.assert_array_equal(faces["class"], [2, 11, 2])
-    np.testing.assert_array_equal(faces["support"], RESTS_ON)
+    np.testing.assert_array_equal(faces["support"], SUPPORT)
 
 
-def test_header_names_crs_and_origin():
-    lines, _, _ = parse(ply.encode(roof(), RESTS_ON))
+def test_encode_header_has_crs_and_origin():
+    lines, _, _ = parse(ply.encode(roof(), SUPPORT))
     assert lines[:4] == [
         "ply",
         "format binary_little_endian 1.0",
@@ -60,27 +60,27 @@ def test_header_names_crs_and_origin():
 
 
 @pytest.mark.parametrize("crs", ['PROJCRS["a",\n  BASEGEOGCRS["b"]]', 'PROJCRS["Réunion"]'])
-def test_wkt_stays_one_ascii_line(crs):
-    lines, vertices, _ = parse(ply.encode(roof(crs), RESTS_ON))
+def test_encode_wkt_is_one_ascii_line(crs):
+    lines, vertices, _ = parse(ply.encode(roof(crs), SUPPORT))
     assert len([line for line in lines if line.startswith("comment crs PROJCRS")]) == 1
     assert len(vertices) == 5
 
 
-def test_trimesh_reads_it():
+def test_encode_is_read_by_trimesh():
     mesh = roof()
-    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh, RESTS_ON)), file_type="ply", process=False)
+    read = trimesh.load_mesh(io.BytesIO(ply.encode(mesh, SUPPORT)), file_type="ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices + np.array(mesh.origin))
     np.testing.assert_array_equal(read.faces, mesh.faces)
 
 
-def test_vtk_reads_it(tmp_path):
+def test_encode_is_read_by_vtk(tmp_path):
     mesh = roof()
     path = tmp_path / "mesh.ply"
-    path.write_bytes(ply.encode(mesh, RESTS_ON))
+    path.write_bytes(ply.encode(mesh, SUPPORT))
     read = pyvista.read(path)
     np.testing.assert_array_equal(read.faces.reshape(-1, 4)[:, 1:], mesh.faces)
     np.testing.assert_allclose(read.points, mesh.vertices + np.array(mesh.origin), rtol=1e-7)
 
 
-def test_equal_meshes_give_equal_bytes():
-    assert ply.encode(roof(), RESTS_ON) == ply.encode(roof(), RESTS_ON)
+def test_encode_equal_meshes_give_equal_bytes():
+    assert ply.encode(roof(), SUPPORT) == ply.encode(roof(), SUPPORT)
