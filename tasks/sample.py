@@ -23,13 +23,13 @@ from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Su
 
 VERSION = 1
 
-MICRO = 6
-"""Decimals of a metre that lattice offsets are rounded to: 3 * 0.1 m and 1 * 0.3 m are one place."""
+DECIMALS = 6
+"""Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
 SNAP_M = 1e-3
-"""The last line of a lattice moves to the border when it ends closer to it than this (m)."""
+"""The last line of a lattice is moved onto the border if it is closer to it than this (m)."""
 
 NUDGE = 1e-6
-"""Part of a cell that is more than the rounding error of its edge's coordinates."""
+"""Share of a cell, larger than the rounding error of its edge's coordinates."""
 
 
 class Options(base.Options):
@@ -42,7 +42,8 @@ class Options(base.Options):
     road_m: float = Field(1.0, ge=0.05, description="spacing of samples on roads, the paper's s^r (m)")
     terrain_m: float = Field(10.0, ge=0.05, description="spacing of samples elsewhere, the paper's s^t (m)")
     mask: Literal["raw", "filtered"] = Field(
-        "raw", description="where road is: raw: as segmented, M^r; filtered: what ECSRC kept, M^{r+}"
+        "raw",
+        description="road mask for sampling: raw: as segmented, M^r; filtered: as kept by ECSRC, M^{r+}",
     )
 
 
@@ -63,13 +64,13 @@ def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Op
     Returns
     -------
     Mesh
-        Counter-clockwise from above, covering the domain but for cells beyond the survey (kept all the
-        same with ``corners``) and where the surface has no height. Equal inputs give equal meshes.
+        Faces are counter-clockwise from above. The mesh covers the domain except where the surface has no
+        height and, unless ``corners``, beyond the survey. Equal inputs give equal meshes.
 
     Raises
     ------
     TaskError
-        If the core is a single row or column of cells without halo, or no face is left.
+        If the core is a single row or column of cells without halo, or if no face is left.
     """
     mask = road.mask if options.mask == "raw" else clusters.mask
     origin = road.core.origin
@@ -85,7 +86,7 @@ def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Op
 
 
 def _domain(road: RoadMask) -> Bounds:
-    """Return west, south, east and north of what the mesh spans (m)."""
+    """Return west, south, east and north of the area to be meshed (m)."""
     if road.core != road.grid:
         return road.core.bounds
     if min(road.core.shape) < 2:
@@ -97,9 +98,9 @@ def _domain(road: RoadMask) -> Bounds:
 
 
 def _axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
-    """Return ``start``, ``start + step``, ... up to ``stop``; ``to_end`` adds a ``stop`` the step misses."""
+    """Return ``start``, ``start + step``, ... up to ``stop``; ``to_end`` adds ``stop`` if it is missing."""
     count = int(np.floor((stop - start + SNAP_M) / step))
-    axis = start + np.round(np.arange(1, count + 1) * step, MICRO)
+    axis = start + np.round(np.arange(1, count + 1) * step, DECIMALS)
     axis = np.concatenate([[start], axis])
     if stop - axis[-1] <= SNAP_M:
         axis[-1] = stop
@@ -111,7 +112,7 @@ def _axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
 def _regular(
     surface: Surface, origin: tuple[float, float], local: Bounds, step: float
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Return points of a full lattice and two faces per quad, split from south-west to north-east."""
+    """Return points of a full lattice and two faces per quad, cut from south-west to north-east."""
     west, south, east, north = local
     x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
     z = surface.lattice(x + origin[0], y + origin[1])
@@ -122,7 +123,7 @@ def _regular(
 
 
 def _dynamic(surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options) -> Floats:
-    """Return road, terrain and border points by northing, then easting; each place once, ``(V, 3)``."""
+    """Return road, terrain and border points without duplicates, by northing, then easting, ``(V, 3)``."""
     parts = [
         _lattice(surface, road, mask, local, options.road_m),
         _lattice(surface, road, ~mask, local, options.terrain_m),
@@ -141,7 +142,7 @@ def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step
     x, y = _axis(west, east, step, to_end=False), _axis(south, north, step, to_end=False)
     eastings, northings = x + road.core.origin[0], y + road.core.origin[1]
     z = surface.lattice(eastings, northings)
-    # A point on the line between two cells belongs to the eastern or southern one, whatever the rounding.
+    # A point on the line between two cells belongs to the eastern or southern one, independent of rounding.
     nudge = NUDGE * road.grid.cell
     row, col = road.grid.cells(eastings + nudge, northings - nudge)
     i, j = np.nonzero(where[np.ix_(row, col)])
@@ -162,24 +163,24 @@ def _border(surface: Surface, origin: tuple[float, float], local: Bounds, step: 
 def _delaunay(points: Floats) -> NDArray[np.int32]:
     """Return the faces of the Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
 
-    A lattice is full of cocircular points; the order of insertion (corners of the bounding box, then by
-    northing and easting) decides these ties.
+    Points of a lattice are cocircular; the order of insertion (corners of the bounding box, then by northing
+    and easting) makes the triangulation unique.
     """
     plan = points.copy()
     plan[:, 2] = 0.0
     triangulation = startinpy.DT()
-    triangulation.snap_tolerance = 10.0 ** -(MICRO + 3)
+    triangulation.snap_tolerance = 10.0 ** -(DECIMALS + 3)
     triangulation.insert(plan, insertionstrategy="BBox")
-    # Vertex 0 of startinpy is at infinity; the points follow in their order.
+    # Vertex 0 of startinpy is at infinity; the points follow in the order of insertion.
     faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32) - 1
-    # It can only be dropped in the thread that made it, and a sampling profiler (Dask's is one) may keep
-    # this frame and all it holds alive in another.
+    # The object must be deleted in the thread that created it. A sampling profiler such as Dask's may keep
+    # this frame and its locals alive in another thread.
     del triangulation
     return faces
 
 
 def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools, keep_outside: bool) -> Mesh:
-    """Drop faces without height or beyond the survey, then the vertices no face needs."""
+    """Return the mesh of the faces that have heights and lie inside the survey, without unused vertices."""
     east, north = road.core.origin
     x, y, z = points.T
     cells = road.grid.cells(x[faces].mean(axis=1) + east, y[faces].mean(axis=1) + north)

@@ -14,7 +14,7 @@ from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
 
 @dataclass(frozen=True)
 class Hills:
-    """A surface known everywhere but in a hole."""
+    """A surface with heights everywhere except in a hole."""
 
     hole: tuple[float, float, float] | None = None
     bounds = (0.0, 0.0, 1.0, 1.0)
@@ -42,7 +42,7 @@ def diagonal_street(grid: Grid, half_m: float = 12.0):
     return np.abs(x - y) < half_m
 
 
-def run(core, mask, options=None, surface=None, halo=0.0, outside=None, filtered=None) -> Mesh:
+def sampled(core, mask, options=None, surface=None, halo=0.0, outside=None, filtered=None) -> Mesh:
     grid = core.buffered(halo)
     road = RoadMask(grid, core, mask, np.zeros(grid.shape, bool) if outside is None else outside)
     clusters = RoadClusters(grid, (mask if filtered is None else filtered).astype(np.int32))
@@ -60,7 +60,7 @@ def plan(mesh: Mesh):
 
 
 def assert_covers(mesh: Mesh, bounds):
-    """The faces are a triangulation of the rectangle: no gap, no overlap, no flat face."""
+    """Assert that the faces triangulate the rectangle without gap, overlap or degenerate face."""
     west, south, east, north = bounds
     signed = areas(mesh)
     assert signed.min() > 1e-7
@@ -69,22 +69,22 @@ def assert_covers(mesh: Mesh, bounds):
     assert xy.min(axis=0) == pytest.approx([west, south], abs=1e-9)
     assert xy.max(axis=0) == pytest.approx([east, north], abs=1e-9)
     at_border = (np.abs(xy - [west, south]) < 1e-8) | (np.abs(xy - [east, north]) < 1e-8)
-    # Euler: every vertex is used, and the outline has as many edges as vertices.
+    # Euler's formula: every vertex is used, and the outline has as many edges as vertices.
     assert len(mesh.faces) == 2 * len(xy) - 2 - at_border.any(axis=1).sum()
     assert len(np.unique(mesh.faces)) == len(xy) == len(np.unique(xy.round(6), axis=0))
 
 
-def test_uniform_has_the_papers_number_of_triangles():
+def test_uniform_has_paper_number_of_triangles():
     core = ground()
-    mesh = run(core, diagonal_street(core), Options(method="uniform"))
+    mesh = sampled(core, diagonal_street(core), Options(method="uniform"))
     assert len(mesh.faces) == 124_002
     assert_covers(mesh, core.hull)
     np.testing.assert_array_equal(np.unique(areas(mesh)), [0.5])
 
 
-def test_uniform_ends_at_the_border_where_the_step_misses_it():
+def test_uniform_adds_points_on_border():
     core = ground(30, 20)
-    mesh = run(core, diagonal_street(core), Options(method="uniform", road_m=4))
+    mesh = sampled(core, diagonal_street(core), Options(method="uniform", road_m=4))
     assert np.unique(mesh.vertices[:, 0]).tolist() == [0.5, 4.5, 8.5, 12.5, 16.5, 20.5, 24.5, 28.5, 29.5]
     assert np.unique(mesh.vertices[:, 1]).tolist() == [0.5, 4.5, 8.5, 12.5, 16.5, 19.5]
     assert_covers(mesh, core.hull)
@@ -92,7 +92,7 @@ def test_uniform_ends_at_the_border_where_the_step_misses_it():
 
 def test_uniform_splits_quads_from_south_west_to_north_east():
     core = ground(2, 2)
-    mesh = run(core, np.zeros((2, 2), bool), Options(method="uniform"))
+    mesh = sampled(core, np.zeros((2, 2), bool), Options(method="uniform"))
     corners = {frozenset(map(tuple, mesh.vertices[face, :2])) for face in mesh.faces}
     assert corners == {
         frozenset([(0.5, 0.5), (1.5, 0.5), (1.5, 1.5)]),
@@ -100,18 +100,18 @@ def test_uniform_splits_quads_from_south_west_to_north_east():
     }
 
 
-def test_corners_are_two_triangles():
+def test_corners_gives_two_triangles():
     core = ground()
     outside = np.ones(core.shape, bool)
-    mesh = run(core, diagonal_street(core), Options(method="corners"), outside=outside)
+    mesh = sampled(core, diagonal_street(core), Options(method="corners"), outside=outside)
     assert len(mesh.faces) == 2
     assert_covers(mesh, core.hull)
 
 
-def test_dynamic_is_fine_on_the_road_and_coarse_elsewhere():
+def test_dynamic_is_fine_on_road_and_coarse_elsewhere():
     core = ground()
     mask = diagonal_street(core)
-    mesh = run(core, mask)
+    mesh = sampled(core, mask)
     assert_covers(mesh, core.hull)
     xy = mesh.vertices[:, :2] - 0.5
     on_road = mask[core.cells(*plan(mesh).T)]
@@ -119,32 +119,32 @@ def test_dynamic_is_fine_on_the_road_and_coarse_elsewhere():
     on_lattice = (xy % 10 == 0).all(axis=1)
     on_border = ((xy == 0) | (xy == 249)).any(axis=1)
     assert (on_road | on_lattice | on_border).all()
-    away = run(core, np.zeros_like(mask))
-    assert (len(away.vertices), len(run(core, ~np.zeros_like(mask)).faces)) == (26 * 26, 124_002)
+    without_road = sampled(core, np.zeros_like(mask))
+    assert (len(without_road.vertices), len(sampled(core, ~np.zeros_like(mask)).faces)) == (26 * 26, 124_002)
 
 
-def test_border_nodes_stand_on_roads_and_beside():
+def test_dynamic_has_border_points_with_and_without_road():
     core = ground(43, 33)
     for mask in (np.zeros(core.shape, bool), np.ones(core.shape, bool)):
-        mesh = run(core, mask, Options(road_m=3))
+        mesh = sampled(core, mask, Options(road_m=3))
         south = mesh.vertices[mesh.vertices[:, 1] == 0.5, 0] - 0.5
         assert {0, 10, 20, 30, 40, 42} <= set(south.tolist())
         assert_covers(mesh, core.hull)
 
 
-def test_heights_are_the_surfaces():
+def test_sample_heights_equal_surface():
     core = ground()
     for method in ("dynamic", "uniform", "corners"):
-        mesh = run(core, diagonal_street(core), Options(method=method))
+        mesh = sampled(core, diagonal_street(core), Options(method=method))
         east, north, up = (mesh.vertices + np.array(mesh.origin)).T
         np.testing.assert_allclose(up, Hills().height(east, north), rtol=0, atol=1e-9)
         assert mesh.origin == (295500, 5629250, np.floor(up.min()))
         assert 0 <= mesh.vertices[:, 2].min() < 1
 
 
-def test_it_is_delaunay():
+def test_dynamic_is_delaunay():
     core = ground(60, 60)
-    mesh = run(core, diagonal_street(core, 6))
+    mesh = sampled(core, diagonal_street(core, 6))
     edges = {}
     for face in mesh.faces.tolist():
         for k in range(3):
@@ -168,18 +168,18 @@ def test_it_is_delaunay():
     data=st.data(),
 )
 @settings(max_examples=150, deadline=None)
-def test_any_mask_on_any_lattice_is_covered(cell, shape, corner, road_m, ratio, halo, method, data):
+def test_sample_any_mask_and_lattice_covers_domain(cell, shape, corner, road_m, ratio, halo, method, data):
     core = ground(shape[1], shape[0], cell, *corner)
     grid = core.buffered(halo)
     mask = data.draw(arrays.arrays(bool, grid.shape))
     options = Options(method=method, road_m=road_m * cell, terrain_m=ratio * road_m * cell)
-    mesh = run(core, mask, options, halo=halo)
+    mesh = sampled(core, mask, options, halo=halo)
     assert_covers(mesh, core.bounds if halo else core.hull)
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.2])
-def test_neighbours_with_a_halo_meet(cell):
-    """Their shared edge has the same vertices."""
+def test_sample_neighbours_with_halo_meet(cell):
+    """Both meshes have the same vertices on the shared edge."""
     n = round(50 / cell)
     west, east = ground(n, n, cell), ground(n, n, cell, west=295550.0)
     edges = []
@@ -187,28 +187,28 @@ def test_neighbours_with_a_halo_meet(cell):
         grid = core.buffered(10)
         x, y = np.meshgrid(grid.eastings, grid.northings)
         mask = np.abs(x - 295550 - (y - 5629475) * 0.6) < 4
-        xy = plan(run(core, mask, halo=10)).round(6)
+        xy = plan(sampled(core, mask, halo=10)).round(6)
         edges.append({tuple(point) for point in xy if abs(point[0] - 295550) < 1e-6})
     assert edges[0] == edges[1]
     assert len(edges[0]) > 8
 
 
-def test_filtered_mask_is_an_option():
+def test_sample_filtered_mask_is_used():
     core = ground(60, 60)
     mask = np.ones(core.shape, bool)
     filtered = diagonal_street(core, 5)
-    raw = run(core, mask, filtered=filtered)
-    fine = run(core, mask, Options(mask="filtered"), filtered=filtered)
+    raw = sampled(core, mask, filtered=filtered)
+    fine = sampled(core, mask, Options(mask="filtered"), filtered=filtered)
     assert len(fine.vertices) < len(raw.vertices) / 3
     assert raw.road.all()
     np.testing.assert_array_equal(fine.road, filtered[core.cells(*plan(fine)[fine.faces].mean(axis=1).T)])
 
 
 @pytest.mark.parametrize("method", ["dynamic", "uniform"])
-def test_faces_without_height_are_dropped(method):
+def test_sample_faces_without_height_are_dropped(method):
     core = ground(60, 60)
     hole = (295530.0, 5629470.0, 8.0)
-    mesh = run(core, diagonal_street(core), Options(method=method), surface=Hills(hole))
+    mesh = sampled(core, diagonal_street(core), Options(method=method), surface=Hills(hole))
     assert np.isfinite(mesh.vertices).all()
     assert (np.hypot(*(plan(mesh) - hole[:2]).T) >= 8).all()
     assert areas(mesh).sum() < 59**2 - 150
@@ -216,12 +216,12 @@ def test_faces_without_height_are_dropped(method):
 
 
 @pytest.mark.parametrize("method", ["dynamic", "uniform"])
-def test_the_mesh_ends_with_the_survey(method):
+def test_sample_mesh_ends_with_survey(method):
     core = ground(60, 60)
     outside = np.zeros(core.shape, bool)
     outside[:, :25] = True
-    whole = run(core, diagonal_street(core), Options(method=method))
-    mesh = run(core, diagonal_street(core), Options(method=method), outside=outside)
+    whole = sampled(core, diagonal_street(core), Options(method=method))
+    mesh = sampled(core, diagonal_street(core), Options(method=method), outside=outside)
     centroids = plan(mesh)[mesh.faces].mean(axis=1)
     assert not outside[core.cells(*centroids.T)].any()
     inside = ~outside[core.cells(*plan(whole)[whole.faces].mean(axis=1).T)]
@@ -229,30 +229,30 @@ def test_the_mesh_ends_with_the_survey(method):
     np.testing.assert_array_equal(plan(mesh)[mesh.faces], plan(whole)[whole.faces[inside]])
 
 
-def test_equal_inputs_give_equal_meshes():
+def test_sample_equal_inputs_give_equal_meshes():
     core = ground(80, 80)
-    one, two = (run(core, diagonal_street(core)) for _ in range(2))
+    one, two = (sampled(core, diagonal_street(core)) for _ in range(2))
     np.testing.assert_array_equal(one.vertices, two.vertices)
     np.testing.assert_array_equal(one.faces, two.faces)
     np.testing.assert_array_equal(one.road, two.road)
 
 
-def test_a_place_has_the_same_mesh_wherever_the_survey_lies():
+def test_sample_shifted_survey_gives_same_mesh():
     shift = np.array([4_000_000.0, -3_000_000.0])
-    here, there = ground(80, 80), ground(80, 80, west=295500 + shift[0], north=5629500 + shift[1])
-    one, two = run(here, diagonal_street(here)), run(there, diagonal_street(there))
+    grid, shifted_grid = ground(80, 80), ground(80, 80, west=295500 + shift[0], north=5629500 + shift[1])
+    one, two = sampled(grid, diagonal_street(grid)), sampled(shifted_grid, diagonal_street(shifted_grid))
     np.testing.assert_array_equal(one.vertices[:, :2], two.vertices[:, :2])
     np.testing.assert_array_equal(one.faces, two.faces)
 
 
-def test_what_spans_no_area_is_refused():
+def test_sample_single_row_of_cells_raises():
     core = ground(5, 1)
     with pytest.raises(TaskError, match="5 x 1 cells span no area"):
-        run(core, np.ones(core.shape, bool))
-    assert_covers(run(core, np.ones((5, 9), bool), halo=2), core.bounds)
+        sampled(core, np.ones(core.shape, bool))
+    assert_covers(sampled(core, np.ones((5, 9), bool), halo=2), core.bounds)
 
 
-def test_a_surface_without_heights_is_refused():
+def test_sample_surface_without_heights_raises():
     core = ground(20, 20)
     with pytest.raises(TaskError, match="no height"):
-        run(core, np.ones(core.shape, bool), surface=Hills((295510.0, 5629490.0, 1e3)))
+        sampled(core, np.ones(core.shape, bool), surface=Hills((295510.0, 5629490.0, 1e3)))

@@ -1,7 +1,7 @@
-"""What ecsrc, sample and evaluate give for one made tile, pinned with their versions.
+"""Pinned output of ecsrc, sample and evaluate for one synthetic tile, with the VERSION of each stage.
 
-Whoever changes a stage's output on purpose counts its VERSION up and renews the figures here; results kept
-from before are then made again.
+If the output of a stage changes on purpose, raise its VERSION, so that stored results are computed again, and
+update the figures here.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ class Hills:
 
 @pytest.fixture(scope="module")
 def tile() -> tuple[TileData, RoadMask]:
-    """Two streets and a yard, with a roof over a street, a kerb and ripples in the DSM."""
+    """Return two streets and a yard, with a roof over a street, a kerb and ripples in the DSM."""
     x, y = np.meshgrid(GRID.eastings - GRID.west, GRID.northings - GRID.south)
     mask = (np.abs(x - y) < 6) | (np.abs(y - 61) < 4) | (np.hypot(x - 75, y - 15) < 7)
     dtm = Hills().height(GRID.eastings[None, :], GRID.northings[:, None])
@@ -57,7 +57,7 @@ def digest(*arrays: np.ndarray) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:16]
 
 
-def test_ecsrc(clusters):
+def test_ecsrc_output_is_pinned_to_version(clusters):
     sizes = np.bincount(clusters.labels.ravel())[1:].tolist()
     assert (ecsrc.VERSION, sizes, digest(clusters.labels)) == (1, [1470, 156], "b4c78ef72d54f40e")
 
@@ -70,16 +70,16 @@ def test_ecsrc(clusters):
         ("corners", (1, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
     ],
 )
-def test_sample(tile, clusters, method, golden):
+def test_sample_output_is_pinned_to_version(tile, clusters, method, golden):
     mesh = sample.sample(Hills(), tile[1], clusters, sample.Options(method=method))
-    # Heights depend on the last digit of the machine's sine; the plan does not.
+    # Heights depend on the last digit of the platform's sine; plan coordinates do not.
     shape = digest(mesh.vertices[:, :2], mesh.faces, mesh.road)
     assert (sample.VERSION, len(mesh.faces), mesh.origin, shape) == golden
 
 
-def test_evaluate(tile, clusters):
+def test_evaluate_output_is_pinned_to_version(tile, clusters):
     mesh = sample.sample(Hills(), tile[1], clusters, sample.Options())
-    found = asdict(evaluate.evaluate(mesh, *tile, evaluate.Options(nearest=True)))
+    metrics = asdict(evaluate.evaluate(mesh, *tile, evaluate.Options(nearest=True)))
     golden = {
         "l2_road_m": 0.128801681877,
         "l2_terrain_m": 0.143542308943,
@@ -96,4 +96,4 @@ def test_evaluate(tile, clusters):
         "completeness": 1.0,
     }
     assert evaluate.VERSION == 1
-    assert found == pytest.approx(golden, rel=1e-9)
+    assert metrics == pytest.approx(golden, rel=1e-9)
