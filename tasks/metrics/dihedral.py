@@ -1,4 +1,4 @@
-"""Smoothness of a mesh: the angles between neighbouring faces, averaged (Eq. mad)."""
+"""Smoothness of a mesh: the mean angle between neighbouring faces (Eq. mad)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Indices = NDArray[np.int32]
 def mean_angles(mesh: Mesh) -> Floats:
     """Return each face's mean angle to the faces it shares an edge with, ``(F,)``, 0 to 90 degrees.
 
-    The paper averages over three neighbours; at a border there are two or one. NaN where there is none.
+    The paper averages over three neighbours; a face at the border has two or one. NaN if it has none.
     """
     totals, counts = np.zeros(len(mesh.faces)), np.zeros(len(mesh.faces))
     start, far, owner = _edges(mesh.faces, len(mesh.vertices))
@@ -27,7 +27,7 @@ def mean_angles(mesh: Mesh) -> Floats:
 
 @compiled()
 def _normals(vertices: Floats, faces: Indices) -> Floats:
-    """Return a normal per face, ``(F, 3)``, as long as the face's doubled area."""
+    """Return a normal per face, ``(F, 3)``; its length is twice the face's area."""
     normals = np.empty((faces.shape[0], 3))
     for f in range(faces.shape[0]):
         ax, ay, az = vertices[faces[f, 0]]
@@ -40,10 +40,10 @@ def _normals(vertices: Floats, faces: Indices) -> Floats:
 
 @compiled()
 def _edges(faces: Indices, vertices: int) -> tuple[Indices, Indices, Indices]:
-    """Sort the faces' edges by their lower vertex.
+    """Return the faces' edges sorted by their lower vertex.
 
-    Those of vertex v are ``start[v]`` to ``start[v + 1]``. Per edge, ``far`` is its other vertex and
-    ``owner`` its face.
+    The edges of vertex v are ``start[v]`` to ``start[v + 1]`` (exclusive). For each edge, ``far`` is its
+    higher vertex and ``owner`` its face.
     """
     start = np.zeros(vertices + 1, np.int32)
     for f in range(faces.shape[0]):
@@ -76,7 +76,7 @@ def _add_angles(
                 cross = math.sqrt(
                     (ny * mz - nz * my) ** 2 + (nz * mx - nx * mz) ** 2 + (nx * my - ny * mx) ** 2
                 )
-                # The arccos of the paper's formula loses half its digits where faces are nearly level.
+                # The arccos of the paper's formula loses half the digits where faces are nearly parallel.
                 angle = math.atan2(cross, abs(nx * mx + ny * my + nz * mz))
                 for f in (owner[i], owner[j]):
                     totals[f] += angle

@@ -1,8 +1,8 @@
 """Compare a mesh with the reference: the paper's "Evaluation Metrics".
 
-Distances are vertical, at the reference's cell centres in the tile's core; a cell, like the face whose
-centroid lies in it, is road by the evaluation mask: the reference's own, else the raw segmented one, which
-is also the paper's.
+Distances are vertical, at the reference's cell centres in the tile's core. The evaluation mask classes cells,
+and faces by the cell under their centroid, as road or terrain. It is the reference's road mask, else the raw
+segmented one; the paper uses the segmented one.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ VERSION = 1
 
 
 class Options(base.Options):
-    """What is measured beside the paper's figures."""
+    """Optional metrics, and the mask that classes cells as road."""
 
-    nearest: bool = Field(False, description="also measure the distance in space (slower)")
+    nearest: bool = Field(False, description="also measure 3-D distances (slower)")
     classes: Literal["reference", "segmented"] = Field(
         "reference",
-        description="what is road: reference: by the true mask, else the raw segmented one; "
-        "segmented: by the raw segmented one, as in the paper",
+        description="mask of the road cells: reference: the true mask, else the raw segmented one; "
+        "segmented: the raw segmented one, as in the paper",
     )
 
 
@@ -41,11 +41,11 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
     mesh : Mesh
         The sampled surface.
     data : TileData
-        Its reference heights, or else its DTM, are the truth.
+        Reference heights, else the DTM, are the truth.
     road : RoadMask
-        Its raw mask classes the cells if so asked for, or where the tile has no reference mask.
+        Its raw mask classes the cells with ``classes: segmented``, or if the tile has no reference mask.
     options : Options
-        Whether to measure distances in space, and which mask says what is road.
+        Whether to measure 3-D distances, and which mask classes the cells.
 
     Returns
     -------
@@ -54,15 +54,19 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
         NaN for a class without any.
     """
     truth = data.dtm if data.reference is None else data.reference
-    known_road = data.reference_road if options.classes == "reference" else None
-    is_road = road.mask if known_road is None else known_road
+    reference_road = data.reference_road if options.classes == "reference" else None
+    is_road = road.mask if reference_road is None else reference_road
     window = data.grid.window(data.core)
     heights = np.ascontiguousarray(truth[window]) - mesh.origin[2]
-    off = drape(mesh, data.core) - heights
-    known, both = np.isfinite(heights), np.isfinite(off)
+    difference = drape(mesh, data.core) - heights
+    has_truth, has_both = np.isfinite(heights), np.isfinite(difference)
     classes = is_road[window], ~is_road[window]
-    on_road, on_terrain = (off[both & cells] for cells in classes)
-    in_space = _in_space(mesh, data, heights, off) if options.nearest else np.full(off.shape, np.nan)
+    on_road, on_terrain = (difference[has_both & cells] for cells in classes)
+    distances_3d = (
+        _distances_3d(mesh, data, heights, difference)
+        if options.nearest
+        else np.full(difference.shape, np.nan)
+    )
     angles = _angles(mesh, data, is_road)
     return Metrics(
         l2_road_m=mean(np.abs(on_road)),
@@ -71,38 +75,38 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
         rmse_terrain_m=float(np.sqrt(mean(on_terrain**2))),
         nmad_road_m=nmad(on_road),
         p95_road_m=float(np.percentile(np.abs(on_road), 95)) if on_road.size else float("nan"),
-        nearest_road_m=mean(in_space[both & classes[0]]),
-        nearest_terrain_m=mean(in_space[both & classes[1]]),
+        nearest_road_m=mean(distances_3d[has_both & classes[0]]),
+        nearest_terrain_m=mean(distances_3d[has_both & classes[1]]),
         mad_road_deg=angles[0],
         mad_terrain_deg=angles[1],
         triangles=len(mesh.faces),
-        road_fraction=mean(is_road[window][known]),
-        completeness=mean(both[known]),
+        road_fraction=mean(is_road[window][has_truth]),
+        completeness=mean(has_both[has_truth]),
     )
 
 
-def _in_space(mesh: Mesh, data: TileData, heights: Floats, off: Floats) -> Floats:
-    """Return the distance in space of each cell with a vertical distance, ``(H, W)``, m; others NaN."""
-    row, col = np.nonzero(np.isfinite(off))
+def _distances_3d(mesh: Mesh, data: TileData, heights: Floats, difference: Floats) -> Floats:
+    """Return the 3-D distance of each cell that has a vertical distance, ``(H, W)``, m; others NaN."""
+    row, col = np.nonzero(np.isfinite(difference))
     east, north = data.core.eastings[col] - mesh.origin[0], data.core.northings[row] - mesh.origin[1]
     points = np.column_stack([east, north, heights[row, col]])
-    out = np.full(off.shape, np.nan)
-    out[row, col] = nearest(mesh.vertices, mesh.faces, points, np.abs(off[row, col]))
+    out = np.full(difference.shape, np.nan)
+    out[row, col] = nearest(mesh.vertices, mesh.faces, points, np.abs(difference[row, col]))
     return out
 
 
 def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
     """Return the mean angle to neighbouring faces (degrees) of the road's and the terrain's faces.
 
-    All faces stand for a class that has cells but no face, as the road under the two faces of a plane.
+    For a class with cells but without faces the mean is over all faces, as for the road of a two-face plane.
     """
     per_face = mean_angles(mesh)
     x, y = (mesh.vertices[:, axis][mesh.faces].mean(axis=1) + mesh.origin[axis] for axis in (0, 1))
     face_is_road = is_road[data.grid.cells(x, y)]
     core_is_road = is_road[data.grid.window(data.core)]
-    found = []
+    means = []
     for faces, cells in ((face_is_road, core_is_road), (~face_is_road, ~core_is_road)):
         chosen = per_face[faces] if faces.any() else per_face
         chosen = chosen[np.isfinite(chosen)]
-        found.append(mean(chosen) if cells.any() else float("nan"))
-    return found[0], found[1]
+        means.append(mean(chosen) if cells.any() else float("nan"))
+    return means[0], means[1]

@@ -10,8 +10,8 @@ from flexroad.tasks.types import Floats
 def least_squares_plane(easting: Floats, northing: Floats, height: Floats) -> tuple[float, float, float]:
     """Return (c, a, b) of ``z = c + a * easting + b * northing`` with the least squared vertical error.
 
-    Points that do not span a plane (one point, points on a line) give the plane through them that is level
-    in the direction they leave open; coordinates should be local, so that c keeps its digits.
+    Points that do not span a plane (one point, points on a line) give the plane through them that is level in
+    the undetermined direction. Coordinates should be local, so that c keeps its digits.
     """
     e, n, z = easting.mean(), northing.mean(), height.mean()
     (a, b), *_ = np.linalg.lstsq(np.column_stack([easting - e, northing - n]), height - z, rcond=1e-9)

@@ -1,4 +1,4 @@
-"""Distance in space from points to a mesh, exact: faces in square bins, searched outwards in rings."""
+"""Exact 3-D distance from points to a mesh; faces are binned in squares that are searched ring by ring."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FACES_PER_BIN = 4
 
 
 def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -> Floats:
-    """Return the distance from each point to the nearest place on the mesh, ``(N,)``, m.
+    """Return the distance from each point to the nearest point of the mesh, ``(N,)``, m.
 
     Parameters
     ----------
@@ -25,8 +25,8 @@ def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -
     points : ndarray, (N, 3)
         In the coordinates of the vertices.
     at_most : ndarray, (N,)
-        A known bound of each distance (m), as the vertical one is; infinity where none is known. The
-        search ends there.
+        Upper bound of each distance (m), such as the vertical distance; infinity if there is none. Faces
+        farther away are not searched.
     """
     plan = vertices[faces][:, :, :2]
     low, high = plan.min(axis=1), plan.max(axis=1)
@@ -44,9 +44,9 @@ def nearest(vertices: Floats, faces: Indices, points: Floats, at_most: Floats) -
 
 @compiled()
 def _bins(boxes: Indices, rows: int, cols: int) -> tuple[Indices, Indices]:
-    """List the faces whose bounding box touches each bin.
+    """Return the faces whose bounding box touches each bin.
 
-    Those of bin b are ``members[start[b] : start[b + 1]]``.
+    The faces of bin b are ``members[start[b] : start[b + 1]]``.
     """
     start = np.zeros(rows * cols + 1, np.int32)
     for f in range(boxes.shape[0]):
@@ -83,13 +83,13 @@ def _search(
         col = min(max(math.floor(x / side), 0), cols - 1)
         best = at_most[i] ** 2
         for ring in range(max(rows, cols)):
-            # All faces of the rings so far are measured: those left are beyond the ring's inner edge.
+            # The faces of all inner rings are measured; the others lie outside the ring's inner edge.
             inner = min(x - (col - ring + 1) * side, (col + ring) * side - x)
             inner = max(min(inner, y - (row - ring + 1) * side, (row + ring) * side - y), 0.0)
             if ring and inner**2 >= best:
                 break
             for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-                # A ring's inner rows have only its first and last column.
+                # The rows between a ring's first and last have only two bins, its first and last column.
                 step = 1 if abs(r - row) == ring else max(2 * ring, 1)
                 for c in range(col - ring, col + ring + 1, step):
                     if c < 0 or c >= cols:
@@ -105,7 +105,7 @@ def _to_triangle(vertices: Floats, face: Indices, x: float, y: float, z: float, 
     ax, ay, az = vertices[face[0], 0] - x, vertices[face[0], 1] - y, vertices[face[0], 2] - z
     bx, by, bz = vertices[face[1], 0] - x, vertices[face[1], 1] - y, vertices[face[1], 2] - z
     cx, cy, cz = vertices[face[2], 0] - x, vertices[face[2], 1] - y, vertices[face[2], 2] - z
-    # The point is now the origin.
+    # Coordinates are now relative to the point.
     gap_x = max(min(ax, bx, cx), -max(ax, bx, cx), 0.0)
     gap_y = max(min(ay, by, cy), -max(ay, by, cy), 0.0)
     gap_z = max(min(az, bz, cz), -max(az, bz, cz), 0.0)

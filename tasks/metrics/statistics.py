@@ -1,4 +1,4 @@
-"""Mean and spread of what may be empty: NaN then."""
+"""Mean and spread of arrays; NaN for empty ones."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from flexroad.tasks.types import Bools, Floats
 
 GAUSSIAN = 1.4826
-"""Standard deviations of a Gaussian in its median absolute deviation."""
+"""Standard deviation of a Gaussian divided by its median absolute deviation."""
 
 
 def mean(values: Floats | Bools) -> float:
-    """Return the mean."""
+    """Return the mean; NaN if there are no values."""
     return float(values.mean()) if values.size else float("nan")
 
 
 def nmad(values: Floats) -> float:
-    """Return the standard deviation as the median absolute deviation from the median tells it."""
+    """Return the normalised median absolute deviation from the median; NaN if there are no values."""
     return float(GAUSSIAN * np.median(np.abs(values - np.median(values)))) if values.size else float("nan")

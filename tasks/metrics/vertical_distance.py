@@ -1,4 +1,4 @@
-"""Heights of a mesh at cell centres: what vertical distances are measured with."""
+"""Heights of a mesh at cell centres, from which vertical distances are computed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Mesh
 
 TOLERANCE_M = 1e-6
-"""A centre this far outside a triangle still counts as inside: borders and shared edges are never missed."""
+"""Centres up to this distance outside a triangle count as inside, so none is missed on a shared edge (m)."""
 
 
 def drape(mesh: Mesh, grid: Grid) -> Floats:
     """Return the mesh's height at every cell centre, ``(H, W)``, m above the mesh's origin.
 
-    NaN where no face lies above or below; where several do, the first one counts.
+    NaN where no face lies above or below; where there are several, the first one is used.
     """
-    # Local coordinates, by column and row counted in metres from the north-western cell's centre.
+    # Local coordinates in metres east and south of the north-western cell's centre.
     east = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west - grid.cell / 2)
     south = (grid.north - mesh.origin[1] - grid.cell / 2) - mesh.vertices[:, 1]
     heights = np.full(grid.shape, np.nan)
@@ -35,12 +35,12 @@ def _drape(points: Floats, faces: NDArray[np.int32], cell: float, heights: Float
         ax, ay, az = points[faces[f, 0]]
         bx, by, bz = points[faces[f, 1]]
         cx, cy, cz = points[faces[f, 2]]
-        # Twice the area; the axes look east and south, which makes it negative for faces that look up.
+        # Twice the area; negative for faces that look up, because the axes point east and south.
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
         side = 1.0 if area > 0 else -1.0
-        # How far the doubled areas opposite to a, b and c may be negative: tolerance times edge.
+        # Lower bounds of the doubled areas opposite to a, b and c: minus tolerance times edge length.
         slack_a = -TOLERANCE_M * math.hypot(cx - bx, cy - by)
         slack_b = -TOLERANCE_M * math.hypot(cx - ax, cy - ay)
         slack_c = -TOLERANCE_M * math.hypot(bx - ax, by - ay)

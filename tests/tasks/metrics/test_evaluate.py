@@ -21,7 +21,7 @@ def ground(width=40, height=30, cell=1.0, west=295500.0, north=5629500.0) -> Gri
 
 
 def on_lattice(grid: Grid, height_at, bounds=None, step=1.0) -> Mesh:
-    """A mesh of square quads, each split in two, with heights ``height_at(easting, northing)``."""
+    """Return a mesh of square quads, each cut in two, with heights ``height_at(easting, northing)``."""
     west, south, east, north = bounds or grid.hull
     x = np.linspace(west, east, max(round((east - west) / step), 1) + 1)
     y = np.linspace(south, north, max(round((north - south) / step), 1) + 1)
@@ -52,8 +52,8 @@ def tilt(slope_x, slope_y=0.0, height=160.0):
     return lambda x, y: height + slope_x * (x - 295500) + slope_y * (y - 5629470)
 
 
-def scattered(rng, n=60, size=20.0, relief=3.0):
-    """A random triangulated surface, ``vertices`` and ``faces``."""
+def random_surface(rng, n=60, size=20.0, relief=3.0):
+    """Return vertices and faces of a random triangulated surface."""
     xy = rng.uniform(0, size, (n, 2))
     faces = Delaunay(xy).simplices.astype(np.int32)
     return np.c_[xy, rng.uniform(0, relief, n)], faces
@@ -63,57 +63,57 @@ def scattered(rng, n=60, size=20.0, relief=3.0):
 
 
 @pytest.mark.parametrize("step", [1.0, 13.0, 39.0])
-def test_a_plane_over_a_plane_is_off_by_their_distance(step):
+def test_evaluate_shifted_plane_measures_shift(step):
     grid = ground(40, 40)
     plane = tilt(0.1, -0.05)
     is_road = western_half(grid)
-    found = figures(on_lattice(grid, plane, step=step), grid, plane(*centres(grid)) + 0.25, is_road)
-    for value in (found.l2_road_m, found.l2_terrain_m, found.rmse_road_m, found.rmse_terrain_m):
+    metrics = figures(on_lattice(grid, plane, step=step), grid, plane(*centres(grid)) + 0.25, is_road)
+    for value in (metrics.l2_road_m, metrics.l2_terrain_m, metrics.rmse_road_m, metrics.rmse_terrain_m):
         assert value == pytest.approx(0.25, abs=1e-9)
-    assert found.p95_road_m == pytest.approx(0.25, abs=1e-9)
-    assert found.nmad_road_m == pytest.approx(0, abs=1e-9)
-    assert found.mad_road_deg == pytest.approx(0, abs=1e-6)
-    assert (found.completeness, found.road_fraction) == (1.0, 0.5)
-    assert math.isnan(found.nearest_road_m)
-    assert math.isnan(found.nearest_terrain_m)
+    assert metrics.p95_road_m == pytest.approx(0.25, abs=1e-9)
+    assert metrics.nmad_road_m == pytest.approx(0, abs=1e-9)
+    assert metrics.mad_road_deg == pytest.approx(0, abs=1e-6)
+    assert (metrics.completeness, metrics.road_fraction) == (1.0, 0.5)
+    assert math.isnan(metrics.nearest_road_m)
+    assert math.isnan(metrics.nearest_terrain_m)
 
 
-def test_vertical_and_nearest_distance_differ_by_the_cosine_of_the_slope():
+def test_evaluate_slope_nearest_is_cosine_of_vertical():
     grid = ground(40, 40)
     slope = 0.75
-    # The mesh reaches beyond the cells: nearest places lie inside it.
+    # The mesh extends beyond the cells, so the nearest points lie inside it.
     mesh = on_lattice(grid, tilt(slope), bounds=(295490.0, 5629450.0, 295550.0, 5629510.0))
-    found = figures(mesh, grid, tilt(slope)(*centres(grid)) + 1, western_half(grid), Options(nearest=True))
-    assert found.l2_road_m == found.l2_terrain_m == pytest.approx(1.0)
-    assert found.nearest_road_m == found.nearest_terrain_m == pytest.approx(1 / math.hypot(1, slope))
+    metrics = figures(mesh, grid, tilt(slope)(*centres(grid)) + 1, western_half(grid), Options(nearest=True))
+    assert metrics.l2_road_m == metrics.l2_terrain_m == pytest.approx(1.0)
+    assert metrics.nearest_road_m == metrics.nearest_terrain_m == pytest.approx(1 / math.hypot(1, slope))
 
 
-def test_statistics_are_those_of_the_classes():
+def test_evaluate_statistics_are_per_class():
     grid = ground(40, 30)
-    off = np.random.default_rng(0).normal(0.1, 0.5, grid.shape)
+    errors = np.random.default_rng(0).normal(0.1, 0.5, grid.shape)
     is_road = western_half(grid)
-    found = figures(on_lattice(grid, tilt(0.0)), grid, 160 - off, is_road)
-    road, terrain = off[is_road], off[~is_road]
-    assert found.l2_road_m == pytest.approx(np.abs(road).mean())
-    assert found.l2_terrain_m == pytest.approx(np.abs(terrain).mean())
-    assert found.rmse_road_m == pytest.approx(math.sqrt((road**2).mean()))
-    assert found.rmse_terrain_m == pytest.approx(math.sqrt((terrain**2).mean()))
-    assert found.nmad_road_m == pytest.approx(1.4826 * np.median(np.abs(road - np.median(road))))
-    assert found.p95_road_m == pytest.approx(np.percentile(np.abs(road), 95))
+    metrics = figures(on_lattice(grid, tilt(0.0)), grid, 160 - errors, is_road)
+    road, terrain = errors[is_road], errors[~is_road]
+    assert metrics.l2_road_m == pytest.approx(np.abs(road).mean())
+    assert metrics.l2_terrain_m == pytest.approx(np.abs(terrain).mean())
+    assert metrics.rmse_road_m == pytest.approx(math.sqrt((road**2).mean()))
+    assert metrics.rmse_terrain_m == pytest.approx(math.sqrt((terrain**2).mean()))
+    assert metrics.nmad_road_m == pytest.approx(1.4826 * np.median(np.abs(road - np.median(road))))
+    assert metrics.p95_road_m == pytest.approx(np.percentile(np.abs(road), 95))
 
 
-def test_reference_layers_take_the_place_of_dtm_and_mask():
+def test_evaluate_reference_layers_replace_dtm_and_mask():
     grid = ground()
     layers = {"reference": np.full(grid.shape, 162.0), "reference_road": ~western_half(grid)}
     mesh, dtm = on_lattice(grid, tilt(0.0)), np.where(western_half(grid), 161.0, 165.0)
-    without = figures(mesh, grid, dtm, western_half(grid))
-    assert (without.l2_road_m, without.l2_terrain_m) == pytest.approx((1, 5))
+    without_layers = figures(mesh, grid, dtm, western_half(grid))
+    assert (without_layers.l2_road_m, without_layers.l2_terrain_m) == pytest.approx((1, 5))
     layers["reference"][~western_half(grid)] = 163.0
-    given_layers = figures(mesh, grid, dtm, western_half(grid), **layers)
-    assert (given_layers.l2_road_m, given_layers.l2_terrain_m) == pytest.approx((3, 2))
+    with_layers = figures(mesh, grid, dtm, western_half(grid), **layers)
+    assert (with_layers.l2_road_m, with_layers.l2_terrain_m) == pytest.approx((3, 2))
 
 
-def test_the_segmented_mask_classes_cells_and_faces_if_asked_for():
+def test_evaluate_classes_segmented_uses_raw_mask():
     grid = ground()
     layers = {"reference": np.where(western_half(grid), 161.0, 165.0), "reference_road": ~western_half(grid)}
     segmented = western_half(grid)
@@ -122,45 +122,45 @@ def test_the_segmented_mask_classes_cells_and_faces_if_asked_for():
     true = figures(mesh, grid, layers["reference"], segmented, **layers)
     by_mask = figures(mesh, grid, layers["reference"], segmented, Options(classes="segmented"), **layers)
     only_mask = figures(mesh, grid, layers["reference"], segmented, reference=layers["reference"])
-    # As text, for NaN is unlike itself.
+    # Compared as text, because NaN does not equal NaN.
     assert str(by_mask) == str(only_mask)
     assert (true.road_fraction, by_mask.road_fraction) == (0.5, 0.25)
     assert true.mad_road_deg != by_mask.mad_road_deg
 
 
-def test_unknown_reference_cells_count_for_nothing():
+def test_evaluate_nan_reference_cells_are_ignored():
     grid = ground()
     truth = np.full(grid.shape, 161.0)
     truth[:, :10] = np.nan
-    found = figures(on_lattice(grid, tilt(0.0)), grid, truth, western_half(grid))
-    assert found.l2_road_m == pytest.approx(1)
-    assert found.completeness == 1
-    assert found.road_fraction == pytest.approx(10 / 30)
+    metrics = figures(on_lattice(grid, tilt(0.0)), grid, truth, western_half(grid))
+    assert metrics.l2_road_m == pytest.approx(1)
+    assert metrics.completeness == 1
+    assert metrics.road_fraction == pytest.approx(10 / 30)
 
 
-def test_a_hole_in_the_mesh_lowers_completeness():
+def test_evaluate_hole_in_mesh_lowers_completeness():
     grid = ground(41, 31)
     mesh = on_lattice(grid, tilt(0.0))
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
     holed = replace(mesh, faces=mesh.faces[(np.abs(centroids[:, :2] - [20.5, 15.5]) > 5).any(axis=1)])
-    found = figures(holed, grid, np.full(grid.shape, 160.5))
-    # The hole is 10 m wide from centre to centre; its rim has heights.
-    assert found.completeness == pytest.approx(1 - 81 / (41 * 31))
-    assert found.l2_terrain_m == pytest.approx(0.5)
+    metrics = figures(holed, grid, np.full(grid.shape, 160.5))
+    # The hole is 10 m wide from centre to centre; the cells on its rim have heights.
+    assert metrics.completeness == pytest.approx(1 - 81 / (41 * 31))
+    assert metrics.l2_terrain_m == pytest.approx(0.5)
 
 
-def test_a_class_without_cells_has_no_figures():
+def test_evaluate_class_without_cells_is_nan():
     grid = ground()
-    found = figures(
+    metrics = figures(
         on_lattice(grid, tilt(0.0)), grid, np.full(grid.shape, 160.0), options=Options(nearest=True)
     )
-    road = [value for name, value in vars(found).items() if "_road_" in name]
+    road = [value for name, value in vars(metrics).items() if "_road_" in name]
     assert len(road) == 6
     assert all(math.isnan(value) for value in road)
-    assert (found.road_fraction, found.l2_terrain_m, found.mad_terrain_deg) == (0, 0, 0)
+    assert (metrics.road_fraction, metrics.l2_terrain_m, metrics.mad_terrain_deg) == (0, 0, 0)
 
 
-def test_only_the_core_counts():
+def test_evaluate_ignores_halo():
     core = ground(20, 20)
     grid = core.buffered(7)
     truth = np.full(grid.shape, 500.0)
@@ -170,9 +170,9 @@ def test_only_the_core_counts():
     data = TileData("t", grid, core, truth, truth)
     mesh = on_lattice(core, tilt(0.0), bounds=core.bounds)
     road = RoadMask(grid, core, is_road, np.zeros_like(is_road))
-    found = evaluate(mesh, data, road, Options(nearest=True))
-    assert (found.l2_road_m, found.nearest_road_m) == pytest.approx((1, 1))
-    assert (found.completeness, found.road_fraction) == (1, 0.5)
+    metrics = evaluate(mesh, data, road, Options(nearest=True))
+    assert (metrics.l2_road_m, metrics.nearest_road_m) == pytest.approx((1, 1))
+    assert (metrics.completeness, metrics.road_fraction) == (1, 0.5)
 
 
 # Draping
@@ -185,7 +185,7 @@ def test_only_the_core_counts():
     step=st.sampled_from([0.2, 1.0, 1.7, 50.0]),
 )
 @settings(deadline=None)
-def test_no_cell_of_a_covered_hull_is_missed(shape, cell, corner, step):
+def test_drape_covered_hull_has_no_nan(shape, cell, corner, step):
     grid = ground(shape[1], shape[0], cell, *corner)
     plane = tilt(0.1, 0.2)
     mesh = on_lattice(grid, plane, step=step * cell)
@@ -194,7 +194,7 @@ def test_no_cell_of_a_covered_hull_is_missed(shape, cell, corner, step):
 
 
 def _slow_drape(mesh: Mesh, grid: Grid):
-    """Height by the first face whose barycentric coordinates of the cell's centre are not negative."""
+    """Return heights from the first face on which no barycentric coordinate of the centre is negative."""
     out = np.full(grid.shape, np.nan)
     corners = mesh.vertices[mesh.faces]
     for r, c in np.ndindex(*grid.shape):
@@ -208,61 +208,62 @@ def _slow_drape(mesh: Mesh, grid: Grid):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_drape_is_the_barycentric_height(seed):
-    vertices, faces = scattered(np.random.default_rng(seed))
+def test_drape_equals_barycentric_height(seed):
+    vertices, faces = random_surface(np.random.default_rng(seed))
     if seed == 2:
         faces = np.ascontiguousarray(faces[:, ::-1])
     grid = ground(24, 22, west=-2.0, north=21.0)
     mesh = Mesh("EPSG:25832", (1.0, -2.0, 100.0), vertices, faces, np.zeros(len(faces), bool))
-    found, truth = drape(mesh, grid), _slow_drape(mesh, grid)
+    heights, truth = drape(mesh, grid), _slow_drape(mesh, grid)
     assert 0.3 < np.isnan(truth).mean() < 0.7
-    np.testing.assert_allclose(found, truth, atol=1e-9)
+    np.testing.assert_allclose(heights, truth, atol=1e-9)
 
 
 # Smoothness
 
 
 def _slow_angles(mesh: Mesh):
-    """The paper's formula face by face, with arccos."""
+    """Evaluate the paper's formula with arccos, face by face."""
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     out = []
     for i, face in enumerate(mesh.faces):
-        shared = [len(set(face) & set(other)) for other in mesh.faces]
-        beside = [j for j, n in enumerate(shared) if n == 2]
-        angles = [math.acos(min(1.0, abs(normals[i] @ normals[j]))) for j in beside]
+        shared = [len(set(face) & set(other_face)) for other_face in mesh.faces]
+        neighbours = [j for j, n in enumerate(shared) if n == 2]
+        angles = [math.acos(min(1.0, abs(normals[i] @ normals[j]))) for j in neighbours]
         out.append(math.degrees(sum(angles) / len(angles)) if angles else math.nan)
     return np.array(out)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_angles_are_those_of_the_formula(seed):
-    vertices, faces = scattered(np.random.default_rng(seed), n=40)
+def test_mean_angles_equal_paper_formula(seed):
+    vertices, faces = random_surface(np.random.default_rng(seed), n=40)
     mesh = Mesh("EPSG:25832", (0.0, 0.0, 0.0), vertices, faces, np.zeros(len(faces), bool))
     np.testing.assert_allclose(mean_angles(mesh), _slow_angles(mesh), rtol=1e-7)
 
 
-def test_a_face_alone_has_no_angle():
+def test_mean_angles_single_face_is_nan():
     grid = ground()
     mesh = on_lattice(grid, tilt(0.1))
     alone = replace(mesh, faces=mesh.faces[[0, 200]])
     assert np.isnan(mean_angles(alone)).all()
 
 
-def test_angle_of_a_fold():
-    """Two planes that meet at 30 degrees: each face at the crease has one neighbour beyond it."""
+def test_mean_angles_fold_has_known_angles():
+    """Two planes meet at 30 degrees: each face at the crease has one neighbour on the other plane."""
     grid = ground(41, 31)
     crease = 295520.5
     mesh = on_lattice(grid, lambda x, y: 160 + np.maximum(x - crease, 0) * math.tan(math.radians(30)))
     angles = mean_angles(mesh)
     at_crease = angles > 1e-6
-    # Of the two faces of a quad one has an edge on the crease; at the mesh's border it lacks a neighbour.
+    # One of the two faces of a quad has an edge on the crease; at the mesh's border it has one neighbour
+    # less.
     assert at_crease.sum() == 2 * 30
     assert sorted(set(angles[at_crease].round(6))) == [10.0, 15.0]
 
 
-def test_no_angle_is_lost_on_almost_level_ground():
+def test_mean_angles_almost_level_ground_is_accurate():
     grid = ground()
     mesh = on_lattice(grid, lambda x, y: 160 + 1e-9 * (x - 295500) ** 2)
     bend = math.degrees(2e-9)
@@ -271,34 +272,34 @@ def test_no_angle_is_lost_on_almost_level_ground():
     assert figures(mesh, grid, np.full(grid.shape, 160.0)).mad_terrain_deg == pytest.approx(bend / 3, rel=0.1)
 
 
-def test_faces_are_classed_under_their_centroids():
+def test_evaluate_faces_are_classed_by_centroid():
     grid = ground(40, 30)
     rng = np.random.default_rng(0)
     rough = np.where(western_half(grid), 0.0, rng.uniform(0, 1, grid.shape))[::-1]
     mesh = on_lattice(grid, lambda x, y: 160 + rough)
     west = centres(grid)[0] < 295515
-    found = figures(mesh, grid, np.full(grid.shape, 160.0), west)
-    assert found.mad_road_deg == pytest.approx(0, abs=1e-6)
-    assert found.mad_terrain_deg > 10
+    metrics = figures(mesh, grid, np.full(grid.shape, 160.0), west)
+    assert metrics.mad_road_deg == pytest.approx(0, abs=1e-6)
+    assert metrics.mad_terrain_deg > 10
     centroid_x = mesh.vertices[mesh.faces][:, :, 0].mean(axis=1)
-    assert found.mad_terrain_deg == pytest.approx(mean_angles(mesh)[centroid_x >= 15].mean())
+    assert metrics.mad_terrain_deg == pytest.approx(mean_angles(mesh)[centroid_x >= 15].mean())
 
 
-def test_all_faces_stand_for_a_class_no_centroid_lies_in():
+def test_evaluate_class_without_centroid_uses_all_faces():
     grid = ground(40, 40)
     bent = on_lattice(grid, lambda x, y: 160 + 0.1 * ((x > 295530) & (y > 5629490)), step=39)
     is_road = np.zeros(grid.shape, bool)
     is_road[0, 0] = True
-    found = figures(bent, grid, np.full(grid.shape, 160.0), is_road)
-    assert found.triangles == 2
-    assert found.mad_road_deg == found.mad_terrain_deg > 0
+    metrics = figures(bent, grid, np.full(grid.shape, 160.0), is_road)
+    assert metrics.triangles == 2
+    assert metrics.mad_road_deg == metrics.mad_terrain_deg > 0
 
 
 # Distance in space
 
 
 def _brute_force(vertices, faces, points):
-    """Nearest of all faces by trimesh's point-to-triangle distance."""
+    """Return the smallest of trimesh's point-to-triangle distances to all faces."""
     corners = vertices[faces]
     return np.array(
         [
@@ -312,27 +313,27 @@ def _brute_force(vertices, faces, points):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("n", [3, 8, 400])
-def test_nearest_is_the_least_of_all_distances(seed, n):
+def test_nearest_equals_brute_force(seed, n):
     rng = np.random.default_rng(seed)
-    vertices, faces = scattered(rng, n, relief=30.0 if seed % 2 else 1.0)
+    vertices, faces = random_surface(rng, n, relief=30.0 if seed % 2 else 1.0)
     points = rng.uniform([-10, -10, -5], [30, 30, 35], (100, 3))
     truth = _brute_force(vertices, faces, points)
-    found = nearest(vertices, faces, points, np.full(len(points), np.inf))
-    np.testing.assert_allclose(found, truth, rtol=1e-9)
+    distances = nearest(vertices, faces, points, np.full(len(points), np.inf))
+    np.testing.assert_allclose(distances, truth, rtol=1e-9)
     np.testing.assert_allclose(nearest(vertices, faces, points, truth * 1.001), truth, rtol=1e-9)
 
 
-def test_distance_in_space_is_the_mean_of_the_class():
+def test_evaluate_nearest_is_mean_of_class():
     grid = ground(14, 12)
     rng = np.random.default_rng(0)
     mesh = on_lattice(grid, lambda x, y: 160 + rng.uniform(0, 2, x.shape))
     truth, is_road = 160 + rng.uniform(0, 5, grid.shape), western_half(grid)
-    found = figures(mesh, grid, truth, is_road, Options(nearest=True))
+    metrics = figures(mesh, grid, truth, is_road, Options(nearest=True))
     points = np.stack([*centres(grid), truth], axis=-1) - mesh.origin
-    assert found.nearest_road_m == pytest.approx(
+    assert metrics.nearest_road_m == pytest.approx(
         _brute_force(mesh.vertices, mesh.faces, points[is_road]).mean()
     )
-    assert found.nearest_terrain_m == pytest.approx(
+    assert metrics.nearest_terrain_m == pytest.approx(
         _brute_force(mesh.vertices, mesh.faces, points[~is_road]).mean()
     )
-    assert found.nearest_road_m < found.l2_road_m
+    assert metrics.nearest_road_m < metrics.l2_road_m
