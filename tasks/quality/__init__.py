@@ -1,1 +1,1 @@
-"""Figures that need no ground truth: support, flags, error estimate."""
+"""Quality of a surface without ground truth: support, flags, error estimate."""

@@ -1,8 +1,9 @@
-"""Say how far a tile's surface can be trusted, without ground truth: figures, flags, a map of its support.
+"""Assess a tile's surface without ground truth: figures, flags and a map of its support.
 
-Road is the raw segmented mask, for on it the surface is used. Two witnesses know the ground there: the scan,
-where the filter kept it, and the terrain model. How far the surface is from the nearer of them is the tile's
-doubt; tiles with the most are worth a look first. A fault in one place shows as a patch of doubted road.
+All figures are over the raw segmented mask, where the surface is used as road. The surface is compared with
+two height sources: the DSM on cells that the filter kept, and the DTM. The distance to the nearer of them is
+the error estimate; tiles with the largest one should be checked first. A local fault appears as a patch of
+road with a large error estimate.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask,
 
 VERSION = 1
 
-AROUND_M = 5.0
-"""Side of the square over which the scan's scatter is taken (m): more than a cell, less than a crown."""
+SCATTER_M = 5.0
+"""Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
 FLAGS = {
     "error-estimate": "error_estimate_m",
     "patch": "suspect_m2",
@@ -34,28 +35,30 @@ FLAGS = {
     "dropped": "dropped_road",
     "weights": "bounded_weights",
 }
-"""Each flag and the figure that raises it when it is above the option of the figure's name."""
+"""Figure of each flag; the flag is raised if the figure exceeds the option with the figure's name."""
 NO_ROAD = "no-road"
-"""The flag of a tile whose mask has no road: nothing else can be told of it."""
+"""The only flag of a tile whose mask has no road."""
 
 
 class Options(base.Options):
-    """What two heights of one ground may differ by, and above what a figure raises its flag."""
+    """Tolerance between two heights of the same ground, and the threshold of each flag."""
 
     agree_m: float = Field(
-        AGREE_M, gt=0, description="heights that differ by more do not tell of one ground (m)"
+        AGREE_M, gt=0, description="largest difference between two heights of the same ground (m)"
     )
     error_estimate_m: float = Field(
-        0.1, gt=0, description="flag error-estimate: mean distance of the surface to its nearer witness (m)"
+        0.1,
+        gt=0,
+        description="flag error-estimate: mean distance of the surface to the nearer of DSM and DTM (m)",
     )
     suspect_m2: float = Field(
-        50.0, gt=0, description="flag patch: largest patch of road doubted by more than agree_m (m2)"
+        50.0, gt=0, description="flag patch: largest patch of road with an error estimate above agree_m (m2)"
     )
     curvature_per_m: float = Field(
         0.2, gt=0, description="flag spike: largest curvature on the road (1/m); a speed hump has less"
     )
     edge_step_m: float = Field(
-        0.15, gt=0, description="flag edge-step: p95 of the step where the road ends (m); above a kerb"
+        0.15, gt=0, description="flag edge-step: p95 of the step at the road's edge (m); higher than a kerb"
     )
     residual_p95_m: float = Field(
         0.5, gt=0, description="flag loose: p95 distance of the kept points to the surface (m)"
@@ -64,7 +67,7 @@ class Options(base.Options):
         0.1, ge=0, le=1, description="flag off-dtm: share of the road more than agree_m off the DTM"
     )
     inferred_road: float = Field(
-        0.05, ge=0, le=1, description="flag inferred: share of the road that no height supports"
+        0.05, ge=0, le=1, description="flag inferred: share of the road without a height in the fit"
     )
     dropped_road: float = Field(
         0.5, ge=0, le=1, description="flag dropped: share of the mask that the filter dropped"
@@ -77,88 +80,96 @@ class Options(base.Options):
 def assess(
     data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
 ) -> Quality:
-    """Measure a surface by what it was made from.
+    """Assess a surface by the data it was fitted to.
 
     Parameters
     ----------
     data : TileData
-        DSM and DTM, m; neither the reference nor its road mask is looked at.
+        DSM and DTM, m; the reference and its road mask are not used.
     road : RoadMask
         The raw mask and the cells beyond the survey.
     clusters : RoadClusters
-        What the filter kept.
+        The road cells that the filter kept.
     surface : Surface
-        What was fitted.
+        The fitted surface.
     options : Options
-        Thresholds.
+        Tolerance and thresholds.
 
     Returns
     -------
     Quality
-        Over the road cells of the core; NaN for what a tile or a surface does not have.
+        Figures over the road cells of the core; NaN where the tile or the surface has no such data.
     """
     window, cell = data.grid.window(data.core), data.core.cell
-    rests_on = support(data, road, clusters, options.agree_m)[window]
-    on_road = road.mask[window] & (rests_on != Support.NONE)
+    classes = support(data, road, clusters, options.agree_m)[window]
+    on_road = road.mask[window] & (classes != Support.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
     off_dsm, off_dtm = height - data.dsm[window], height - data.dtm[window]
-    doubted = error_estimate(off_dsm, off_dtm, data.dsm[window] - data.dtm[window], kept, rests_on, cell)
+    estimate = error_estimate(off_dsm, off_dtm, data.dsm[window] - data.dtm[window], kept, classes, cell)
     residuals, to_dtm = _finite(off_dsm[kept]), _finite(off_dtm[on_road])
     figures = {
         "residual_median_m": _quantile(residuals, 50),
         "residual_nmad_m": nmad(residuals),
         "residual_p95_m": _quantile(np.abs(residuals), 95),
-        "curvature_per_m": _largest(_bends(height, on_road) / cell**2),
+        "curvature_per_m": _largest(_second_differences(height, on_road) / cell**2),
         "edge_step_m": _quantile(_edge_steps(height, on_road), 95),
-        "measured_road": mean(rests_on[on_road] == Support.MEASURED),
-        "dtm_road": mean(rests_on[on_road] == Support.DTM),
-        "inferred_road": mean(rests_on[on_road] == Support.INFERRED),
+        "measured_road": mean(classes[on_road] == Support.MEASURED),
+        "dtm_road": mean(classes[on_road] == Support.DTM),
+        "inferred_road": mean(classes[on_road] == Support.INFERRED),
         "dropped_road": mean(~kept[on_road]),
         "off_dtm_m": _quantile(to_dtm, 50),
         "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
-        "bounded_weights": _bounded(surface),
-        "error_estimate_m": mean(_finite(doubted[on_road])),
-        "suspect_m2": _patch(on_road & (doubted > options.agree_m)) * cell**2,
+        "bounded_weights": _share_at_bound(surface),
+        "error_estimate_m": mean(_finite(estimate[on_road])),
+        "suspect_m2": _largest_patch(on_road & (estimate > options.agree_m)) * cell**2,
     }
     flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
-    return Quality(**figures, flags=tuple(flags if on_road.any() else [NO_ROAD]), support=rests_on)
+    return Quality(**figures, flags=tuple(flags if on_road.any() else [NO_ROAD]), support=classes)
 
 
 def error_estimate(
-    off_dsm: Floats, off_dtm: Floats, above: Floats, kept: Bools, rests_on: NDArray[np.uint8], cell: float
+    off_dsm: Floats,
+    off_dtm: Floats,
+    dsm_above_dtm: Floats,
+    kept: Bools,
+    classes: NDArray[np.uint8],
+    cell: float,
 ) -> Floats:
-    """Return by how much the surface may be wrong in each cell, ``(H, W)``, m: an estimate, no bound.
+    """Return the estimated error of the surface in each cell, ``(H, W)``, m; it is not an upper bound.
 
-    It is the distance to the nearer witness. The DTM is one where it supports the surface; the scan is one
-    where the filter kept it, but never better than it scatters around the cell: a road or a bridge deck
-    is even, a crown is not. Without either it is what a road may rise from where it was known last.
+    It is the distance to the nearer of DTM and DSM. The DTM is used where it supports the surface, the DSM on
+    cells that the filter kept. The distance to the DSM is at least the scatter of the DSM around the cell,
+    which is small on roads and bridge decks and large in tree crowns. Where neither is available, the
+    estimate is `AGREE_M` plus the height a road may gain since the nearest supported cell.
 
     Parameters
     ----------
     off_dsm, off_dtm : (H, W) array
         Surface minus DSM and DTM (m).
-    above : (H, W) array
+    dsm_above_dtm : (H, W) array
         DSM minus DTM (m).
     kept : (H, W) array of bool
-        Cells where the scan counts.
-    rests_on : (H, W) array of uint8
+        Road cells that the filter kept.
+    classes : (H, W) array of uint8
         The cells' `Support`.
     cell : float
         Size of a cell (m).
     """
-    scatter = _scatter(above, kept & np.isfinite(above), 2 * max(1, round(AROUND_M / cell / 2)) + 1)
+    scatter = _scatter(
+        dsm_above_dtm, kept & np.isfinite(dsm_above_dtm), 2 * max(1, round(SCATTER_M / cell / 2)) + 1
+    )
     by_scan = np.where(kept, np.maximum(np.abs(off_dsm), scatter), np.nan)
-    inferred = rests_on == Support.INFERRED
+    inferred = classes == Support.INFERRED
     by_dtm = np.where(inferred, np.nan, np.abs(off_dtm))
     away = scipy.ndimage.distance_transform_edt(inferred) * cell
     return np.where(inferred, AGREE_M + rise(away), np.fmin(by_scan, by_dtm))
 
 
-def _scatter(values: Floats, known: Bools, size: int) -> Floats:
-    """Return the standard deviation of the known values in a square around each cell; 0 without any."""
-    share = np.maximum(scipy.ndimage.uniform_filter(known.astype(np.float64), size), 1e-9)
-    values = np.where(known, values, 0.0)
+def _scatter(values: Floats, valid: Bools, size: int) -> Floats:
+    """Return the standard deviation of the valid values in a square around each cell; 0 if there are none."""
+    share = np.maximum(scipy.ndimage.uniform_filter(valid.astype(np.float64), size), 1e-9)
+    values = np.where(valid, values, 0.0)
     mean, square = (
         scipy.ndimage.uniform_filter(values, size) / share,
         scipy.ndimage.uniform_filter(values**2, size) / share,
@@ -166,32 +177,32 @@ def _scatter(values: Floats, known: Bools, size: int) -> Floats:
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
-def _bends(height: Floats, on_road: Bools) -> Floats:
-    """Return the second differences (m) along rows and columns at road cells between road cells, ``(n,)``."""
-    found = []
-    for z, inside in ((height, on_road), (height.T, on_road.T)):
-        bend = z[2:] - 2 * z[1:-1] + z[:-2]
-        found.append(np.abs(bend[inside[2:] & inside[1:-1] & inside[:-2]]))
-    return _finite(np.concatenate(found))
+def _second_differences(height: Floats, on_road: Bools) -> Floats:
+    """Return absolute second differences along rows and columns of three road cells each, ``(n,)``, m."""
+    parts = []
+    for z, road in ((height, on_road), (height.T, on_road.T)):
+        second_difference = z[2:] - 2 * z[1:-1] + z[:-2]
+        parts.append(np.abs(second_difference[road[2:] & road[1:-1] & road[:-2]]))
+    return _finite(np.concatenate(parts))
 
 
 def _edge_steps(height: Floats, on_road: Bools) -> Floats:
-    """Return by how far the first cell beside the road is off the line of the last two on it, ``(n,)``, m."""
-    found = []
-    for z, inside in ((height, on_road), (height.T, on_road.T)):
-        for ahead, there in ((z, inside), (z[::-1], inside[::-1])):
-            step = ahead[2:] - 2 * ahead[1:-1] + ahead[:-2]
-            found.append(np.abs(step[~there[2:] & there[1:-1] & there[:-2]]))
-    return _finite(np.concatenate(found))
+    """Return the distance of each first cell beside the road to the line of the last two on it, ``(n,)``."""
+    parts = []
+    for z, road in ((height, on_road), (height.T, on_road.T)):
+        for profile, road_profile in ((z, road), (z[::-1], road[::-1])):
+            step = profile[2:] - 2 * profile[1:-1] + profile[:-2]
+            parts.append(np.abs(step[~road_profile[2:] & road_profile[1:-1] & road_profile[:-2]]))
+    return _finite(np.concatenate(parts))
 
 
-def _patch(cells: Bools) -> int:
-    """Return how many cells the largest patch of neighbours has."""
+def _largest_patch(cells: Bools) -> int:
+    """Return the number of cells in the largest connected patch."""
     patches, _ = scipy.ndimage.label(cells)
     return int(np.bincount(patches[cells], minlength=1).max())
 
 
-def _bounded(surface: Surface) -> float:
+def _share_at_bound(surface: Surface) -> float:
     if not isinstance(surface, NurbsSurface):
         return float("nan")
     return mean(np.abs(np.log(surface.W)) > MAX_LOG_WEIGHT * (1 - 1e-9))

@@ -1,8 +1,8 @@
-"""What stands behind the fitted surface, cell by cell: a measurement, the terrain model, or neither.
+"""Support of the fitted surface in each cell: a measurement, the terrain model, or neither.
 
-The fit draws road cells that the filter kept to the DSM, all others to the DTM; a cell without that height
-leaves the loss, and the surface goes on through it. Where something hides a road, the DTM stands in; whether
-it is sound there, the road that can be seen beside tells.
+The fit uses the DSM on road cells that the filter kept and the DTM on all others; a cell without that height
+is left out of the loss, and the surface is extrapolated across it. Where an object hides the road, the DTM is
+used if it agrees with the visible road beside (`tasks.roads.dtm_validity`).
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 
 class Support(IntEnum):
-    """What the surface's height in a cell rests on."""
+    """Source of the surface's height in a cell."""
 
     NONE = 0
-    """Beyond the survey; there is no mesh."""
+    """Beyond the survey, where there is no mesh."""
     MEASURED = 1
-    """The scan saw the ground: a road cell that the filter kept, or a cell where DSM and DTM agree."""
+    """The DSM shows the ground: a road cell that the filter kept, or a cell where DSM and DTM agree."""
     DTM = 2
-    """Something hides the ground, and the terrain model tells its height."""
+    """An object hides the ground, and the height comes from the DTM."""
     INFERRED = 3
-    """No height entered the fit: the surface goes on from the cells around."""
+    """No height entered the fit; the surface is extrapolated from the cells around."""
 
 
 def support(
     data: TileData, road: RoadMask, clusters: RoadClusters, agree_m: float = AGREE_M
 ) -> NDArray[np.uint8]:
-    """Return the `Support` of every cell, ``(H, W)``, in a fit to the DSM on roads and the DTM elsewhere.
+    """Return the `Support` of each cell, ``(H, W)``, for a fit to the DSM on roads and the DTM elsewhere.
 
     Parameters
     ----------
@@ -41,19 +41,19 @@ def support(
     road : RoadMask
         Gives the cells beyond the survey.
     clusters : RoadClusters
-        The road cells that count by their DSM, and those whose DTM does not count.
+        The road cells fitted to their DSM, and the cells with an invalid DTM.
     agree_m : float
-        Greatest difference of a DSM and a DTM that saw the same ground (m).
+        Largest difference between DSM and DTM of the same ground (m).
     """
-    modelled = np.isfinite(without_invalid_dtm(data, clusters).dtm)
-    agreed = modelled & (np.abs(data.dsm - data.dtm) <= agree_m)
-    found = np.where(modelled & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
-    found[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED
-    found[road.outside] = Support.NONE
-    return found
+    has_dtm = np.isfinite(without_invalid_dtm(data, clusters).dtm)
+    agreed = has_dtm & (np.abs(data.dsm - data.dtm) <= agree_m)
+    classes = np.where(has_dtm & ~clusters.mask, Support.DTM, Support.INFERRED).astype(np.uint8)
+    classes[np.where(clusters.mask, np.isfinite(data.dsm), agreed)] = Support.MEASURED
+    classes[road.outside] = Support.NONE
+    return classes
 
 
-def of_faces(found: NDArray[np.uint8], road: RoadMask, mesh: Mesh) -> NDArray[np.uint8]:
-    """Return the `Support` under the centroid of each face, ``(F,)``, from that of the core's cells."""
+def of_faces(classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh) -> NDArray[np.uint8]:
+    """Return the `Support` of the core cell under the centroid of each face, ``(F,)``."""
     x, y = (mesh.vertices[:, axis][mesh.faces].mean(axis=1) + mesh.origin[axis] for axis in (0, 1))
-    return np.asarray(found[road.core.cells(x, y)])
+    return np.asarray(classes[road.core.cells(x, y)])

@@ -1,4 +1,4 @@
-"""A surface with made faults tells of them; one without tells of none."""
+"""Surfaces with deliberate faults raise their flags; surfaces without faults raise none."""
 
 from dataclasses import fields, replace
 
@@ -24,8 +24,8 @@ FIT = nurbs.Options(control_points=(18, 16), weights="unit")
 FLOATS = [field.name for field in fields(Quality) if field.name not in ("flags", "support")]
 
 
-class Shape:
-    """A surface that is what it is told."""
+class GivenHeights:
+    """A surface with given heights."""
 
     bounds = GRID.hull
 
@@ -40,128 +40,128 @@ def tile(dsm=None, dtm=None) -> TileData:
     return TileData("made", GRID, GRID, TRUTH + NOISE if dsm is None else dsm, TRUTH if dtm is None else dtm)
 
 
-def told(data, surface, road=STREET, kept=None, dtm_invalid=None) -> Quality:
+def assessed(data, surface, road=STREET, kept=None, dtm_invalid=None) -> Quality:
     clusters = RoadClusters(GRID, (road if kept is None else kept).astype(np.int32), dtm_invalid)
     if surface is None:
         surface = nurbs.fit(data, clusters, FIT)
     return assess(data, RoadMask(GRID, GRID, road, NOWHERE), clusters, surface, Options())
 
 
-def test_a_good_surface_raises_no_flag():
-    found = told(tile(), None)
-    assert found.flags == ()
-    assert found.error_estimate_m < 0.06
-    assert found.residual_nmad_m == pytest.approx(0.05, abs=0.02)
-    assert (found.measured_road, found.inferred_road, found.dropped_road) == (1, 0, 0)
+def test_assess_good_surface_raises_no_flag():
+    quality = assessed(tile(), None)
+    assert quality.flags == ()
+    assert quality.error_estimate_m < 0.06
+    assert quality.residual_nmad_m == pytest.approx(0.05, abs=0.02)
+    assert (quality.measured_road, quality.inferred_road, quality.dropped_road) == (1, 0, 0)
 
 
-def test_figures_are_those_of_a_surface_known_by_hand():
+def test_assess_figures_equal_hand_computed_values():
     step = np.where(STREET, 0.1, 0.4)
-    found = told(tile(dsm=TRUTH, dtm=TRUTH - 1), Shape(TRUTH + step))
-    assert found.residual_median_m == pytest.approx(0.1)
-    assert found.residual_nmad_m == pytest.approx(0, abs=1e-12)
-    assert found.residual_p95_m == pytest.approx(0.1)
-    assert found.edge_step_m == pytest.approx(0.3, abs=0.01)
-    assert found.off_dtm_m == pytest.approx(1.1)
-    assert found.off_dtm_road == 1
-    # The scan is the nearer witness, and even.
-    assert found.error_estimate_m == pytest.approx(0.1)
-    assert found.curvature_per_m == pytest.approx(0, abs=0.01)
+    quality = assessed(tile(dsm=TRUTH, dtm=TRUTH - 1), GivenHeights(TRUTH + step))
+    assert quality.residual_median_m == pytest.approx(0.1)
+    assert quality.residual_nmad_m == pytest.approx(0, abs=1e-12)
+    assert quality.residual_p95_m == pytest.approx(0.1)
+    assert quality.edge_step_m == pytest.approx(0.3, abs=0.01)
+    assert quality.off_dtm_m == pytest.approx(1.1)
+    assert quality.off_dtm_road == 1
+    # The DSM is nearer than the DTM, and it has no scatter.
+    assert quality.error_estimate_m == pytest.approx(0.1)
+    assert quality.curvature_per_m == pytest.approx(0, abs=0.01)
 
 
-def test_a_pole_is_a_spike():
+def test_assess_pole_raises_spike():
     pole = TRUTH.copy()
     pole[52, 60] += 2
-    found = told(tile(), Shape(pole))
-    assert found.flags == ("spike",)
-    assert found.curvature_per_m == pytest.approx(4, abs=0.02)
+    quality = assessed(tile(), GivenHeights(pole))
+    assert quality.flags == ("spike",)
+    assert quality.curvature_per_m == pytest.approx(4, abs=0.02)
 
 
-def test_a_hump_in_one_place_is_a_patch():
+def test_assess_local_hump_raises_patch():
     hump = STREET & (np.hypot(ROW - 55, COL - 60) < 6)
-    found = told(tile(), Shape(TRUTH + 0.8 * hump))
-    assert "patch" in found.flags
-    assert found.suspect_m2 == hump.sum()
+    quality = assessed(tile(), GivenHeights(TRUTH + 0.8 * hump))
+    assert "patch" in quality.flags
+    assert quality.suspect_m2 == hump.sum()
 
 
-def test_curvature_does_not_depend_on_the_size_of_cells():
+def test_assess_curvature_is_independent_of_cell_size():
     fine = Grid(GRID.crs, GRID.west, GRID.north, 0.5, 120, 100)
     bowl = 0.05 * ((COL * 0.5) ** 2 + (ROW * 0.5) ** 2)
     mask = np.ones(GRID.shape, bool)
-    found = assess(
+    quality = assess(
         TileData("made", fine, fine, bowl, bowl), RoadMask(fine, fine, mask, NOWHERE),
-        RoadClusters(fine, mask.astype(np.int32)), Shape(bowl), Options(),
+        RoadClusters(fine, mask.astype(np.int32)), GivenHeights(bowl), Options(),
     )  # fmt: skip
-    assert found.curvature_per_m == pytest.approx(0.1)
+    assert quality.curvature_per_m == pytest.approx(0.1)
 
 
-def test_a_filter_that_climbs_a_crown_is_doubted():
+def test_assess_kept_crown_raises_flags():
     data = tile(dsm=TRUTH + NOISE + np.where(CROWN, DOME, 0))
-    climbed, clean = told(data, None), told(data, None, kept=STREET & ~CROWN)
+    climbed, clean = assessed(data, None), assessed(data, None, kept=STREET & ~CROWN)
     assert {"error-estimate", "patch", "loose", "off-dtm"} <= set(climbed.flags)
     assert climbed.suspect_m2 == pytest.approx(CROWN.sum(), rel=0.5)
     assert clean.flags == ()
     assert clean.dtm_road == pytest.approx(CROWN.sum() / STREET.sum())
 
 
-def test_a_bridge_deck_is_not_doubted():
+def test_assess_bridge_deck_has_small_error_estimate():
     deck = STREET & (COL > 40) & (COL < 90)
-    found = told(tile(dsm=TRUTH + 6 * deck + NOISE), Shape(TRUTH + 6 * deck))
-    assert "off-dtm" in found.flags
-    # But for its ends, where the scan is not even.
-    assert found.error_estimate_m < 0.3
+    quality = assessed(tile(dsm=TRUTH + 6 * deck + NOISE), GivenHeights(TRUTH + 6 * deck))
+    assert "off-dtm" in quality.flags
+    # Not 0, because the DSM has scatter at the ends of the deck.
+    assert quality.error_estimate_m < 0.3
 
 
-def test_missing_road_data_is_inferred():
+def test_assess_missing_road_data_is_inferred():
     gap = STREET & (COL > 40) & (COL < 80)
-    found = told(
+    quality = assessed(
         tile(dsm=np.where(gap, np.nan, TRUTH), dtm=np.where(gap, np.nan, TRUTH)), None, kept=STREET & ~gap
     )
-    assert {"inferred", "error-estimate"} <= set(found.flags)
-    assert found.inferred_road == pytest.approx(gap.sum() / STREET.sum())
-    np.testing.assert_array_equal(found.support == Support.INFERRED, gap)
-    assert told(tile(), None, kept=STREET & (COL < 40)).flags == ("dropped",)
+    assert {"inferred", "error-estimate"} <= set(quality.flags)
+    assert quality.inferred_road == pytest.approx(gap.sum() / STREET.sum())
+    np.testing.assert_array_equal(quality.support == Support.INFERRED, gap)
+    assert assessed(tile(), None, kept=STREET & (COL < 40)).flags == ("dropped",)
 
 
-def test_doubt_grows_with_what_is_inferred():
+def test_assess_error_estimate_grows_with_inferred_cells():
     data = tile(dsm=np.where(CROWN, TRUTH + DOME, TRUTH + NOISE))
-    believed = told(data, None, kept=STREET & ~CROWN)
-    inferred = told(data, None, kept=STREET & ~CROWN, dtm_invalid=CROWN)
-    assert inferred.error_estimate_m > believed.error_estimate_m + 0.3 * CROWN.sum() / STREET.sum() - 0.01
+    valid = assessed(data, None, kept=STREET & ~CROWN)
+    inferred = assessed(data, None, kept=STREET & ~CROWN, dtm_invalid=CROWN)
+    assert inferred.error_estimate_m > valid.error_estimate_m + 0.3 * CROWN.sum() / STREET.sum() - 0.01
 
 
-def test_weights_at_a_bound_are_counted():
+def test_assess_weights_at_bound_are_counted():
     surface = nurbs.fit(tile(), RoadClusters(GRID, STREET.astype(np.int32)), FIT)
-    assert told(tile(), surface).bounded_weights == 0
+    assert assessed(tile(), surface).bounded_weights == 0
     weights = np.ones_like(surface.W)
     weights[:8], weights[0, 0] = 10, 0.1
-    found: NurbsSurface = replace(surface, A=surface.A * weights, W=weights)
-    assert told(tile(), found).bounded_weights == pytest.approx(0.5)
-    assert "weights" in told(tile(), found).flags
+    bounded: NurbsSurface = replace(surface, A=surface.A * weights, W=weights)
+    assert assessed(tile(), bounded).bounded_weights == pytest.approx(0.5)
+    assert "weights" in assessed(tile(), bounded).flags
 
 
-def test_other_surfaces_tell_what_they_can():
+def test_assess_plane_has_all_figures_but_weights():
     flat = plane.fit(tile(), RoadClusters(GRID, STREET.astype(np.int32)), plane.Options())
-    found = told(tile(), flat)
-    assert np.isnan(found.bounded_weights)
-    assert "error-estimate" in found.flags
-    assert np.isfinite([getattr(found, name) for name in FLOATS if name != "bounded_weights"]).all()
+    quality = assessed(tile(), flat)
+    assert np.isnan(quality.bounded_weights)
+    assert "error-estimate" in quality.flags
+    assert np.isfinite([getattr(quality, name) for name in FLOATS if name != "bounded_weights"]).all()
 
 
-def test_nothing_to_tell_of_is_no_fault():
-    empty = told(tile(), Shape(TRUTH), road=NOWHERE)
-    assert empty.flags == (NO_ROAD,)
-    assert np.isnan([getattr(empty, name) for name in FLOATS if name != "suspect_m2"]).all()
-    unknown = np.full(GRID.shape, np.nan)
-    blind = told(tile(unknown, unknown), Shape(TRUTH), kept=NOWHERE)
-    assert {"inferred", "error-estimate", "dropped"} <= set(blind.flags)
-    assert told(tile(), Shape(unknown)).error_estimate_m != 0
+def test_assess_without_road_or_data():
+    no_road = assessed(tile(), GivenHeights(TRUTH), road=NOWHERE)
+    assert no_road.flags == (NO_ROAD,)
+    assert np.isnan([getattr(no_road, name) for name in FLOATS if name != "suspect_m2"]).all()
+    no_heights = np.full(GRID.shape, np.nan)
+    no_data = assessed(tile(no_heights, no_heights), GivenHeights(TRUTH), kept=NOWHERE)
+    assert {"inferred", "error-estimate", "dropped"} <= set(no_data.flags)
+    assert assessed(tile(), GivenHeights(no_heights)).error_estimate_m != 0
 
 
-def test_neither_truth_nor_the_land_around_matters():
+def test_assess_ignores_reference():
     data = tile()
-    found = told(data, None)
-    again = told(replace(data, reference=TRUTH + 9, reference_road=~STREET), None)
-    assert [getattr(found, n) for n in FLOATS if n != "bounded_weights"] == [
-        getattr(again, n) for n in FLOATS if n != "bounded_weights"
+    quality = assessed(data, None)
+    with_reference = assessed(replace(data, reference=TRUTH + 9, reference_road=~STREET), None)
+    assert [getattr(quality, n) for n in FLOATS if n != "bounded_weights"] == [
+        getattr(with_reference, n) for n in FLOATS if n != "bounded_weights"
     ]

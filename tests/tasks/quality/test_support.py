@@ -1,4 +1,4 @@
-"""What the surface rests on, and when a DTM under a road is believed: against made truth."""
+"""Support of the surface and validity of the DTM under a road, on synthetic data with known result."""
 
 import numpy as np
 import pytest
@@ -29,26 +29,26 @@ def kept(mask, dtm_invalid=None) -> RoadClusters:
     return RoadClusters(GRID, mask.astype(np.int32), dtm_invalid)
 
 
-def test_every_cell_rests_on_what_the_fit_takes_there():
+def test_support_equals_source_used_by_fit():
     crown = STREET & (COL > 20) & (COL < 30)
     house, hole, sea = ROW < 8, (ROW > 40) & (COL < 10), COL > 55
     data = tile()
     data.dsm[crown | house] += 6
     data.dtm[hole] = np.nan
     data.dsm[:, 12], data.dtm[:, 13] = np.nan, np.nan
-    found = support(data, street(outside=sea), kept(STREET & ~crown))
+    result = support(data, street(outside=sea), kept(STREET & ~crown))
     truth = np.full(GRID.shape, Support.MEASURED)
     truth[crown | house] = Support.DTM
     truth[hole] = Support.INFERRED
-    # A kept cell without DSM has no height, whatever the DTM says; any other without DSM has the DTM's.
+    # A kept cell without DSM has no height in the fit; any other cell without DSM has the DTM's.
     truth[:, 12] = np.where(STREET[:, 12], Support.INFERRED, truth[:, 12])
     truth[~STREET & ~hole & (COL == 12)] = Support.DTM
     truth[:, 13] = np.where(STREET[:, 13], Support.MEASURED, Support.INFERRED)
     truth[sea] = Support.NONE
-    np.testing.assert_array_equal(found, truth)
+    np.testing.assert_array_equal(result, truth)
 
 
-def test_a_dtm_that_is_not_sound_supports_nothing():
+def test_support_invalid_dtm_is_inferred():
     crown = STREET & (COL > 20) & (COL < 30)
     data, clusters = tile(dsm=RAMP + 6 * crown), kept(STREET & ~crown, crown)
     assert (support(data, street(), clusters)[crown] == Support.INFERRED).all()
@@ -56,64 +56,64 @@ def test_a_dtm_that_is_not_sound_supports_nothing():
     assert without_invalid_dtm(data, kept(STREET)) is data
 
 
-def test_faces_take_the_cell_under_their_centroid():
-    found = np.where(COL < 30, Support.MEASURED, Support.DTM).astype(np.uint8)
+def test_of_faces_uses_cell_under_centroid():
+    classes = np.where(COL < 30, Support.MEASURED, Support.DTM).astype(np.uint8)
     west, east = [(28.5, 10, 0), (29.5, 10, 0), (28.5, 12, 0)], [(30.5, 10, 0), (33, 10, 0), (30.5, 12, 0)]
     vertices = np.array(west + east, float)
     mesh = Mesh(
         GRID.crs, (*GRID.origin, 0.0), vertices, np.arange(6, dtype=np.int32).reshape(2, 3), np.ones(2, bool)
     )
-    np.testing.assert_array_equal(of_faces(found, street(), mesh), [Support.MEASURED, Support.DTM])
+    np.testing.assert_array_equal(of_faces(classes, street(), mesh), [Support.MEASURED, Support.DTM])
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-500, 5000))
-def test_a_plane_goes_on_as_it_is(by_row, by_col, level):
+def test_extrapolated_plane_reproduces_plane(by_row, by_col, level):
     plane = level + by_row * ROW + by_col * COL
-    known = STREET & ((COL < 22) | (COL > 30))
-    found, scatter = extrapolated_plane(np.where(known, plane, 1e4), known, 1.0)
-    told = np.isfinite(found)
-    np.testing.assert_allclose(found[told], plane[told], atol=1e-5)
-    assert scatter[told].max() < 1e-3
+    ground = STREET & ((COL < 22) | (COL > 30))
+    extrapolated, scatter = extrapolated_plane(np.where(ground, plane, 1e4), ground, 1.0)
+    determined = np.isfinite(extrapolated)
+    np.testing.assert_allclose(extrapolated[determined], plane[determined], atol=1e-5)
+    assert scatter[determined].max() < 1e-3
 
 
-def test_nothing_goes_on_from_a_line():
-    found, _ = extrapolated_plane(RAMP, ROW == 25, 1.0)
-    assert np.isnan(found).all()
-    found, _ = extrapolated_plane(RAMP, (ROW == 25) | (ROW == 26), 1.0)
-    np.testing.assert_allclose(found[30], RAMP[30], atol=1e-6)
+def test_extrapolated_plane_cells_on_line_is_nan():
+    extrapolated, _ = extrapolated_plane(RAMP, ROW == 25, 1.0)
+    assert np.isnan(extrapolated).all()
+    extrapolated, _ = extrapolated_plane(RAMP, (ROW == 25) | (ROW == 26), 1.0)
+    np.testing.assert_allclose(extrapolated[30], RAMP[30], atol=1e-6)
 
 
-def test_continuation_is_a_weighted_plane_fit():
+def test_extrapolated_plane_equals_weighted_fit():
     rng = np.random.default_rng(1)
-    heights, known = rng.normal(0, 1, GRID.shape), rng.random(GRID.shape) < 0.3
-    found, _ = extrapolated_plane(heights, known, 1.0)
+    heights, ground = rng.normal(0, 1, GRID.shape), rng.random(GRID.shape) < 0.3
+    extrapolated, _ = extrapolated_plane(heights, ground, 1.0)
     r, c = 20, 31
-    near = known & (np.abs(ROW - r) <= 15) & (np.abs(COL - c) <= 15)
+    near = ground & (np.abs(ROW - r) <= 15) & (np.abs(COL - c) <= 15)
     x = np.column_stack([np.ones(near.sum()), ROW[near] - r, COL[near] - c])
     root = np.exp(-0.25 * (x[:, 1] ** 2 + x[:, 2] ** 2) / 25)
     oracle = np.linalg.lstsq(x * root[:, None], heights[near] * root, rcond=None)[0][0]
-    assert found[r, c] == pytest.approx(oracle, abs=1e-9)
+    assert extrapolated[r, c] == pytest.approx(oracle, abs=1e-9)
 
 
-@pytest.mark.parametrize(("off", "believed"), [(0.0, True), (0.2, True), (1.5, False), (-1.5, False)])
-def test_the_road_beside_a_gap_judges_the_dtm_in_it(off, believed):
+@pytest.mark.parametrize(("offset", "valid"), [(0.0, True), (0.2, True), (1.5, False), (-1.5, False)])
+def test_invalid_dtm_gap_is_compared_with_road_beside(offset, valid):
     gap = STREET & (COL > 25) & (COL < 35)
     rng = np.random.default_rng(0)
-    data = tile(dsm=RAMP + 0.05 * rng.standard_normal(GRID.shape), dtm=RAMP + off * gap)
-    found = invalid_dtm(data, street(), STREET & ~gap)
-    assert not found[~gap].any()
-    assert found[gap].mean() == (0 if believed else 1)
+    data = tile(dsm=RAMP + 0.05 * rng.standard_normal(GRID.shape), dtm=RAMP + offset * gap)
+    invalid = invalid_dtm(data, street(), STREET & ~gap)
+    assert not invalid[~gap].any()
+    assert invalid[gap].mean() == (0 if valid else 1)
 
 
-def test_far_from_any_road_that_is_seen_the_dtm_is_believed():
-    seen = STREET & (COL < 10)
-    found = invalid_dtm(tile(dtm=RAMP + 9.0), street(), seen)
-    assert found[STREET & (COL > 10) & (COL < 20)].all()
-    assert not found[COL >= 9 + REACH_M + 1].any()
+def test_invalid_dtm_far_from_visible_road_is_valid():
+    visible = STREET & (COL < 10)
+    invalid = invalid_dtm(tile(dtm=RAMP + 9.0), street(), visible)
+    assert invalid[STREET & (COL > 10) & (COL < 20)].all()
+    assert not invalid[COL >= 9 + REACH_M + 1].any()
     assert not invalid_dtm(tile(dtm=RAMP + 9.0), street(), NOWHERE).any()
 
 
-def test_under_a_crown_on_a_bridge_the_deck_goes_on():
+def test_invalid_dtm_under_crown_on_bridge():
     deck, crown = STREET & (COL > 10) & (COL < 50), STREET & (COL > 27) & (COL < 34)
-    found = invalid_dtm(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
-    np.testing.assert_array_equal(found, crown)
+    invalid = invalid_dtm(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
+    np.testing.assert_array_equal(invalid, crown)
