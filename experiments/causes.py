@@ -1,8 +1,8 @@
-"""Why some claims of the paper do not hold on the benchmark: what another start or loss would have given.
+"""Why some claims of the paper do not hold on the benchmark: results with another filter, start or loss.
 
-Over 24 tiles of the benchmark: the surface is fitted to the roads that ECSRC keeps with two thresholds, to
-all segmented cells, and to those within 0.3 m of the truth (no filter could know them); from the DTM or from
-level ground; under the paper's L1 loss by Adam, or under a squared loss in closed form.
+On 24 tiles of the benchmark the surface is fitted to the roads that ECSRC keeps with two thresholds, to all
+segmented cells, and to the cells within 0.3 m of the truth (a perfect filter); starting from the DTM or from
+level ground; with the paper's L1 loss by Adam, or with a squared loss in closed form.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
     print(f"{TILES} tiles of the benchmark, seed {SEED}; classes by the segmented mask; means over tiles")
     print(table.round(3).to_string())
     if RESULTS.exists():
-        print("\nroad L2 against the full pipeline, by how spoiled the road is (quarters of RGT's road L2)")
+        print("\nroad L2 relative to the full pipeline, by quarters of RGT's road L2 (share of spoiled road)")
         print(by_spoilage(pd.read_parquet(RESULTS)).round(3).to_string())
 
 
@@ -62,28 +62,28 @@ def experiment(tile, store: ArtefactStore) -> list[dict[str, float | str]]:
         "perfect filter": replace(clusters, labels=sound.astype(np.int32)),
     }
     spoiled = np.abs(data.dsm - data.reference) > SOUND_M
-    ways = {"L1 from the DTM": fit.fit, "L1 from level ground": level_start, "squared": squared}
+    fits = {"L1 from the DTM": fit.fit, "L1 from level ground": level_start, "squared": squared}
     rows: list[dict[str, float | str]] = []
-    for way, function in ways.items():
+    for fit_name, function in fits.items():
         for name, kept in roads.items():
             surface = function(data, kept, options["fit"])
             mesh = sample.sample(surface, road, kept, options["sample"])
-            found = evaluate.evaluate(mesh, data, road, options["evaluate"])
+            metrics = evaluate.evaluate(mesh, data, road, options["evaluate"])
             rows.append(
                 {
-                    "fit": way,
+                    "fit": fit_name,
                     "roads": name,
                     "spoiled": spoiled[kept.mask].mean(),
-                    "road L2 (m)": found.l2_road_m,
-                    "road MAD (deg)": found.mad_road_deg,
-                    "terrain L2 (m)": found.l2_terrain_m,
+                    "road L2 (m)": metrics.l2_road_m,
+                    "road MAD (deg)": metrics.mad_road_deg,
+                    "terrain L2 (m)": metrics.l2_terrain_m,
                 }
             )
     return rows
 
 
 def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
-    """Fit as the pipeline does, but from the tile's mean height."""
+    """Fit like the pipeline, but start from the tile's mean height."""
     space = fit.space_of(data, options)
     heights, datum = start_heights(data, clusters.mask, space, options.terrain)
     loss = fit.objective_of(data, clusters.mask, space, datum, options)
@@ -96,7 +96,7 @@ def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) ->
 
 
 def squared(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
-    """Fit by separable least squares, without regulariser, with unit weights."""
+    """Fit by separable least squares with unit weights and without regulariser."""
     space = fit.space_of(data, options)
     rows, cols = data.grid.shape
     along_u = basis_matrix(space[0], space[2][0], np.linspace(0, 1, cols))[0]
@@ -121,8 +121,8 @@ def by_spoilage(metrics: pd.DataFrame) -> pd.DataFrame:
         road = part.pivot_table(index="tile_id", columns="variant", values="l2_road_m")
         quarter = pd.qcut(road.rgt, 4, labels=["least", "less", "more", "most"])
         means = road.groupby(quarter, observed=True).mean()
-        shown = means[["wo_ecsrc", "degree_2", "grid_55"]]
-        parts[classes] = shown.div(means.flexroad, axis=0) - 1
+        columns = means[["wo_ecsrc", "degree_2", "grid_55"]]
+        parts[classes] = columns.div(means.flexroad, axis=0) - 1
     return pd.concat(parts, names=["classes", "spoiled"])
 
 

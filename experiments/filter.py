@@ -1,11 +1,11 @@
-"""The filters beside each other: what they keep of each kind of cell, and what the fit makes of it.
+"""Compare the filters: the share of each kind of cell that they keep, and the surfaces fitted to the kept cells.
 
-``PYTHONPATH=. python experiments/filter.py 24`` for docs/filter.md; 2 tiles of the benchmark without a
-number; with a second word, the file of that page's figure is drawn instead. The default options of
-`tasks.filter.planar` were chosen on seeds 5 to 7; here is seed 1. With FLEXROAD_REAL_DATA two real towns
-follow, with their canopies laid over the surface model.
+``PYTHONPATH=. python experiments/filter.py 24`` gives the tables of docs/filter.md; without a number 2 tiles
+of the benchmark are used. A second argument is a path: the figure of that page is drawn there instead. The
+default options of `tasks.filter.planar` were chosen on seeds 5 to 7; seed 1 is used here. If
+FLEXROAD_REAL_DATA is set, two real towns follow, with their canopies added to the DSM.
 
-A cell is sound if the surface model shows the ground, with noise, or is within `SOUND_M` of it.
+A cell is sound if the DSM shows the ground, with noise, or is within `SOUND_M` of it.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
 
 TILES, SEED = 2, 1
 HALO_M = 50
-"""As in production; only the core counts."""
+"""Halo, as in production (m); only the core is scored."""
 SOUND_M = 0.15
 SPOILERS = (
     Kind.PARKED_CAR, Kind.MOVING_CAR, Kind.CROWN, Kind.BUILDING,
     Kind.PLANTS, Kind.RAIL, Kind.WIRE, Kind.MIXED,
 )  # fmt: skip
 NOISE_M, OFFSET_M, SCAR_M, SCAR_SHARE_M2 = 0.1, 0.5, 0.5, 2500
-"""Of a worse terrain model: white noise, an offset, the depth of a scar, the area that has one scar."""
+"""Degraded DTM: white noise (m), offset (m), depth of a scar (m), area per scar (m2)."""
 DECK_M, BEYOND = 0.5, 3
-"""A deck is so high over the terrain model; so many cells beyond it are interpolated or unknown."""
+"""Smallest height of a deck above the DTM (m); number of cells beside it that are also changed."""
 LEVEL_M, STEEP, LARGE = 0.3, 0.3, 60
-"""Of the filter of two lines: cells this level; or high, not steep, in patches of so many."""
+"""Filter of two lines: height difference to the DTM (m), largest slope, smallest patch (cells)."""
 PLACES = {
     "Barbican": ("London_BNG", "dsm_barb*.tif", "dem_barb*.tif", "cdsm_barb*.tif", "landcover*.tif"),
     "Gothenburg": ("Goteborg", "DSM_KRbig.tif", "DEM_KRbig.tif", "CDSM_KRbig.asc", "landcover.tif"),
@@ -59,7 +59,7 @@ Filter = Callable[[TileData, RoadMask], RoadClusters]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A tile of which all is known."""
+    """A tile with its road mask and the true kind of each cell."""
 
     data: TileData
     road: RoadMask
@@ -71,7 +71,7 @@ class Case:
 
 
 def two_lines(data: TileData, road: RoadMask) -> RoadClusters:
-    """Near the DTM, or high but flat over 60 cells."""
+    """Keep cells near the DTM, and higher cells that are not steep in patches of more than 60 cells."""
     points, up = road.mask & np.isfinite(data.dsm), data.dsm - data.dtm
     patches, _ = label(points & (up > LEVEL_M) & (np.hypot(*np.gradient(data.dsm)) < STEEP), np.ones((3, 3)))
     large = np.bincount(patches.ravel()) > LARGE
@@ -79,15 +79,15 @@ def two_lines(data: TileData, road: RoadMask) -> RoadClusters:
     return RoadClusters(data.grid, (points & ((np.abs(up) <= LEVEL_M) | large[patches])).astype(np.int32))
 
 
-def of(module, options) -> Filter:
+def as_filter(module, options) -> Filter:
     return lambda data, road: module.ecsrc(data, road, options)
 
 
 FILTERS: dict[str, Filter] = {
-    "off": of(ecsrc, ecsrc.Options(method="off")),
-    "paper": of(ecsrc, ecsrc.Options(keep_largest=None)),
+    "off": as_filter(ecsrc, ecsrc.Options(method="off")),
+    "paper": as_filter(ecsrc, ecsrc.Options(keep_largest=None)),
     "two lines": two_lines,
-    "planar": of(planar, planar.Options()),
+    "planar": as_filter(planar, planar.Options()),
 }
 
 
@@ -99,21 +99,25 @@ def main() -> None:
         return
     for function in FILTERS.values():
         function(cases[0].data, cases[0].road)
-    print(f"{tiles} tiles of the benchmark, seed {SEED}; cells kept (%), by what the surface model shows")
-    for worse in WORSE:
+    print(f"{tiles} tiles of the benchmark, seed {SEED}; cells kept (%), by kind of cell")
+    for degradation in DEGRADATIONS:
         show(
-            worse,
-            *(kept(degraded(case, worse, i), f) for f in FILTERS.values() for i, case in enumerate(cases)),
+            degradation,
+            *(
+                kept(degraded(case, degradation, i), f)
+                for f in FILTERS.values()
+                for i, case in enumerate(cases)
+            ),
         )
     print("\nroads fitted with unit weights and with the paper's; L2 and RMSE (m), MAD (degrees)")
-    for worse in ("as given", "noise and scars"):
-        fitted_table(worse, [degraded(case, worse, i) for i, case in enumerate(cases)])
+    for degradation in ("as given", "noise and scars"):
+        fitted_table(degradation, [degraded(case, degradation, i) for i, case in enumerate(cases)])
     if folder := os.environ.get("FLEXROAD_REAL_DATA"):
         real(Path(folder) / "umep")
 
 
 def show(name: str, *rows: pd.Series) -> None:
-    """Print one line a filter: the rows are its cases, one filter after the other."""
+    """Print one line per filter; the rows are the cases of one filter after the other."""
     each = len(rows) // len(FILTERS)
     sums = {f: sum(rows[i * each : (i + 1) * each]) for i, f in enumerate(FILTERS)}
     table = pd.DataFrame({f: 100 * row.xs("kept") / row.xs("all") for f, row in sums.items()}).T
@@ -125,19 +129,19 @@ def show(name: str, *rows: pd.Series) -> None:
 
 
 def kept(case: Case, function: Filter) -> pd.Series:
-    """Return how many cells of each kind there are and are kept; under precision, of those kept the sound."""
+    """Return the numbers of kept and of all cells by kind; precision is sound cells among the kept ones."""
     start = time.process_time()
     mask = function(case.data, case.road).mask[case.core]
     ms = 1e3 * (time.process_time() - start)
     kind, points = case.kind[case.core], (case.road.mask & np.isfinite(case.data.dsm))[case.core]
     off = np.abs(case.data.dsm - case.data.reference)[case.core]
     sound = points & (np.isin(kind, BARE) | (off <= SOUND_M))
-    found = {"precision": (np.sum(mask & sound), np.sum(mask))}
-    found |= {"recall": (np.sum(mask & sound), np.sum(sound))}
+    counts = {"precision": (np.sum(mask & sound), np.sum(mask))}
+    counts |= {"recall": (np.sum(mask & sound), np.sum(sound))}
     parts = {"decks": points & (kind == Kind.DECK)}
     parts |= {k.name.lower().replace("_", " "): points & (kind == k) & (off > SOUND_M) for k in SPOILERS}
-    found |= {name: (np.sum(mask & part), np.sum(part)) for name, part in parts.items()}
-    table = pd.DataFrame({**found, "ms": (ms, 1)}, index=["kept", "all"])
+    counts |= {name: (np.sum(mask & part), np.sum(part)) for name, part in parts.items()}
+    table = pd.DataFrame({**counts, "ms": (ms, 1)}, index=["kept", "all"])
     return table.stack()
 
 
@@ -159,24 +163,24 @@ def fitted(case: Case, function: Filter, options: nurbs.Options) -> dict[str, fl
     data, road = case.data, case.road
     clusters = function(data, road)
     surface = nurbs.fit(data, clusters, options)
-    found = evaluate.evaluate(
+    metrics = evaluate.evaluate(
         sample.sample(surface, road, clusters, sample.Options()), data, road, evaluate.Options()
     )
-    at = surface.lattice(data.core.eastings, data.core.northings)
+    heights = surface.lattice(data.core.eastings, data.core.northings)
     truth = data.reference[case.core]
     true_road = road.mask if data.reference_road is None else data.reference_road
     below = (case.kind == Kind.CROWN)[case.core] & true_road[case.core] & np.isfinite(truth)
     return {
-        "road L2": found.l2_road_m,
-        "road RMSE": found.rmse_road_m,
-        "road MAD": found.mad_road_deg,
-        "terrain L2": found.l2_terrain_m,
-        "road L2 below crowns": float(np.abs(at - truth)[below].mean()) if below.any() else np.nan,
+        "road L2": metrics.l2_road_m,
+        "road RMSE": metrics.rmse_road_m,
+        "road MAD": metrics.mad_road_deg,
+        "terrain L2": metrics.l2_terrain_m,
+        "road L2 below crowns": float(np.abs(heights - truth)[below].mean()) if below.any() else np.nan,
     }
 
 
 def picture(cases: Sequence[Case], path: Path) -> None:
-    """Draw the street with the most spoiled cells around a deck: what each filter keeps."""
+    """Draw the cells that each filter keeps on the street with the most spoiled cells around a deck."""
     import matplotlib.pyplot as plt
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -192,8 +196,8 @@ def picture(cases: Sequence[Case], path: Path) -> None:
     figure.colorbar(up, ax=axes[0], shrink=0.8)
     for axis, name in zip(axes[1:], ("paper", "two lines", "planar"), strict=True):
         keeps = FILTERS[name](data, case.road).mask[window]
-        shown = np.select([~mask, keeps & sound[window], keeps, sound[window]], [0, 2, 4, 1], 3)
-        axis.imshow(shown, cmap=ListedColormap(colours), vmin=0, vmax=4, interpolation="nearest")
+        classes = np.select([~mask, keeps & sound[window], keeps, sound[window]], [0, 2, 4, 1], 3)
+        axis.imshow(classes, cmap=ListedColormap(colours), vmin=0, vmax=4, interpolation="nearest")
         axis.set_title(name)
     names = ["", "road lost", "road kept", "spoiled cell dropped", "spoiled cell kept"]
     key = [Patch(color=colours[i], label=names[i]) for i in (2, 1, 3, 4)]
@@ -215,7 +219,7 @@ def _busiest(cases: Sequence[Case], half: int = 35) -> tuple[Case, tuple[slice, 
                 window = (slice(r - half, r + half), slice(c - half, c + half))
                 inner = (slice(r - half // 2, r + half // 2), slice(c - half // 2, c + half // 2))
                 count = float(spoiled[window].sum()) * (deck[inner].sum() > 80)
-                best = max(best, (count, case, window), key=lambda found: found[0])
+                best = max(best, (count, case, window), key=lambda candidate: candidate[0])
     return best[1:]
 
 
@@ -228,13 +232,13 @@ def synthetic(tile_id: str, core: Grid, stratum: str, options) -> Case:
     return Case(data, RoadMask(grid, core, scene.road_mask, np.zeros(grid.shape, np.bool_)), scene.kind)
 
 
-def degraded(case: Case, worse: str, seed: int) -> Case:
-    dtm = WORSE[worse](case, np.random.default_rng(seed))
+def degraded(case: Case, degradation: str, seed: int) -> Case:
+    dtm = DEGRADATIONS[degradation](case, np.random.default_rng(seed))
     return replace(case, data=replace(case.data, dtm=dtm))
 
 
 def with_scars(case: Case, rng: np.random.Generator) -> Floats:
-    """Noise, and tilted patches of 8 to 20 m that are off, as houses taken out leave them."""
+    """Return the DTM with noise and with tilted, shifted patches of 8 to 20 m, as left by removed houses."""
     dtm = case.data.dtm + NOISE_M * rng.standard_normal(case.data.dtm.shape)
     row, col = np.indices(dtm.shape)
     for _ in range(dtm.size // SCAR_SHARE_M2):
@@ -248,23 +252,25 @@ def with_scars(case: Case, rng: np.random.Generator) -> Floats:
 
 
 def below_decks(case: Case, rng: np.random.Generator) -> Floats:
-    """The terrain model has no height under bridges."""
+    """Return the DTM without heights under bridges."""
     deck = binary_dilation(case.data.reference - case.data.dtm > DECK_M, iterations=BEYOND)
     return np.where(deck, np.nan, case.data.dtm)
 
 
 def across_decks(case: Case, rng: np.random.Generator) -> Floats:
-    """The terrain model is interpolated across what lies under bridges."""
+    """Return the DTM interpolated across the area under bridges."""
     dtm = below_decks(case, rng)
     gap = np.isnan(dtm)
     if gap.any():
         rim = binary_dilation(gap, iterations=2) & ~gap
-        way = {m: griddata(np.argwhere(rim), dtm[rim], np.argwhere(gap), m) for m in ("linear", "nearest")}
-        dtm[gap] = np.where(np.isnan(way["linear"]), way["nearest"], way["linear"])
+        interpolated = {
+            m: griddata(np.argwhere(rim), dtm[rim], np.argwhere(gap), m) for m in ("linear", "nearest")
+        }
+        dtm[gap] = np.where(np.isnan(interpolated["linear"]), interpolated["nearest"], interpolated["linear"])
     return dtm
 
 
-WORSE: dict[str, Callable[[Case, np.random.Generator], Floats]] = {
+DEGRADATIONS: dict[str, Callable[[Case, np.random.Generator], Floats]] = {
     "as given": lambda case, rng: case.data.dtm,
     "noise and scars": with_scars,
     "interpolated across bridges": across_decks,
@@ -276,9 +282,9 @@ WORSE: dict[str, Callable[[Case, np.random.Generator], Floats]] = {
 def real(folder: Path) -> None:
     for name, files in PLACES.items():
         case = town(folder, *files)
-        print(f"\n{name}: DSM and canopies; truth is the DTM as it was, roads are all that is paved")
-        for worse in ("as given", "noise and scars", f"{OFFSET_M} m too high"):
-            show(worse, *(kept(degraded(case, worse, 0), f) for f in FILTERS.values()))
+        print(f"\n{name}: DSM and canopies; truth is the original DTM, road is all paved ground")
+        for degradation in ("as given", "noise and scars", f"{OFFSET_M} m too high"):
+            show(degradation, *(kept(degraded(case, degradation, 0), f) for f in FILTERS.values()))
         fitted_table("noise and scars", [degraded(case, "noise and scars", 0)])
 
 

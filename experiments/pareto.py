@@ -1,9 +1,9 @@
-"""Accuracy against smoothness of the fit's choices, on the benchmark and on two real places.
+"""Accuracy against smoothness for several options of the fit, on the benchmark and on two real places.
 
-With the roads that the paper's filter keeps, and with those that a perfect filter would: segmented cells
-within 0.3 m of the truth. Choices are made on every other tile of the benchmark and reported on the rest.
-The real places (FLEXROAD_REAL_DATA) have their canopies added to the DSM; their DTM is the truth with noise
-of 0.1 m and a level shift under each building. Writes the picture of docs/fit.md where a path is given.
+The fit uses the roads that the paper's filter keeps, or those of a perfect filter: segmented cells within
+0.3 m of the truth. Options are chosen on every other tile of the benchmark and reported on the rest. The real
+places (FLEXROAD_REAL_DATA) have their canopies added to the DSM; their DTM is the truth with noise of 0.1 m
+and a level shift under each building. An argument is the path for the figure of docs/fit.md.
 """
 
 from __future__ import annotations
@@ -40,32 +40,35 @@ NOISE_M, SCAR_M, BUILDING_M = 0.1, 0.3, 2.0
 
 
 def bending(points: int, **options: float) -> smoothing_spline.Options:
-    """Return options with so many control points each way over a tile, all differences absolute."""
-    plain = {"bending_m3": 100, "lambda_terrain": 1, "huber_m": 0}
-    return smoothing_spline.Options(spacing_m=249 / (points - 1), **(plain | options))
+    """Return options with this number of control points along both axes of a tile and an L1 loss."""
+    defaults = {"bending_m3": 100, "lambda_terrain": 1, "huber_m": 0}
+    return smoothing_spline.Options(spacing_m=249 / (points - 1), **(defaults | options))
 
 
-LESS = {"lambda_terrain": 0.3}
+TERRAIN_03 = {"lambda_terrain": 0.3}
 CHOICES: dict[str, nurbs.Options | smoothing_spline.Options] = {
     "paper: free weights, Adam, 35": nurbs.Options(),
     "unit weights, Adam, 35": nurbs.Options(weights="unit"),
     **{f"bending {b} all over, 70": bending(70, bending_m3=b, bending_terrain=1) for b in (30, 100)},
     "bending 100 on roads, 70": bending(70),
-    **{f"bending {b} on roads, 70, terrain 0.3": bending(70, **LESS, bending_m3=b) for b in (30, 100, 300)},
-    "bending 100 on roads, 50, terrain 0.3": bending(50, **LESS),
-    "bending 100 on roads, 35, terrain 0.3": bending(35, **LESS),
     **{
-        f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1": bending(n, **LESS, huber_m=0.1)
+        f"bending {b} on roads, 70, terrain 0.3": bending(70, **TERRAIN_03, bending_m3=b)
+        for b in (30, 100, 300)
+    },
+    "bending 100 on roads, 50, terrain 0.3": bending(50, **TERRAIN_03),
+    "bending 100 on roads, 35, terrain 0.3": bending(35, **TERRAIN_03),
+    **{
+        f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1": bending(n, **TERRAIN_03, huber_m=0.1)
         for n in (50, 70)
     },
     "bending 100 on roads, 50, terrain 0.5, Huber 0.1": bending(50, lambda_terrain=0.5, huber_m=0.1),
 }
-"""Name: options of the fit. The number behind the smoothness is that of control points each way."""
+"""Options of the fit by name. A number after the comma is that of control points along both axes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A tile, ready to be fitted."""
+    """A tile with its raw mask and the filtered masks to fit to."""
 
     place: str
     data: TileData
@@ -82,14 +85,14 @@ def case(place: str, data: TileData) -> Case:
     return Case(place, data, road, {"paper": kept, "perfect": replace(kept, labels=sound.astype(np.int32))})
 
 
-def made(scratch: Path) -> Iterator[Case]:
+def benchmark_cases(scratch: Path) -> Iterator[Case]:
     catalog = Catalog.read(write_scenes(scratch, TILES, SEED, preset="gerod"))
     for number, tile in enumerate(catalog.tiles):
         yield case(("chosen on", "reported on")[number % 2], load.load(tile, load.Options()))
 
 
-def surveyed(scratch: Path) -> Iterator[Case]:
-    """Barbican and Gothenburg, as far as they are there."""
+def real_cases(scratch: Path) -> Iterator[Case]:
+    """Yield the tiles of Barbican and Gothenburg if FLEXROAD_REAL_DATA is set."""
     root = os.environ.get("FLEXROAD_REAL_DATA")
     places = {
         "Barbican": (
@@ -118,26 +121,26 @@ def surveyed(scratch: Path) -> Iterator[Case]:
 
 
 def degraded(data: TileData, seed: int) -> TileData:
-    """Put the canopies, which came as the reference, on the DSM, and spoil the DTM, which is the truth."""
+    """Add the canopies (loaded as reference) to the DSM; degrade the DTM, whose original is the truth."""
     rng = np.random.default_rng(seed)
-    crowned = np.fmax(data.dsm, data.dtm + np.nan_to_num(data.reference))
+    with_canopies = np.fmax(data.dsm, data.dtm + np.nan_to_num(data.reference))
     buildings, count = label(data.dsm - data.dtm > BUILDING_M)
     shifts = np.append(0.0, rng.normal(0, SCAR_M, count))
     dtm = data.dtm + rng.normal(0, NOISE_M, data.dtm.shape) + shifts[buildings]
-    return replace(data, dsm=crowned, dtm=dtm, reference=data.dtm)
+    return replace(data, dsm=with_canopies, dtm=dtm, reference=data.dtm)
 
 
-def rows(found: Case) -> Iterator[dict[str, float | str]]:
-    for roads, kept in found.roads.items():
+def rows(tile_case: Case) -> Iterator[dict[str, float | str]]:
+    for roads, kept in tile_case.roads.items():
         for name, options in CHOICES.items():
             start = time.process_time()
             method = nurbs if options.method == "nurbs" else smoothing_spline
-            surface = method.fit(found.data, kept, options)
+            surface = method.fit(tile_case.data, kept, options)
             seconds = time.process_time() - start
-            mesh = sample.sample(surface, found.road, kept, sample.Options())
-            figures = evaluate.evaluate(mesh, found.data, found.road, evaluate.Options())
+            mesh = sample.sample(surface, tile_case.road, kept, sample.Options())
+            figures = evaluate.evaluate(mesh, tile_case.data, tile_case.road, evaluate.Options())
             yield {
-                "place": found.place,
+                "place": tile_case.place,
                 "roads": roads,
                 "choice": name,
                 "road L2 (m)": figures.l2_road_m,
@@ -150,7 +153,7 @@ def rows(found: Case) -> Iterator[dict[str, float | str]]:
 
 
 def picture(table: pd.DataFrame, path: Path) -> None:
-    """Draw road MAD over road L2, one panel a filter; lines join choices that differ in one number."""
+    """Draw road MAD over road L2, one panel per filter; lines join options that differ in one number."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -188,9 +191,9 @@ def picture(table: pd.DataFrame, path: Path) -> None:
 def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        found = [row for source in (made, surveyed) for c in source(folder) for row in rows(c)]
-    table = pd.DataFrame(found).groupby(["place", "roads", "choice"], sort=False).mean()
-    print(f"{TILES} tiles of the benchmark, seed {SEED}, one half chosen on; means over tiles; one thread")
+        results = [row for source in (benchmark_cases, real_cases) for c in source(folder) for row in rows(c)]
+    table = pd.DataFrame(results).groupby(["place", "roads", "choice"], sort=False).mean()
+    print(f"{TILES} tiles of the benchmark, seed {SEED}; options chosen on one half; tile means, one thread")
     print(table.round(4).to_string())
     if len(sys.argv) > 1:
         picture(table, Path(sys.argv[1]))

@@ -1,12 +1,13 @@
 """The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
 
-``PYTHONPATH=. python experiments/production.py 240`` for docs/fit.md; 4 tiles of the benchmark without
-a number. Stages and options are those of configs/paper.yaml and configs/nightly.yaml, tile by tile as a run
-does them; only the benchmark's tiles, which are islands, have no halo.
+``PYTHONPATH=. python experiments/production.py 240`` gives the table of docs/fit.md; without a number 4 tiles
+of the benchmark are used. Stages and options are those of configs/paper.yaml and configs/nightly.yaml, tile
+by tile as in a run; only the benchmark's tiles, which have no neighbours, have no halo.
 
-With FLEXROAD_REAL_DATA follow Barbican and Gothenburg, their canopies laid over the DSM and their DTM spoiled
-(noise and scars; truth is the DTM as it was), and the north of Autzen with roads drawn by hand against ground
-points of another classification. Intervals are 95% of a bootstrap over tiles, squares of `BLOCK_M`, points.
+If FLEXROAD_REAL_DATA is set, two more comparisons follow. Barbican and Gothenburg have their canopies added
+to the DSM and a degraded DTM (noise and scars); truth is the original DTM. The north of Autzen has roads
+drawn by hand and is compared with ground points of another classification. Intervals are 95% intervals of a
+bootstrap over tiles, over squares of `BLOCK_M`, or over points.
 """
 
 from __future__ import annotations
@@ -40,34 +41,34 @@ from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
 TILES, SEED = 4, 1
 OVER_M = 2.0
-"""Where the DSM is this much over a true road, something hides it."""
+"""A road cell counts as hidden if the DSM is this much above the true road (m)."""
 BLOCK_M = 50
 FOOT_M = 0.3048
 CHAINS = {name: load_config(name).chains["flexroad"] for name in ("paper", "nightly")}
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """What a chain made of a tile."""
+class Result:
+    """Results of one configuration for one tile."""
 
     data: TileData
     road: RoadMask
     figures: dict[str, float]
     heights: Floats
-    """Of the surface at the cells of the core (m)."""
+    """Heights of the surface at the cells of the core, ``(H, W)``, m."""
 
 
-def made(tile: Tile, name: str, halo: bool = True) -> Made:
-    """Take a tile through the stages of a configuration."""
+def run_stages(tile: Tile, name: str, halo: bool = True) -> Result:
+    """Run the stages of a configuration on a tile."""
     chain = dict(CHAINS[name])
     if not halo:
         chain["load"] = chain["load"].model_copy(update={"halo_m": 0.0})
-    found: dict[str, object] = {}
+    results: dict[str, object] = {}
     for stage in STAGES[: STAGE_NAMES.index("evaluate") + 1]:
-        inputs = [found[i] for i in stage.inputs] or [tile]
-        found[stage.name] = stage_function(stage.name, chain[stage.name])(*inputs, chain[stage.name])
-    data, core = found["load"], tile.grid
-    surface, metrics = found["fit"], found["evaluate"]
+        inputs = [results[i] for i in stage.inputs] or [tile]
+        results[stage.name] = stage_function(stage.name, chain[stage.name])(*inputs, chain[stage.name])
+    data, core = results["load"], tile.grid
+    surface, metrics = results["fit"], results["evaluate"]
     figures = {
         "road L2 (m)": metrics.l2_road_m,
         "road RMSE (m)": metrics.rmse_road_m,
@@ -75,27 +76,30 @@ def made(tile: Tile, name: str, halo: bool = True) -> Made:
         "terrain L2 (m)": metrics.l2_terrain_m,
         "T": metrics.triangles,
     }
-    return Made(data, found["segment"], figures, surface.lattice(core.eastings, core.northings))
+    return Result(data, results["segment"], figures, surface.lattice(core.eastings, core.northings))
 
 
-def interval(paper: Floats, ours: Floats) -> str:
-    """Return the mean of paired differences with its interval, and how many there are."""
-    off = (ours - paper)[np.isfinite(ours - paper)]
-    means = np.random.default_rng(0).choice(off, (2000, off.size)).mean(axis=1)
+def interval(paper: Floats, production: Floats) -> str:
+    """Return mean, interval and number of the paired differences as text."""
+    differences = (production - paper)[np.isfinite(production - paper)]
+    means = np.random.default_rng(0).choice(differences, (2000, differences.size)).mean(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
-    return f"{off.mean():+.4f} [{low:+.4f}, {high:+.4f}], n = {off.size}, lower on {np.mean(off < 0):.0%}"
+    share = np.mean(differences < 0)
+    return (
+        f"{differences.mean():+.4f} [{low:+.4f}, {high:+.4f}], n = {differences.size}, lower on {share:.0%}"
+    )
 
 
 def show(rows: pd.DataFrame) -> None:
-    """Print the mean figures of each configuration, and the intervals of their differences."""
+    """Print the mean metrics of each configuration and the intervals of their differences."""
     print(rows.groupby("config", sort=False).mean(numeric_only=True).round(4).to_string())
-    paper, ours = (rows[rows.config == name].reset_index() for name in CHAINS)
+    paper, production = (rows[rows.config == name].reset_index() for name in CHAINS)
     for figure in rows.columns.drop(["config", "T"]):
-        print(f"  {figure}: {interval(paper[figure].to_numpy(), ours[figure].to_numpy())}")
+        print(f"  {figure}: {interval(paper[figure].to_numpy(), production[figure].to_numpy())}")
 
 
 def benchmark(tiles: int, scratch: Path) -> None:
-    """Compare on made tiles: all road, and the road below crowns and below anything high."""
+    """Compare on synthetic tiles: all road, road below crowns, and road below any high object."""
     catalog = Catalog.read(write_scenes(scratch, tiles, SEED, preset="gerod"))
     scenes = {name: place for name, *place in gerod.survey(tiles, SEED)}
     rows, hidden = [], []
@@ -103,16 +107,16 @@ def benchmark(tiles: int, scratch: Path) -> None:
         grid, stratum, options = scenes[tile.id]
         kind = make_scene(grid, SEED, stratum, options).kind
         for name in CHAINS:
-            found = made(tile, name, halo=False)
-            off = np.abs(found.heights - found.data.reference)
+            result = run_stages(tile, name, halo=False)
+            errors = np.abs(result.heights - result.data.reference)
             below = {
-                "below crowns": found.data.reference_road & (kind == Kind.CROWN),
-                "below anything high": found.data.reference_road
-                & (found.data.dsm - found.data.reference > OVER_M),
+                "below crowns": result.data.reference_road & (kind == Kind.CROWN),
+                "below anything high": result.data.reference_road
+                & (result.data.dsm - result.data.reference > OVER_M),
             }
-            rows.append({"config": name, **found.figures})
+            rows.append({"config": name, **result.figures})
             hidden += [
-                {"config": name, "cells": k, "sum": off[m].sum(), "n": m.sum()} for k, m in below.items()
+                {"config": name, "cells": k, "sum": errors[m].sum(), "n": m.sum()} for k, m in below.items()
             ]
     print(f"{tiles} tiles of the benchmark, seed {SEED}")
     show(pd.DataFrame(rows))
@@ -130,43 +134,43 @@ def town(name: str, archive: Path, crs: str, patterns: dict[str, str], scratch: 
     """Compare in a real town, cell by cell of its tiles' cores."""
     zipfile.ZipFile(archive).extractall(scratch)
     folder = scratch / archive.stem
-    spoil(folder, patterns)
+    write_degraded(folder, patterns)
     layers = {"dsm": "spoiled_dsm.tif", "dtm": "spoiled_dtm.tif", "reference": patterns["dtm"]}
-    found = index(folder, {**layers, "road_mask": patterns["cover"]}, road_values=(PAVED,), crs=crs)
+    catalog = index(folder, {**layers, "road_mask": patterns["cover"]}, road_values=(PAVED,), crs=crs)
     rows, blocks = [], []
-    for tile in found.tiles:
+    for tile in catalog.tiles:
         for config in CHAINS:
-            m = made(tile, config)
-            core = m.data.grid.window(m.data.core)
-            off = np.abs(m.heights - m.data.reference[core])
-            road = m.road.mask[core] & np.isfinite(off)
-            rows.append({"config": config, **m.figures})
-            blocks += [{"config": config, **b} for b in squares(off, road, int(BLOCK_M / tile.grid.cell))]
-    print(f"\n{name}: {len(found.tiles)} tiles; roads are all that is paved")
+            result = run_stages(tile, config)
+            core = result.data.grid.window(result.data.core)
+            errors = np.abs(result.heights - result.data.reference[core])
+            road = result.road.mask[core] & np.isfinite(errors)
+            rows.append({"config": config, **result.figures})
+            blocks += [{"config": config, **b} for b in squares(errors, road, int(BLOCK_M / tile.grid.cell))]
+    print(f"\n{name}: {len(catalog.tiles)} tiles; road is all paved ground")
     print(pd.DataFrame(rows).groupby("config", sort=False).mean().round(4).to_string())
     table = pd.DataFrame(blocks)
-    paper, ours = (table[table.config == c].mean_m.to_numpy() for c in CHAINS)
-    print(f"  road L2 by squares of {BLOCK_M} m: {interval(paper, ours)}")
+    paper, production = (table[table.config == c].mean_m.to_numpy() for c in CHAINS)
+    print(f"  road L2 by squares of {BLOCK_M} m: {interval(paper, production)}")
 
 
-def squares(off: Floats, road: Bools, side: int) -> Iterator[dict[str, float]]:
-    """Yield the mean distance on the road in each square that has some."""
-    for r in range(0, off.shape[0], side):
-        for c in range(0, off.shape[1], side):
+def squares(errors: Floats, road: Bools, side: int) -> Iterator[dict[str, float]]:
+    """Yield the mean distance on the road of each square with enough road cells."""
+    for r in range(0, errors.shape[0], side):
+        for c in range(0, errors.shape[1], side):
             here = np.s_[r : r + side, c : c + side]
             if road[here].sum() >= side:
-                yield {"mean_m": float(off[here][road[here]].mean())}
+                yield {"mean_m": float(errors[here][road[here]].mean())}
 
 
-def spoil(folder: Path, patterns: dict[str, str]) -> None:
-    """Write a DSM with the canopies laid over it and a DTM with noise and scars beside the files."""
+def write_degraded(folder: Path, patterns: dict[str, str]) -> None:
+    """Write a DSM with canopies and a DTM with noise and scars next to the original files."""
     paths = {layer: next(folder.glob(pattern)) for layer, pattern in patterns.items()}
     with rasterio.open(paths["dtm"]) as raster:
         profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
     dsm, dtm, canopy = (_read(paths[layer]) for layer in ("dsm", "dtm", "canopy"))
     scarred = with_scars(_as_case(dtm), np.random.default_rng(0))
-    crowned = np.fmax(dsm, dtm + np.nan_to_num(canopy))
-    for name, heights in (("spoiled_dsm.tif", crowned), ("spoiled_dtm.tif", scarred)):
+    with_canopies = np.fmax(dsm, dtm + np.nan_to_num(canopy))
+    for name, heights in (("spoiled_dsm.tif", with_canopies), ("spoiled_dtm.tif", scarred)):
         with rasterio.open(folder / name, "w", **profile) as raster:
             raster.write(np.nan_to_num(heights, nan=-9999.0), 1)
 
@@ -197,24 +201,25 @@ def autzen(folder: Path, scratch: Path) -> None:
     cloud = laspy.read(folder / "autzen-thin.las")
     ground = np.asarray(cloud.classification) == 2
     x, y, z = (np.asarray(axis)[ground] * FOOT_M for axis in (cloud.x, cloud.y, cloud.z))
-    off: dict[str, list[Floats]] = {name: [] for name in CHAINS}
+    errors: dict[str, list[Floats]] = {name: [] for name in CHAINS}
     for tile in Catalog.read(out / "catalog.parquet").tiles:
         west, south, east, north = tile.grid.bounds
         inside = (x >= west) & (x < east) & (y > south) & (y <= north)
         for name in CHAINS:
-            found = made(tile, name)
+            result = run_stages(tile, name)
             row, col = tile.grid.cells(x[inside], y[inside])
-            on_road = found.road.mask[found.data.grid.window(tile.grid)][row, col]
-            off[name].append(np.abs(found.heights[row, col] - z[inside])[on_road])
-    paper, ours = (np.concatenate(off[name]) for name in CHAINS)
+            on_road = result.road.mask[result.data.grid.window(tile.grid)][row, col]
+            errors[name].append(np.abs(result.heights[row, col] - z[inside])[on_road])
+    paper, production = (np.concatenate(errors[name]) for name in CHAINS)
     print(
-        f"\nAutzen north: paper {paper.mean():.4f} m, nightly {ours.mean():.4f} m off ground points on roads"
+        f"\nAutzen north, distance to ground points on roads: paper {paper.mean():.4f} m, "
+        f"nightly {production.mean():.4f} m"
     )
-    print(f"  {interval(paper, ours)}")
+    print(f"  {interval(paper, production)}")
 
 
 def call(words: list[str]) -> None:
-    """Give a command of the program."""
+    """Run a command of the program."""
     before, sys.argv = sys.argv, ["flexroad", *words]
     try:
         flexroad()
@@ -242,7 +247,7 @@ def main() -> None:
         if tiles:
             benchmark(tiles, scratch / "made")
         if folder := os.environ.get("FLEXROAD_REAL_DATA"):
-            print(f"\nCanopies laid over the DSM; DTM with {NOISE_M} m of noise and scars")
+            print(f"\nDSM with canopies; DTM with {NOISE_M} m of noise and with scars")
             for place, (archive, crs, patterns) in TOWNS.items():
                 town(place, Path(folder) / "umep" / f"{archive}.zip", crs, patterns, scratch)
             autzen(Path(folder) / "autzen", scratch)

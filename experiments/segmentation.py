@@ -1,9 +1,8 @@
-"""Roads found by each method around Autzen Stadium, beside two plain baselines.
+"""Compare road segmentation methods and two simple baselines around Autzen Stadium.
 
-Half of the tiles, those in the west or those in the east, is there to learn and to tune on; the other half
-is scored. Truth are the roads drawn by hand; areas drawn with little certainty do not count. Needs the
-folder named by FLEXROAD_REAL_DATA. With a file name
-as argument, a picture of what was found goes there.
+The western or the eastern half of the tiles is used for training and tuning; the other half is scored. The
+truth is the roads drawn by hand; areas drawn with low certainty are ignored. Needs FLEXROAD_REAL_DATA, the
+folder of real data. An argument is the path for a picture of the results.
 """
 
 from __future__ import annotations
@@ -42,56 +41,56 @@ HALO_M = 60.0
 MIDDLE_M = 194_250.0
 """Tiles east of this are the eastern half."""
 BAND_M = 1.0
-"""Cells this near to the edge of a label are not learnt: the drawing is no better. All are scored."""
+"""Cells this close to the edge of a label are not used for training, because the drawing is imprecise (m)."""
 ABOVE_M, GREENNESS = np.arange(0.1, 1.05, 0.1), np.arange(-0.05, 0.125, 0.005)
 WIDTHS_M = np.arange(4.0, 20.0, 0.5)
-TIDY = Cleanup()
-SHOWN = ("height and greenness", "pixels")
-SURE = "class = 'road' AND certainty <> 'low'"
+CLEANUP = Cleanup()
+PICTURED = ("height and greenness", "pixels")
+CERTAIN = "class = 'road' AND certainty <> 'low'"
 
 Maps = list[Bools]
-"""What was found on each of some tiles."""
+"""Road masks, one per tile."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A tile with what is drawn on it."""
+    """A tile with its hand-drawn labels."""
 
     data: TileData
     road: Bools
     parking: Bools
     scored: Bools
-    """Cells of the tile inside the survey, without what is uncertain."""
+    """Cells of the tile that are scored: inside the survey and drawn with certainty."""
     sample: Sample
 
 
 def main() -> None:
     folder = os.environ.get("FLEXROAD_REAL_DATA")
     if not folder:
-        print("FLEXROAD_REAL_DATA is not set: nothing to score on")
+        print("set FLEXROAD_REAL_DATA to the folder of real data")
         return
     with tempfile.TemporaryDirectory() as scratch:
         cases = list(autzen(Path(folder) / "autzen", Path(scratch)))
         west = [case for case in cases if case.data.core.west < MIDDLE_M]
         east = [case for case in cases if case.data.core.west >= MIDDLE_M]
-        pictured: dict[str, list[tuple[Case, Bools]]] = {method: [] for method in SHOWN}
+        pictured: dict[str, list[tuple[Case, Bools]]] = {method: [] for method in PICTURED}
         print(f"{'':38} {'IoU':>6} {'prec.':>6} {'recall':>6} {'without lots':>13}")
         for name, learn, score in (
             ("west, scored on east", west, east),
             ("east, scored on west", east, west),
         ):
-            print(f"learnt in the {name}")
-            for method, find in methods(Path(scratch)).items():
-                found = find(learn, score)
-                show(method, score, found)
-                if method in SHOWN:
-                    pictured[method] += zip(score, found, strict=True)
+            print(f"trained in the {name}")
+            for method, method_function in methods(Path(scratch)).items():
+                masks = method_function(learn, score)
+                show(method, score, masks)
+                if method in PICTURED:
+                    pictured[method] += zip(score, masks, strict=True)
         if len(sys.argv) > 1:
             draw(Path(sys.argv[1]), pictured)
 
 
 def autzen(home: Path, scratch: Path) -> Iterator[Case]:
-    """Make the catalog of the northern points; its colours come from the photo moved onto the heights."""
+    """Yield the tiles of the northern points; the orthophoto is the one registered to the heights."""
     made = prepare_points(
         [home / "autzen_north.laz"],
         scratch,
@@ -108,17 +107,17 @@ def autzen(home: Path, scratch: Path) -> Iterator[Case]:
 
 def case(data: TileData) -> Case:
     def areas(where: str) -> Bools:
-        asked = rasterise.Options(
+        options = rasterise.Options(
             layer="road_polygons", where=f"({where}) AND visible_in <> 'rgb'", left_out=()
         )
-        return rasterise.rasterise_roads(data, asked)
+        return rasterise.rasterise_roads(data, options)
 
-    road, unsure = areas(SURE), areas("certainty = 'low'")
+    road, uncertain = areas(CERTAIN), areas("certainty = 'low'")
     scored = np.zeros(data.grid.shape, bool)
     scored[data.grid.window(data.core)] = True
-    scored &= ~beyond_extent(data) & (road | ~unsure)
-    known = scored & ~edge(road, BAND_M / data.grid.cell)
-    return Case(data, road, areas("class = 'parking'"), scored, Sample(data, road, known))
+    scored &= ~beyond_extent(data) & (road | ~uncertain)
+    trainable = scored & ~edge(road, BAND_M / data.grid.cell)
+    return Case(data, road, areas("class = 'parking'"), scored, Sample(data, road, trainable))
 
 
 def edge(mask: Bools, reach: float) -> Bools:
@@ -132,34 +131,34 @@ Method = Callable[[Sequence[Case], Sequence[Case]], Maps]
 
 def methods(scratch: Path) -> dict[str, Method]:
     return {
-        "height and greenness": plain,
+        "height and greenness": height_and_green,
         "centre lines, one width": one_width,
         "centre lines, their own widths": lambda _, score: lines(score),
-        "pixels, heights alone": lambda *halves: learnt(*halves, scratch, photo=False),
-        "pixels": lambda *halves: learnt(*halves, scratch),
-        "pixels, not tidied": lambda *halves: learnt(*halves, scratch, cleanup=NOTHING),
+        "pixels, heights alone": lambda *halves: trained_pixels(*halves, scratch, photo=False),
+        "pixels": lambda *halves: trained_pixels(*halves, scratch),
+        "pixels, not tidied": lambda *halves: trained_pixels(*halves, scratch, cleanup=NOTHING),
     }
 
 
-def plain(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
-    """Cells that are low and not green; both thresholds are the best of the half to learn on."""
+def height_and_green(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
+    """Segment cells that are low and not green; both thresholds are tuned on the training half."""
 
-    def seen(cases: Sequence[Case]) -> list[tuple[np.ndarray, np.ndarray]]:
-        found = [features(case.data, look(case.data)) for case in cases]
-        return [tuple(f.values[f.names.index(name)] for name in ("above", "greenness")) for f in found]
+    def height_and_greenness(cases: Sequence[Case]) -> list[tuple[np.ndarray, np.ndarray]]:
+        feature_maps = [features(case.data, look(case.data)) for case in cases]
+        return [tuple(f.values[f.names.index(name)] for name in ("above", "greenness")) for f in feature_maps]
 
-    there = seen(learn)
+    train_values = height_and_greenness(learn)
 
     def low(cells, above, green) -> Maps:
         return [(height < above) & (tint < green) for height, tint in cells]
 
-    best = max(product(ABOVE_M, GREENNESS), key=lambda pair: iou(*counts(learn, low(there, *pair))))
-    return low(seen(score), *best)
+    best = max(product(ABOVE_M, GREENNESS), key=lambda pair: iou(*counts(learn, low(train_values, *pair))))
+    return low(height_and_greenness(score), *best)
 
 
 def lines(cases: Sequence[Case], width: float | None = None) -> Maps:
-    one = {} if width is None else {"width_columns": (), "class_columns": (), "default_width_m": width}
-    options = vector.Options(layer="road_centerlines", where=SURE, **one)
+    widths = {} if width is None else {"width_columns": (), "class_columns": (), "default_width_m": width}
+    options = vector.Options(layer="road_centerlines", where=CERTAIN, **widths)
     return [rasterise.rasterise_roads(case.data, options) for case in cases]
 
 
@@ -167,29 +166,29 @@ def one_width(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
     return lines(score, max(WIDTHS_M, key=lambda width: iou(*counts(learn, lines(learn, width)))))
 
 
-def learnt(
+def trained_pixels(
     learn: Sequence[Case],
     score: Sequence[Case],
     scratch: Path,
     photo: bool | None = None,
-    cleanup: Cleanup = TIDY,
+    cleanup: Cleanup = CLEANUP,
 ) -> Maps:
     samples = [case.sample for case in learn]
     began = time.perf_counter()
-    # Nothing but the history hangs on the validation tiles: any will do.
+    # The validation tiles affect only the history, so any tile can be used.
     made = training.train(samples, samples[:1], training.Options(photo=photo))
     trained = time.perf_counter()
     model = scratch / f"model{made.suffix}"
     model.write_bytes(made.model)
     about = read_model(model).about
-    found = [mask(case.data, segment.Options(model=model, cleanup=cleanup)) for case in score]
+    masks = [mask(case.data, segment.Options(model=model, cleanup=cleanup)) for case in score]
     ended = time.perf_counter()
     print(
         f"  {len(made.history)} rounds, {len(made.model) / 1e6:.1f} MB, threshold {about.threshold:.2f}, "
         f"expects IoU {about.trained['expected_iou']:.3f}; {trained - began:.0f} s to train, "
         f"{(ended - trained) / len(score):.2f} s a tile"
     )
-    return found
+    return masks
 
 
 def mask(data: TileData, options: segment.Options) -> Bools:
@@ -199,29 +198,32 @@ def mask(data: TileData, options: segment.Options) -> Bools:
         return np.zeros(data.grid.shape, bool)
 
 
-def counts(cases: Sequence[Case], found: Maps, lots: bool = True) -> tuple[int, int, int]:
-    """Return how many cells are road and found, found, and road."""
-    hit = called = there = 0
-    for case, mask in zip(cases, found, strict=True):
+def counts(cases: Sequence[Case], masks: Maps, lots: bool = True) -> tuple[int, int, int]:
+    """Return the numbers of true positives, of segmented cells and of road cells."""
+    correct = segmented = road_cells = 0
+    for case, mask in zip(cases, masks, strict=True):
         scored = case.scored if lots else case.scored & ~(case.parking & ~case.road)
-        hit += int((mask & case.road & scored).sum())
-        called += int((mask & scored).sum())
-        there += int((case.road & scored).sum())
-    return hit, called, there
+        correct += int((mask & case.road & scored).sum())
+        segmented += int((mask & scored).sum())
+        road_cells += int((case.road & scored).sum())
+    return correct, segmented, road_cells
 
 
-def iou(hit: int, called: int, there: int) -> float:
-    return hit / (called + there - hit)
+def iou(correct: int, segmented: int, road_cells: int) -> float:
+    return correct / (segmented + road_cells - correct)
 
 
-def show(name: str, cases: Sequence[Case], found: Maps) -> None:
-    hit, called, there = counts(cases, found)
-    without = iou(*counts(cases, found, lots=False))
-    print(f"{name:38} {iou(hit, called, there):6.3f} {hit / called:6.3f} {hit / there:6.3f} {without:13.3f}")
+def show(name: str, cases: Sequence[Case], masks: Maps) -> None:
+    correct, segmented, road_cells = counts(cases, masks)
+    without = iou(*counts(cases, masks, lots=False))
+    precision, recall = correct / segmented, correct / road_cells
+    print(
+        f"{name:38} {iou(correct, segmented, road_cells):6.3f} {precision:6.3f} {recall:6.3f} {without:13.3f}"
+    )
 
 
 def draw(path: Path, pictured: dict[str, list[tuple[Case, Bools]]]) -> None:
-    """Draw each method's finds over the photo: hits green, false alarms red, misses blue."""
+    """Draw each method's masks over the photo: true positives green, false positives red, misses blue."""
     import matplotlib.pyplot as plt
     from PIL import Image
 
@@ -239,7 +241,7 @@ def draw(path: Path, pictured: dict[str, list[tuple[Case, Bools]]]) -> None:
             canvas[row : row + core.height, col : col + core.width] = coloured(case, mask)
         axis.imshow(canvas[(canvas < 255).any(axis=(1, 2))])
         axis.axvline(MIDDLE_M - west, color="white", linewidth=1)
-        axis.set_title(f"{method}; each half by what the other taught")
+        axis.set_title(f"{method}; each half segmented with training on the other")
         axis.set_axis_off()
     figure.savefig(path, dpi=80)
     with Image.open(path) as picture:
