@@ -1,4 +1,4 @@
-"""Compare the filters: the share of each kind of cell that they keep, and the surfaces fitted to the kept cells.
+"""Compare the filters: the share of each kind of cell that they keep, and the surface fitted to these cells.
 
 ``PYTHONPATH=. python experiments/filter.py 24`` gives the tables of docs/filter.md; without a number 2 tiles
 of the benchmark are used. A second argument is a path: the figure of that page is drawn there instead. The
