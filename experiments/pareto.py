@@ -161,8 +161,6 @@ def picture(table: pd.DataFrame, path: Path) -> None:
 
     families = {
         "paper: free weights": ["paper: free weights, Adam, 35"],
-        "range, 35 / 50 / 70 points": [f"range, {n}" for n in (35, 50, 70)],
-        "range, 70, terrain 0.3": ["range, 70, terrain 0.3"],
         "bending 30 / 100 m³ all over, 70": [f"bending {b} all over, 70" for b in (30, 100)],
         "bending 30 / 100 / 300 m³ on roads, 70, terrain 0.3": [
             f"bending {b} on roads, 70, terrain 0.3" for b in (30, 100, 300)
@@ -173,7 +171,6 @@ def picture(table: pd.DataFrame, path: Path) -> None:
         "the same, 50 / 70, Huber 0.1": [
             f"bending 100 on roads, {n}, terrain 0.3, Huber 0.1" for n in (50, 70)
         ],
-        "auto": ["bending auto on roads, 70, terrain 0.3"],
     }
     figure, axes = plt.subplots(1, 2, figsize=(10, 5.2), sharey=True, layout="constrained")
     for axis, roads in zip(axes, ("paper", "perfect"), strict=True):
