@@ -1,4 +1,4 @@
-"""What happens to many tiles: configuration, graph, store, execution, report, command line."""
+"""Processing of many tiles: configuration, graph, store, execution, report, command line."""
 
 import atexit
 import os
@@ -18,11 +18,11 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
-"""Environment of every process: at these sizes two BLAS threads are up to 400 times slower than one."""
+"""Environment of every process: on a tile's arrays two BLAS threads are up to 400 times slower than one."""
 
-# Libraries read these once, when they are imported, so it is done before any of them is. What the user
-# has set stays. In a notebook NumPy is there already, and the environment is the notebook's: numba even
-# refuses to go on when its number of threads changes.
+# Libraries read these variables once, on import, so they are set before any import. Values set by the user
+# are kept. If NumPy is already imported (as in a notebook), nothing is changed: numba raises an error when
+# its number of threads changes.
 if "numpy" not in sys.modules:
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
@@ -37,18 +37,19 @@ def _writable(folder: Path) -> bool:
     return True
 
 
-def _keep_compiled() -> None:
-    """Give numba a folder for what it compiles, where it finds none itself and would refuse to work.
+def _set_numba_cache() -> None:
+    """Set a temporary numba cache folder if none of the default folders is writable.
 
-    As a service without a home that uses an installation of root's. Workers inherit it.
+    Numba raises an error without one, for example in a service account without a home folder that uses
+    a system-wide installation. Workers inherit the setting.
     """
     beside = Path(__file__).parent.parent / "tasks" / "__pycache__"
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME", "/"), ".cache"))
     if "NUMBA_CACHE_DIR" in os.environ or _writable(beside) or _writable(home / "numba"):
         return
-    # One of its own: what is read from there is carried out.
+    # A new private folder, because numba executes the code that it reads from its cache.
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="flexroad-")
     atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
 
 
-_keep_compiled()
+_set_numba_cache()

@@ -1,9 +1,9 @@
-"""What the pipeline itself complains about: before any tile is touched, or when nobody is left to work."""
+"""Errors of the pipeline itself, raised before any tile is processed or when the cluster is lost."""
 
 
 class ConfigError(Exception):
-    """A configuration or run folder that cannot be used; one line naming file, key, value and remedy."""
+    """An unusable configuration or run folder; the message is one line with file, key, value and remedy."""
 
 
 class ClusterLost(Exception):
-    """Scheduler or workers went away in mid-run and stayed away; the same command goes on from there."""
+    """Scheduler or workers were lost during a run; the same command resumes the run."""

@@ -1,6 +1,6 @@
-"""Where a run's workers come from: the `cluster:` section of a configuration.
+"""The workers of a run: the `cluster:` section of a configuration.
 
-It says who works, never what is made: no fingerprint knows it, and a file that extends another may change it.
+It does not affect results: it is not part of any fingerprint, and a file that extends another may change it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from flexroad.tasks.options import Options
 
 
 class Cluster(Options):
-    """Who does the tiles; `--workers` and `--scheduler` override it for one command."""
+    """The workers that process the tiles; `--workers` and `--scheduler` override it for one command."""
 
     kind: Literal["local", "slurm", "kubernetes"] = Field(
         "local",
-        description="local: processes of this machine; slurm, kubernetes: workers asked for there "
+        description="local: processes of this machine; slurm, kubernetes: workers requested there "
         "(pip install 'flexroad[slurm]' or 'flexroad[kubernetes]')",
     )
     workers: int | None = Field(
@@ -26,25 +26,25 @@ class Cluster(Options):
     memory: ByteSize | None = Field(
         None,
         ge=100 * 1024**2,
-        description="of each worker, as 4 GiB; by default this machine's shared out, elsewhere 4 GiB; "
-        "a tile that needs more is stopped and becomes a failed row",
+        description="memory of each worker, as 4 GiB; by default an equal share of this machine's memory, "
+        "on slurm and kubernetes 4 GiB; a tile that needs more is stopped and becomes a failed row",
     )
     patience_s: float = Field(
-        60, ge=0, le=86_400, description="how long a run waits for a worker when none is left (s)"
+        60, ge=0, le=86_400, description="waiting time for a new worker when all workers are lost (s)"
     )
     start_s: float = Field(
-        3600, gt=0, le=604_800, description="slurm, kubernetes: how long to wait for the first worker (s)"
+        3600, gt=0, le=604_800, description="slurm, kubernetes: waiting time for the first worker (s)"
     )
-    walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: of each job (hours)")
+    walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: time limit of each job (hours)")
     queue: str | None = Field(None, min_length=1, description="slurm: partition (-p)")
     account: str | None = Field(None, min_length=1, description="slurm: account (-A)")
-    per_job: int = Field(1, ge=1, le=1024, description="slurm: workers of one job, a core each")
+    per_job: int = Field(1, ge=1, le=1024, description="slurm: workers per job, one core each")
     interface: str | None = Field(
-        None, min_length=1, description="slurm: network interface that workers reach this machine by, as ib0"
+        None, min_length=1, description="slurm: network interface between workers and this machine, as ib0"
     )
     job_extra: tuple[str, ...] = Field((), description="slurm: further #SBATCH lines, as --exclusive")
     prologue: tuple[str, ...] = Field(
-        (), description="slurm: shell lines before a worker starts, as module load gdal"
+        (), description="slurm: shell lines run before a worker starts, as module load gdal"
     )
     image: str | None = Field(None, min_length=1, description="kubernetes: image of scheduler and workers")
-    namespace: str | None = Field(None, min_length=1, description="kubernetes: where they are made")
+    namespace: str | None = Field(None, min_length=1, description="kubernetes: namespace of the pods")

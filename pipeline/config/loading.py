@@ -1,4 +1,4 @@
-"""Read a configuration from YAML, resolve what it extends, and validate it; one line per fault."""
+"""Read a configuration from YAML, resolve `extends`, and validate it; one line per error."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ RENAMED = {
     "bending_m3": SPLINE,
     "bending_terrain": SPLINE,
 }
-"""Words of earlier versions, and what stands for them."""
+"""Option names of earlier versions and the hint for each."""
 
 
 def shipped() -> dict[str, Path]:
     """Return the configurations that come with the program, by name."""
-    # In a checkout the package is a link to this folder, and the configurations lie beside it, too.
+    # In a checkout the package's folders are links; resolve() leads to the root, which has configs/.
     folder = Path(__file__).resolve().parents[2] / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
@@ -44,16 +44,21 @@ def load_config(name: str | Path) -> Config:
     Raises
     ------
     ConfigError
-        If there is none of that name or a key or value is wrong; one line per fault.
+        If no such configuration exists, or a key or value is invalid; one line per error.
     """
     return compose(_raw(name), str(name))
 
 
 def compose(raw: Mapping[str, Any], name: str) -> Config:
-    """Validate a configuration already read; ``name`` is what errors call it."""
+    """Validate a configuration that has been read; ``name`` identifies it in error messages.
+
+    Raises
+    ------
+    ConfigError
+        If a key or value is invalid; one line per error.
+    """
     stages = list(stage_models())
-    known = ["dataset", *stages, "export", "cluster", "variants"]
-    _refuse_unknown(raw, known, name, "")
+    _reject_unknown_keys(raw, ["dataset", *stages, "export", "cluster", "variants"], name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
         stage: _merge(DEFAULTS.get(stage), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
@@ -63,9 +68,11 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     for variant, overrides in variants.items():
         where = f"variants.{variant}"
         if not str(variant).replace("-", "").replace("_", "").isalnum():
-            raise ConfigError(f"{name}: {where}: its files bear the name; use letters, digits, - and _")
+            raise ConfigError(
+                f"{name}: {where}: the name is part of file names; use letters, digits, - and _"
+            )
         overrides = _mapping(overrides or {}, name, where)
-        _refuse_unknown(overrides, stages, name, where)
+        _reject_unknown_keys(overrides, stages, name, where)
         chains[str(variant)] = {
             stage: _validate(
                 stage_models()[stage],
@@ -75,26 +82,27 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             for stage in stages
         }
     export = _validate(
-        TypeAdapter(Export), raw.get("export") or {"variants": _main(chains)}, f"{name}: export"
+        TypeAdapter(Export), raw.get("export") or {"variants": _main_variant(chains)}, f"{name}: export"
     )
     for variant in export.variants:
         if variant not in chains:
             raise ConfigError(f"{name}: export.variants: no variant {variant!r}, only {', '.join(chains)}")
-    workers = _merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
-    cluster = _validate(TypeAdapter(Cluster), workers, f"{name}: cluster")
+    options = _merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
+    cluster = _validate(TypeAdapter(Cluster), options, f"{name}: cluster")
     dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
     return Config(name=name, chains=chains, export=export, cluster=cluster, dataset=dataset, raw=dict(raw))
 
 
-def _raw(name: str | Path, heirs: tuple[Path, ...] = ()) -> dict[str, Any]:
-    known = shipped()
-    path = known.get(str(name), Path(name))
+def _raw(name: str | Path, children: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the file's mapping merged over its parents; ``children`` are the files that extend it."""
+    configs = shipped()
+    path = configs.get(str(name), Path(name))
     if not path.is_file():
-        near = difflib.get_close_matches(Path(name).name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(known)}"
+        near = difflib.get_close_matches(Path(name).name, configs, n=1)
+        hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
         raise ConfigError(f"no configuration {str(name)!r}: neither a file nor a shipped name{hint}")
-    if path.resolve() in heirs:
-        raise ConfigError(f"{path}: extends: leads back to itself; name another file or paper")
+    if path.resolve() in children:
+        raise ConfigError(f"{path}: extends: the file extends itself; name another file or paper")
     try:
         raw = yaml.safe_load(path.read_text()) or {}
     except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError) as error:
@@ -105,10 +113,10 @@ def _raw(name: str | Path, heirs: tuple[Path, ...] = ()) -> dict[str, Any]:
         return raw
     if not isinstance(parent, str):
         raise ConfigError(f"{name}: extends: expected a file or a shipped name, not {parent!r}")
-    if parent not in known:
-        # A file names its parent as it sees it, wherever the command is given.
+    if parent not in configs:
+        # The parent's path is relative to the file, not to the working directory.
         parent = path.parent / parent
-    return _extend(_raw(parent, (*heirs, path.resolve())), raw)
+    return _extend(_raw(parent, (*children, path.resolve())), raw)
 
 
 def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
@@ -117,18 +125,18 @@ def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
         if key in ("variants", "export", "dataset"):
             merged[key] = value
         else:
-            # A parent that names no method has the usual one, and another starts from its own defaults.
-            below = _merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
-            merged[key] = _merge(below, value, TAG.get(key), key)
+            # A parent without a method has the default one; another method starts from its own defaults.
+            base = _merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
+            merged[key] = _merge(base, value, TAG.get(key), key)
     return merged
 
 
 def _merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Lay an override over a stage's options; another method starts from its own defaults."""
-    below, above = _tagged(base, tag, where), _tagged(override, tag, where)
-    if tag in above and tag in below and above[tag] != below[tag]:
-        return above
-    return below | above
+    """Merge an override into a stage's options; an override with another method replaces them."""
+    options, changes = _tagged(base, tag, where), _tagged(override, tag, where)
+    if tag in changes and tag in options and changes[tag] != options[tag]:
+        return changes
+    return options | changes
 
 
 def _tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
@@ -148,62 +156,64 @@ def _mapping(value: Any, name: str, where: str) -> dict[str, Any]:
     return dict(value)
 
 
-def _refuse_unknown(raw: Mapping[str, Any], known: list[str], name: str, where: str) -> None:
+def _reject_unknown_keys(raw: Mapping[str, Any], allowed: list[str], name: str, where: str) -> None:
     for key in raw:
-        if key not in known:
+        if key not in allowed:
             raise ConfigError(
-                f"{name}: {where + '.' if where else ''}{key}: unknown key{_hint(str(key), known)}"
+                f"{name}: {where + '.' if where else ''}{key}: unknown key{_hint(str(key), allowed)}"
             )
 
 
-def _hint(key: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(key, known, n=1)
-    return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
+def _hint(key: str, allowed: list[str]) -> str:
+    near = difflib.get_close_matches(key, allowed, n=1)
+    return f"; did you mean {near[0]}?" if near else f"; valid are {', '.join(allowed)}"
 
 
 def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> Any:
     try:
         return model.validate_python(options)
     except ValidationError as error:
-        faults = [_fault(fault, model, where) for fault in error.errors()]
-        raise ConfigError("\n".join(faults)) from None
+        lines = [_error_line(details, model, where) for details in error.errors()]
+        raise ConfigError("\n".join(lines)) from None
 
 
-def _fault(fault: Any, model: TypeAdapter[Any], where: str) -> str:
+def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
+    """Return one of pydantic's errors as a line with key, message and value."""
     # A discriminated union puts the chosen method first in the path; the file has no such level.
     keys = _keys(model)
-    method = next((str(part) for part in fault["loc"][:1] if part in keys), "")
-    path = [str(part) for part in fault["loc"][bool(method) :]]
+    method = next((str(part) for part in details["loc"][:1] if part in keys), "")
+    path = [str(part) for part in details["loc"][bool(method) :]]
     key = ".".join([where, *path])
-    if fault["type"] == "extra_forbidden":
+    if details["type"] == "extra_forbidden":
         return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
-    if fault["type"] == "union_tag_invalid":
-        tag = fault["ctx"]["tag"]
+    if details["type"] == "union_tag_invalid":
+        tag = details["ctx"]["tag"]
         return f"{key}: there is no method {tag!r}{RENAMED.get(tag) or _hint(tag, sorted(keys))}"
-    message = fault["msg"].removeprefix("Value error, ")
-    if isinstance(fault["input"], dict):
-        # A fault of several options together has told their values itself.
+    message = details["msg"].removeprefix("Value error, ")
+    if isinstance(details["input"], dict):
+        # The message of an error about several options contains their values.
         return f"{key}: {message[0].lower()}{message[1:]}"
-    return f"{key}: {message[0].lower()}{message[1:]}, not {fault['input']!r}"
+    return f"{key}: {message[0].lower()}{message[1:]}, not {details['input']!r}"
 
 
 def _remedy(key: str, method: str, keys: Mapping[str, list[str]]) -> str:
-    others = [name for name, known in keys.items() if key in known and name != method]
+    others = [name for name, options in keys.items() if key in options and name != method]
     if key not in RENAMED and others:
         return f"; it is an option of method {' and '.join(others)}, not of {method}"
     return RENAMED.get(key) or _hint(key, keys[method])
 
 
 def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
-    """Return the options of each method of a stage; of a stage without methods, those of ``""``."""
+    """Return the option names of a stage by method; the method is ``""`` for a stage without methods."""
     schema = model.json_schema()
     tags = schema.get("discriminator", {}).get("mapping", {"": ""})
     parts = {tag: schema["$defs"][ref.rpartition("/")[2]] if ref else schema for tag, ref in tags.items()}
-    found = {tag: list(part.get("properties", {})) for tag, part in parts.items()}
-    # Options within options, such as how a mask is cleaned.
-    within = [key for part in schema.get("$defs", {}).values() for key in part.get("properties", {})]
-    return {tag: sorted({*own, *(within if tags == {"": ""} else ())}) for tag, own in found.items()}
+    options = {tag: list(part.get("properties", {})) for tag, part in parts.items()}
+    # Nested options, such as those of the mask cleanup.
+    nested = [key for part in schema.get("$defs", {}).values() for key in part.get("properties", {})]
+    return {tag: sorted({*own, *(nested if tags == {"": ""} else ())}) for tag, own in options.items()}
 
 
-def _main(chains: Mapping[str, Any]) -> tuple[str, ...]:
+def _main_variant(chains: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the variant that is exported by default: ``flexroad``, or else the last one."""
     return ("flexroad",) if "flexroad" in chains else tuple(chains)[-1:]

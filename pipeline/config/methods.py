@@ -1,4 +1,4 @@
-"""The steps of the paper and the files that do them: one file, or a folder with one file per method."""
+"""The stages of the paper and their modules: one file, or a package with one file per method."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ HOMES = {
     "evaluate": "flexroad.tasks.metrics.evaluate",
     "assess": "flexroad.tasks.quality.assess",
 }
-"""The module of each stage, in the paper's order; of a stage with several methods, their package."""
+"""Stage -> its module, or the package of its methods if it has several; in the paper's order."""
 DEFAULTS = {"segment": "mask", "ecsrc": "paper", "fit": "nurbs"}
-"""Methods of the stages that have several, where a file names none."""
+"""Default method of each stage that has several."""
 NO_METHODS = ("kit", "training_types")
-"""What lies in a package of methods beside them."""
+"""Modules in the packages of methods that are not methods."""
 
 
 @cache
 def methods(stage: str) -> dict[str, Any]:
-    """Return the modules of a stage by method; of a stage with one way to do it, that one under ``""``.
+    """Return the modules of a stage by method; the key is ``""`` for a stage with a single method.
 
-    A method's module is NAME.py, or NAME/segment.py of one that learns; the option ``method`` of its model
-    tells the methods.
+    A method's module is NAME.py, or NAME/segment.py for a learned method. Its methods are the values of the
+    field ``method`` in its options.
     """
     home: Any = importlib.import_module(HOMES[stage])
     if stage not in DEFAULTS:
         return {"": home}
-    found: dict[str, Any] = {}
+    modules: dict[str, Any] = {}
     for file in sorted(pkgutil.iter_modules(home.__path__), key=lambda file: file.name):
         if file.name not in NO_METHODS:
             name = f"{file.name}.{stage}" if file.ispkg else file.name
             module = importlib.import_module(f"{HOMES[stage]}.{name}")
-            found |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
-    return found
+            modules |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
+    return modules

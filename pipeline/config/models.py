@@ -1,8 +1,8 @@
 """Compose the stages' option models into one configuration; the only reader of configs.
 
-A configuration holds one set of options per stage, and variants: named overrides of them. A variant is
-never a code path, only other options for the same chain of stages. A stage given as a bare word means its
-method: ``fit: plane`` is ``fit: {method: plane}``.
+A configuration holds one set of options per stage, and variants: named overrides of these options. All
+variants run the same chain of stages. A stage given as a single word is its method: ``fit: plane`` is
+``fit: {method: plane}``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flexroad.pipeline.config.methods import HOMES, methods
 from flexroad.tasks.options import Options
 
 TAG = {"segment": "method", "ecsrc": "method", "fit": "method", "sample": "method", "cluster": "kind"}
-"""The option that a bare word stands for, by stage or section."""
+"""Stage or section -> the option that a single word sets."""
 
 
 Chain = Mapping[str, Options]
@@ -29,12 +29,12 @@ Format = Literal["glb", "ply", "cog", "npz"]
 
 
 class Export(Options):
-    """What is written for the user, beside the metrics."""
+    """The products written for the user, besides the metrics."""
 
     variants: tuple[str, ...] = Field(
         ("flexroad",),
         min_length=1,
-        description="variants whose meshes are kept; query asks the first",
+        description="variants whose meshes are kept; query uses the first",
     )
     formats: tuple[Format, ...] = Field(
         ("glb", "ply", "cog", "npz"),
@@ -43,30 +43,30 @@ class Export(Options):
 
 
 class Config(BaseModel):
-    """A whole run: the chain of every variant, what is exported, and who works."""
+    """The configuration of a run: the chain of every variant, the export and the cluster."""
 
     model_config = {"frozen": True, "arbitrary_types_allowed": True}
 
     name: str
     chains: dict[str, dict[str, Any]]
-    """Variant -> stage -> options (`Options`), in the file's and the paper's order."""
+    """Variant -> stage -> options (`Options`); variants in the file's order, stages in the paper's."""
     export: Export
     cluster: Cluster
     dataset: dict[str, Any]
-    """Where a published dataset's files lie: for `catalog.sources`, which checks it."""
+    """Locations of a published dataset's files; validated and used by `catalog.sources`."""
     raw: dict[str, Any]
-    """The resolved file, as written to the run's config.yaml."""
+    """The file with `extends` resolved, as written to the run's config.yaml."""
 
 
 @cache
 def stage_models() -> dict[str, TypeAdapter[Options]]:
-    """Return what validates the options of each stage, in the paper's order."""
-    found: dict[str, TypeAdapter[Options]] = {}
+    """Return the validator of each stage's options, in the paper's order."""
+    adapters: dict[str, TypeAdapter[Options]] = {}
     for stage in HOMES:
         models: Any = tuple(dict.fromkeys(module.Options for module in methods(stage).values()))
         chosen: Any = models[0]
         if len(models) > 1:
-            union: Any = Union[models]  # noqa: UP007 (which models there are is known only now)
+            union: Any = Union[models]  # noqa: UP007 (the models are only known at run time)
             chosen = Annotated[union, Field(discriminator="method")]
-        found[stage] = TypeAdapter(chosen)
-    return found
+        adapters[stage] = TypeAdapter(chosen)
+    return adapters

@@ -1,4 +1,4 @@
-"""A configuration file described: its JSON schema, and a template with every option."""
+"""Description of a configuration file: its JSON schema, and a template with every option."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def schema() -> dict[str, Any]:
     variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
     properties = {
         "extends": {"type": "string", "description": "name of the configuration this one overrides"},
-        "dataset": {"type": "object", "description": "where a dataset's files lie: layers, road_values, crs"},
+        "dataset": {"type": "object", "description": "a dataset's files: layers, road_values, crs"},
         **stages,
         "export": Export.model_json_schema(),
         "cluster": {"anyOf": [{"type": "string"}, Cluster.model_json_schema()]},
@@ -29,7 +29,7 @@ def schema() -> dict[str, Any]:
 
 
 def template() -> str:
-    """Return a configuration file with every option at its default and its meaning beside it."""
+    """Return a configuration file with every option at its default, each with its description."""
     lines = ["# Every option with its default. Delete what you do not change."]
     for stage in HOMES:
         default = DEFAULTS.get(stage, "")

@@ -9,13 +9,13 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.filter import planar
 
 
-def test_every_shipped_configuration_is_valid():
+def test_shipped_configurations_are_valid():
     assert {"paper", "nightly"} <= set(shipped())
     for name in shipped():
         assert load_config(name).chains
 
 
-def test_paper_is_the_paper():
+def test_paper_configuration_has_parameters_of_the_paper():
     chains = load_config("paper").chains
     assert list(chains) == ["plane", "rgt", "flexroad"]
     full = chains["flexroad"]
@@ -29,7 +29,7 @@ def test_paper_is_the_paper():
     assert chains["rgt"]["sample"].method == "uniform"
 
 
-def test_an_override_keeps_the_base_unless_the_method_changes():
+def test_override_with_same_method_keeps_base_options():
     raw = {
         "fit": {"method": "nurbs", "degree": 5},
         "variants": {"a": {"fit": {"iterations": 7}}, "b": {"fit": "plane"}, "c": None},
@@ -40,7 +40,7 @@ def test_an_override_keeps_the_base_unless_the_method_changes():
     assert chains["c"]["fit"].degree == 5
 
 
-def test_extends(tmp_path):
+def test_extends_merges_over_parent(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("extends: paper\nfit: {degree: 2}\nvariants: {flexroad: {}}\n")
     config = load_config(path)
@@ -49,7 +49,7 @@ def test_extends(tmp_path):
     assert config.chains["flexroad"]["fit"].learning_rate == 0.1
 
 
-def test_another_filter_starts_from_its_own_defaults(tmp_path):
+def test_override_with_other_filter_uses_its_defaults(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("extends: paper\necsrc: planar\nvariants: {flexroad: {}, bare: {ecsrc: off}}\n")
     chains = load_config(path).chains
@@ -76,14 +76,14 @@ def test_another_filter_starts_from_its_own_defaults(tmp_path):
         ({"fit": {"degree": 5, "control_points": [4, 20]}}, "x: fit"),
     ],
 )
-def test_what_is_wrong_is_named_in_one_line(raw, message):
+def test_compose_invalid_option_raises_one_line(raw, message):
     with pytest.raises(ConfigError) as caught:
         compose(raw, "x")
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_are_none(tmp_path):
+def test_load_config_unusable_file_raises(tmp_path):
     with pytest.raises(ConfigError, match="did you mean paper"):
         load_config("papr")
     bad = tmp_path / "bad.yaml"
@@ -95,14 +95,14 @@ def test_files_that_are_none(tmp_path):
         load_config(bad)
 
 
-def test_template_is_the_default():
+def test_template_equals_default_configuration():
     raw = yaml.safe_load(template())
     filled, empty = compose(raw, "x"), compose({}, "x")
     assert filled.chains == empty.chains
     assert filled.export == empty.export
 
 
-def test_schema_knows_every_stage_and_option():
+def test_schema_contains_every_stage_and_option():
     properties = schema()["properties"]
     assert list(properties) == [
         "extends", "dataset", "load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export",
