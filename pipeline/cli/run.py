@@ -291,11 +291,11 @@ def _tell(run: Run, as_json: bool) -> None:
     import json
     from dataclasses import asdict
 
-    from flexroad.pipeline.run.lock import at_work, death_of, owner
+    from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
     from flexroad.pipeline.run.status import progress, summary
 
     who = owner(run.path)
-    alive = who if who and not death_of(who) else None
+    alive = who if who and not exit_reason(who) else None
     if as_json:
         found = asdict(summary(run))
         found["failures"] = [{k: v for k, v in one.items() if k != "trace"} for one in found["failures"]]
@@ -305,6 +305,6 @@ def _tell(run: Run, as_json: bool) -> None:
     how, pace = progress(run, alive) if alive else (summary(run), "")
     typer.echo(format_summary(how))
     if who:
-        typer.echo(at_work(who) + pace)
+        typer.echo(describe_owner(who) + pace)
     for failure in how.failures:
         typer.echo(f"  {failure.notice}")

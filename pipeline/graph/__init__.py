@@ -1,1 +1,1 @@
-"""The paper as a graph: tile x variant x stage, every node named by what makes it."""
+"""The paper as a graph of tile x variant x stage; each node is identified by a fingerprint."""

@@ -1,4 +1,4 @@
-"""The steps of the paper: which there are, what each takes, and the file that does it.
+"""The stages of the paper: their names, their inputs and the file of each.
 
 ::
 
@@ -7,10 +7,10 @@
     ecsrc     tasks/filter/METHOD.py      the filtered mask M^{r+} (step B, Algorithm 1)
     fit       tasks/fit/METHOD.py         the surface S (step C)
     sample    tasks/sample.py             the mesh (dynamic surface sampling)
-    evaluate  tasks/metrics/evaluate.py   its error, its smoothness and its size
+    evaluate  tasks/metrics/evaluate.py   error, smoothness and size of the mesh
     assess    tasks/quality/assess.py     flags and an error estimate without ground truth; not the paper's
 
-`pipeline.config.methods` finds the files.
+`pipeline.config.methods` imports the files.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from flexroad.tasks.options import Options
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the paper."""
+    """One stage of the paper."""
 
     name: str
     inputs: tuple[str, ...]
-    """Stages whose results it takes, in the order of its arguments."""
+    """Stages whose results are the arguments of its function, in that order."""
 
 
 STAGES = (
@@ -49,7 +49,7 @@ STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
 def stage_module(options: Options) -> ModuleType:
-    """Return the file that does the work: where the options' model is defined, with its `VERSION`."""
+    """Return the module that computes the stage: the one that defines the options' class and `VERSION`."""
     return sys.modules[type(options).__module__]
 
 
@@ -60,12 +60,12 @@ def stage_version(stage: str, options: Options) -> tuple[str, int]:
 
 
 def stage_function(stage: str, options: Options) -> Callable[..., Any]:
-    """Return what computes a stage with such options: the function of that name beside their model."""
+    """Return the function that computes a stage: the function named ``stage`` in the options' module."""
     function: Callable[..., Any] = getattr(stage_module(options), stage)
     return function
 
 
 def model_files(options: Options) -> tuple[Path, ...]:
-    """Return the files that only the options name, as their module's `files` tells them."""
+    """Return the files named by the options, such as a model: the result of their module's `files`."""
     files: Callable[[Options], tuple[Path, ...]] = getattr(stage_module(options), "files", lambda _: ())
     return files(options)

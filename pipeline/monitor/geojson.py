@@ -32,7 +32,7 @@ def write_states(run: Run, where: Location) -> None:
     from geopandas import GeoDataFrame
 
     left = {tile.id: tile for tile in run.catalog.tiles}
-    with RunDatabase.peek(run.path / DATABASE) as database:
+    with RunDatabase.open_readonly(run.path / DATABASE) as database:
         rows = [
             _row(left.pop(name), standing, entry, run.config.export.variants[0])
             for name, standing, entry in database.entries()

@@ -1,1 +1,1 @@
-"""A run: its record, its tiles, its lock and its log."""
+"""A run: its folder, its loop over the tiles, its lock, its event log and its status."""

@@ -1,12 +1,12 @@
-"""What happened in a run, one event a line: ``RUN/log.jsonl``, or ``RUN/log/<start>.jsonl`` in a bucket.
+"""The event log of a run, one JSON line per event: ``RUN/log.jsonl``, in a bucket ``RUN/log/<start>.jsonl``.
 
 ::
 
-    run    a run began: tiles, config, versions
-    stage  a stage of a tile, at the time it began: seconds, bytes written, peak memory (MB), host, pid,
+    run    start of a run: tiles, config, versions
+    stage  one stage of a tile, with its start time: seconds, bytes written, peak memory (MB), host, pid,
            nodes computed and reused
-    tile   a tile was tried: status, seconds, notes, failures
-    end    the run is over: how it stands, seconds
+    tile   a processed tile: status, seconds, notes, failures
+    end    end of the run: its summary, seconds
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from typing import IO, Any
 
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.storage.staging import StagedFile
-from flexroad.pipeline.worker.profiling import now
+from flexroad.pipeline.worker.profiling import utc_now
 from flexroad.pipeline.worker.tile import TileResult
 
 
 class EventLog:
-    """Appends events; use it as a context. A disk too full for the log is no reason to stop the tiles."""
+    """Appends events to the log; a context manager. Write errors (full disk) are ignored and stop no run."""
 
     def __init__(self, run: Location) -> None:
-        start = now().replace(":", "").replace("+0000", "Z")
+        start = utc_now().replace(":", "").replace("+0000", "Z")
         self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / "log.jsonl")
         self._file: IO[str] | None = None
 
@@ -42,17 +42,17 @@ class EventLog:
             self._staged.put()
         self._staged.close()
 
-    def note(self, event: str, time: str = "", **what: Any) -> None:
-        """Append one event, of now unless ``time`` says when."""
-        line = {"time": time or now(), "event": event, **what}
+    def note(self, event: str, time: str = "", **fields: Any) -> None:
+        """Append one event; ``time`` is its time (ISO 8601, UTC), by default the current time."""
+        line = {"time": time or utc_now(), "event": event, **fields}
         with contextlib.suppress(OSError):
             if self._file:
                 self._file.write(json.dumps(line) + "\n")
             self._staged.sync_if_due()
 
     def tile(self, result: TileResult) -> None:
-        """Append one event for every stage of a tile, and one for the tile."""
-        where: dict[str, Any] = {"host": result.host, "pid": result.pid}
+        """Append one event for each stage of a tile and one for the tile."""
+        process: dict[str, Any] = {"host": result.host, "pid": result.pid}
         for stage, span in result.spans.items():
             cost = {
                 "seconds": round(span.seconds, 4),
@@ -61,10 +61,10 @@ class EventLog:
                 "computed": span.computed,
                 "reused": span.reused,
             }
-            self.note("stage", span.time, tile=result.tile_id, stage=stage, **cost, **where)
-        told = {"status": result.status, "seconds": round(result.entry.seconds, 4)} | where
+            self.note("stage", span.time, tile=result.tile_id, stage=stage, **cost, **process)
+        fields = {"status": result.status, "seconds": round(result.entry.seconds, 4)} | process
         if result.notes:
-            told["notes"] = list(result.notes)
+            fields["notes"] = list(result.notes)
         if result.failures:
-            told["failures"] = [asdict(failure) for failure in result.failures]
-        self.note("tile", tile=result.tile_id, **told)
+            fields["failures"] = [asdict(failure) for failure in result.failures]
+        self.note("tile", tile=result.tile_id, **fields)

@@ -1,7 +1,7 @@
-"""``flexroad clean``: find what nobody needs any more, and drop it; whatever is not known for ours stays.
+"""``flexroad clean``: find and delete files that are no longer needed; files of other programs are kept.
 
-What is needed: of artefacts, all that the graphs of all runs of the store name, as their options and sources
-are now; of tiles, those in the run's catalog; of products, those of the tiles' items and of the export.
+Needed are: artefacts in the current graph of any run of the store; tiles in the run's catalog; products in
+the tiles' items or in the export options.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ARTEFACT = re.compile(r"([0-9a-f]{32})\.npz")
 
 @dataclass(frozen=True)
 class Garbage:
-    """A file that nobody needs."""
+    """A file that is no longer needed; ``size`` in bytes."""
 
     kind: Kind
     path: Location
@@ -49,96 +49,98 @@ class Garbage:
 
 
 @contextlib.contextmanager
-def exclusive(run: Run, without: Sequence[Location], say: Callable[[str], None]) -> Iterator[list[Run]]:
-    """Keep every other run of this run's store from working meanwhile; give them all, this one first.
+def exclusive(run: Run, without: Sequence[Location], notify: Callable[[str], None]) -> Iterator[list[Run]]:
+    """Lock all other runs of this run's store; a context manager that gives all runs, this one first.
 
     Parameters
     ----------
-    without : sequence of Place
-        Runs that are no more.
-    say : callable
-        Told of locks of dead holders.
+    run : Run
+        The run; the caller holds its lock.
+    without : sequence of Location
+        Runs to ignore because they no longer exist.
+    notify : callable
+        Receives one line when the lock of a dead process is taken over.
 
     Raises
     ------
     ConfigError
-        If one of them is at work, or cannot be read: what it needs is not known then.
+        If another run is active or cannot be read, so that its needed files are unknown.
     """
     with contextlib.ExitStack() as stack:
         runs = [run]
         for path in _others(run, without):
-            remedy = f"bring it back, or `flexroad clean {run.path} --forget {path}` if it is no more"
+            remedy = f"restore it, or `flexroad clean {run.path} --forget {path}` if it no longer exists"
             if not exists(path / "run.json"):
-                raise ConfigError(f"{path} uses the store {run.store}, but is not there; {remedy}")
-            stack.enter_context(run_lock(path, say))
+                raise ConfigError(f"{path} uses the store {run.store}, but is missing; {remedy}")
+            stack.enter_context(run_lock(path, notify))
             try:
                 runs.append(Run.open(path))
             except (CatalogError, ConfigError) as error:
                 raise ConfigError(
                     f"{path} uses the store {run.store}, but cannot be read ({error}); {remedy}"
                 ) from error
-        yield [one for one in runs if _same(one.store, run.store)]
+        yield [user for user in runs if _same(user.store, run.store)]
 
 
 def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
-    """Yield what nobody needs in the store of these runs, and in the folder of the first one.
+    """Yield the files that are not needed in the store of these runs and in the folder of the first run.
 
     Parameters
     ----------
     runs : sequence of Run
-        All that use the store.
+        All runs of the store.
 
     Raises
     ------
     ConfigError
-        If a model of theirs is missing: without it, it is not known what they need.
+        If a model of a run is missing, so that its needed artefacts are unknown.
     """
     first = runs[0]
     needed = _needed(runs)
     yield from _in_store(first.store, needed)
     yield from _in_tiles(first)
     for folder in (first.path, first.store):
-        # A bucket knows no temporary names.
+        # Buckets have no temporary files.
         if isinstance(folder, Path):
             files = [path for path in folder.glob(".*") if path.is_file()]
             yield from _temporary(folder, {path.name: path.stat().st_size for path in files})
 
 
-def delete(found: Iterable[Garbage]) -> Iterator[Garbage]:
-    """Remove the files, and folders that are empty then; yield each when it is gone."""
-    for one in found:
-        remove(one.path)
-        yield one
-        if isinstance(one.path, Path) and one.kind != "temporary files":
-            # Others' files stay, and so do their folders.
+def delete(garbage: Iterable[Garbage]) -> Iterator[Garbage]:
+    """Delete the files and the folders that become empty; yield each file after it was deleted."""
+    for file in garbage:
+        remove(file.path)
+        yield file
+        if isinstance(file.path, Path) and file.kind != "temporary files":
+            # A folder that still has files of other programs is kept: rmdir fails.
             with contextlib.suppress(OSError):
-                one.path.parent.rmdir()
+                file.path.parent.rmdir()
 
 
 def _others(run: Run, without: Sequence[Location]) -> list[Location]:
     """Return the other runs of the store."""
     try:
-        found = set(runs_using(run.store))
+        users = set(runs_using(run.store))
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
-            f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; mend or remove that file"
+            f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; correct or remove that file"
         ) from error
-    left = (path for path in found if not any(_same(path, one) for one in (run.path, *without)))
-    return sorted(left, key=str)
+    others = (path for path in users if not any(_same(path, known) for known in (run.path, *without)))
+    return sorted(others, key=str)
 
 
-def _same(one: Location, other: Location) -> bool:
-    return str(absolute(one)) == str(absolute(other))
+def _same(first: Location, second: Location) -> bool:
+    return str(absolute(first)) == str(absolute(second))
 
 
 def _needed(runs: Iterable[Run]) -> set[bytes]:
-    """Return the fingerprints of all artefacts that runs may take up."""
+    """Return the fingerprints of all artefacts that the runs may reuse."""
     needed: set[bytes] = set()
     for run in runs:
         check_models(run.config)
-        with RunDatabase.peek(run.path / DATABASE) as database:
-            for now in tile_statuses(run, database):
-                needed |= {bytes.fromhex(name) for name, node in now.graph.nodes.items() if node.stored}
+        with RunDatabase.open_readonly(run.path / DATABASE) as database:
+            for status in tile_statuses(run, database):
+                needed |= {bytes.fromhex(name) for name, node in status.graph.nodes.items() if node.stored}
     return needed
 
 
@@ -153,27 +155,27 @@ def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
 
 
 def _in_tiles(run: Run) -> Iterator[Garbage]:
-    known = {safe_name(tile.id): tile for tile in run.catalog.tiles}
-    ends = _ends(run.config.export.variants, run.config.export.formats)
-    ours = _ends(run.exported, SUFFIXES) | ends
-    with RunDatabase.peek(run.path / DATABASE) as database:
+    tiles = {safe_name(tile.id): tile for tile in run.catalog.tiles}
+    current = _ends(run.config.export.variants, run.config.export.formats)
+    ever = _ends(run.exported, SUFFIXES) | current
+    with RunDatabase.open_readonly(run.path / DATABASE) as database:
         for folder, files in _folders(run.path / "tiles"):
             yield from _temporary(folder, files)
-            made = [folder.name + end for end in sorted(ours) if folder.name + end in files]
-            tile = known.get(folder.name)
+            products = [folder.name + end for end in sorted(ever) if folder.name + end in files]
+            tile = tiles.get(folder.name)
             if tile is None:
-                # The markers last: a tile half dropped is found again.
+                # Markers come last, so that an interrupted deletion is continued by the next clean.
                 markers = [name for name in (DONE, FAILED) if name in files]
-                yield from (Garbage("tiles", folder / name, files[name]) for name in [*made, *markers])
+                yield from (Garbage("tiles", folder / name, files[name]) for name in [*products, *markers])
             elif entry := database.get(tile.id):
-                kept = {folder.name + end for end in ends} | entry.sizes.keys()
+                kept = {folder.name + end for end in current} | entry.sizes.keys()
                 yield from (
-                    Garbage("products", folder / name, files[name]) for name in made if name not in kept
+                    Garbage("products", folder / name, files[name]) for name in products if name not in kept
                 )
 
 
 def _ends(variants: Iterable[str], formats: Iterable[str]) -> set[str]:
-    """Return what names of products end with, after the tile's."""
+    """Return the ends of product file names, after the tile's name."""
     return {f"_{variant}{end}" for variant in variants for kind in formats for end in SUFFIXES[kind]}
 
 
@@ -183,16 +185,16 @@ def _temporary(folder: Location, files: dict[str, int]) -> Iterator[Garbage]:
             yield Garbage("temporary files", folder / name, size)
 
 
-def _folders(above: Location) -> Iterator[tuple[Location, dict[str, int]]]:
-    """Yield the folders directly below one, with the sizes of their files; folder by folder on disk."""
-    if isinstance(above, Path):
-        names = sorted(path.name for path in above.iterdir() if path.is_dir()) if above.is_dir() else []
+def _folders(parent: Location) -> Iterator[tuple[Location, dict[str, int]]]:
+    """Yield the folders directly below ``parent`` with the sizes of their files (bytes) by name."""
+    if isinstance(parent, Path):
+        names = sorted(path.name for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
         for name in names:
-            yield above / name, {file: seen.size for file, seen in listing(above / name).items()}
+            yield parent / name, {file: stat.size for file, stat in listing(parent / name).items()}
         return
-    found: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for path, seen in listing(above).items():
+    folders: defaultdict[str, dict[str, int]] = defaultdict(dict)
+    for path, stat in listing(parent).items():
         folder, slash, file = path.partition("/")
         if slash:
-            found[folder][file] = seen.size
-    yield from ((above / name, files) for name, files in found.items())
+            folders[folder][file] = stat.size
+    yield from ((parent / name, files) for name, files in folders.items())

@@ -1,9 +1,9 @@
-"""One run at a time in a run folder: a lock that names its holder, and that nobody keeps who is dead.
+"""The lock of a run folder: one process at a time may write a run; the lock of a dead process is taken over.
 
-``RUN/lock.json`` says who holds it. Of a holder on this machine the process table tells whether it lives,
-whatever the clocks say; of one elsewhere the file's own time, which it renews every half minute, compared by
-the storage's clock. Before such a lock is taken over it is watched for a while, so that a clock that jumped
-does no harm, either.
+``RUN/lock.json`` holds the owner: host, process id and start time. If the owner is on this machine, the
+process table shows whether it is alive, independent of any clock. An owner on another machine renews the
+file's time every 30 s; the age of the file is measured with the storage's clock. Before such a lock is taken
+over, it is observed for a while, so that a clock that jumped cannot make a living owner lose it.
 """
 
 from __future__ import annotations
@@ -27,33 +27,39 @@ from flexroad.pipeline.run.lock_file import LockFile, LockStat, OnDisk
 
 NAME = "lock.json"
 TRIES = 20
+"""Attempts to take a lock that changes or is just being written."""
 
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """How often a holder gives a sign of life, and when others miss it."""
+    """Timing of lock renewal."""
 
-    beat_s: float = 30
+    interval_s: float = 30
+    """Interval at which the owner renews its lock (s)."""
     stale_s: float = 300
+    """Age at which an owner on another machine counts as dead (s)."""
 
 
 @dataclass(frozen=True)
 class Owner:
-    """A process that may hold a lock."""
+    """The process that holds a lock, as written to lock.json."""
 
     host: str
     machine: str
-    """Tells machines of one name apart, and containers that count processes for themselves."""
+    """Machine id and process namespace: distinguishes machines of the same name, and containers."""
     boot: str
+    """Boot id of the machine, new after each restart."""
     pid: int
     start: int
-    """When the process started, in ticks since the machine did; 0 where that cannot be told."""
+    """Start time of the process in clock ticks since boot; 0 if unknown."""
     since: str
+    """Time at which the lock was requested, ISO 8601 in UTC."""
     token: str
+    """Random hexadecimal text, unique to this lock."""
 
     @classmethod
     def me(cls) -> Owner:
-        """Return this process."""
+        """Return this process as an owner."""
         return cls(
             host=socket.gethostname(),
             machine=f"{_read('/etc/machine-id')} {_namespace()}".strip(),
@@ -66,7 +72,7 @@ class Owner:
 
     @classmethod
     def of(cls, data: bytes) -> Owner | None:
-        """Return who wrote a lock, or None if it is damaged or half-written."""
+        """Return the owner in the content of a lock file, None if it is damaged or incomplete."""
         try:
             return cls(**json.loads(data))
         except (ValueError, TypeError):
@@ -74,11 +80,11 @@ class Owner:
 
     @property
     def data(self) -> bytes:
-        """The content of the lock."""
+        """The content of the lock file."""
         return json.dumps(asdict(self), indent=1).encode()
 
-    def gone(self, here: Owner, started: Callable[[int], int | None]) -> str | None:
-        """Tell why this holder, on the machine of ``here``, no longer lives; None if it does."""
+    def exit_reason(self, here: Owner) -> str | None:
+        """Return why this owner, on the machine of ``here``, counts as dead; None if it is alive."""
         if self.boot != here.boot:
             return f"{self.host} was restarted since"
         start = started(self.pid)
@@ -89,59 +95,63 @@ class Owner:
         return None
 
 
-def death_of(who: Owner) -> str | None:
-    """Tell why a holder is known to be dead: a process of this machine that is gone; None if it may live."""
+def exit_reason(holder: Owner) -> str | None:
+    """Return why an owner is dead, if it is a process of this machine that has exited; else None."""
     here = Owner.me()
-    return who.gone(here, started) if (who.host, who.machine) == (here.host, here.machine) else None
+    return holder.exit_reason(here) if (holder.host, holder.machine) == (here.host, here.machine) else None
 
 
-def at_work(who: Owner) -> str:
-    """Return a line about who holds a run's lock."""
-    why = death_of(who)
-    name = f"pid {who.pid} on {who.host}"
-    return f"{name} ended in the middle ({why})" if why else f"{name} at work since {who.since}"
+def describe_owner(holder: Owner) -> str:
+    """Return one line about the owner of a run's lock: its process, and its start time or why it ended."""
+    reason = exit_reason(holder)
+    name = f"pid {holder.pid} on {holder.host}"
+    if reason:
+        return f"{name} ended before the run was complete ({reason})"
+    return f"{name} at work since {holder.since}"
 
 
 @contextlib.contextmanager
 def run_lock(
-    run: Location, say: Callable[[str], None] = lambda line: None, pace: Heartbeat | None = None
+    run: Location, notify: Callable[[str], None] = lambda line: None, heartbeat: Heartbeat | None = None
 ) -> Iterator[None]:
-    """Hold a run folder's lock.
+    """Hold the lock of a run folder; a context manager.
 
     Parameters
     ----------
-    run : Place
-        The folder, which must be there if it is on disk.
-    say : callable
-        Told, in one line, of a dead holder's lock taken over.
+    run : Location
+        The run folder; on disk it must exist.
+    notify : callable
+        Receives one line when the lock of a dead process is observed or taken over, or this lock is lost.
+    heartbeat : Heartbeat, optional
+        Timing of renewal.
 
     Raises
     ------
     ConfigError
-        If another process holds it, or nothing can be written there.
+        If another process holds the lock, or the folder is not writable.
     """
-    lock = _Lock(run, _file(run / NAME), Owner.me(), say, pace or Heartbeat())
+    lock = _Lock(run, _lock_file(run / NAME), Owner.me(), notify, heartbeat or Heartbeat())
     try:
         lock.take()
     except FileNotFoundError as error:
         raise ConfigError(f"{run} is no run; make one with `flexroad run --out {run}`") from error
     except OSError as error:
         raise ConfigError(
-            f"cannot write the run to {run}: {error}; mend that or choose another --out"
+            f"cannot write the run to {run}: {error}; correct that or choose another --out"
         ) from error
-    over = threading.Event()
-    beating = threading.Thread(target=lock.beat, args=(over,), name="lock", daemon=True)
-    beating.start()
+    stop = threading.Event()
+    renewal = threading.Thread(target=lock.renew_until, args=(stop,), name="lock", daemon=True)
+    renewal.start()
     try:
         yield
     finally:
-        over.set()
-        beating.join()
+        stop.set()
+        renewal.join()
         lock.release()
 
 
 def owner(run: Location) -> Owner | None:
-    """Return who holds a run's lock, dead or alive, or None if nobody does; takes and writes nothing."""
+    """Return the owner of a run's lock, dead or alive, None if it is free; does not change the lock."""
     try:
         return Owner.of(read(run / NAME))
     except OSError:
@@ -149,19 +159,20 @@ def owner(run: Location) -> Owner | None:
 
 
 def started(pid: int) -> int | None:
-    """Return when a process of this machine started, 0 if that cannot be told, None if there is none.
+    """Return the start time of a process of this machine, 0 if it is unknown, None if it has exited.
 
-    In ticks since the machine's start, which no setting of the clock changes.
+    The time is in clock ticks since boot, so that setting the clock does not change it.
     """
     try:
-        told = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return _hidden(pid)
-    # A dead process that nobody buried is dead.
-    return None if told[0] in "ZX" else int(told[19])
+        return _start_without_proc(pid)
+    # Z (zombie) and X (dead): the process has exited, but its parent has not waited for it.
+    return None if fields[0] in "ZX" else int(fields[19])
 
 
-def _hidden(pid: int) -> int | None:
+def _start_without_proc(pid: int) -> int | None:
+    """Return 0 if a process exists whose start time cannot be read, None if it does not exist."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -176,80 +187,82 @@ class _Lock:
     run: Location
     file: LockFile
     me: Owner
-    say: Callable[[str], None]
-    pace: Heartbeat
+    notify: Callable[[str], None]
+    heartbeat: Heartbeat
 
     def take(self) -> None:
-        """Become the holder; of several that try at once, one does."""
+        """Become the owner; if several processes try at the same time, exactly one succeeds."""
         for _ in range(TRIES):
             if self.file.create(self.me.data):
                 return
-            seen = self.file.look()
-            if seen is None:
+            current = self.file.read()
+            if current is None:
                 continue
-            if seen.data == self.me.data:
-                # The bucket's answer was lost, and what was asked again was refused.
+            if current.data == self.me.data:
+                # The bucket's first response was lost, and the repeated request was rejected.
                 return
-            who = Owner.of(seen.data)
-            why = self._dead(who, seen)
-            if why and self.file.replace(seen, self.me.data):
-                self.say(f"took over the lock of {_name(who)}: {why}")
+            holder = Owner.of(current.data)
+            reason = self._dead(holder, current)
+            if reason and self.file.replace(current, self.me.data):
+                self.notify(f"took over the lock of {_name(holder)}: {reason}")
                 return
-            if not why and (who is not None or seen.data):
-                raise ConfigError(self._refusal(who, seen))
-            # Somebody is just writing it, or was faster: look again.
+            if not reason and (holder is not None or current.data):
+                raise ConfigError(self._refusal(holder, current))
+            # Another process is writing the file or has just replaced it: read it again.
             time.sleep(0.05)
-        raise ConfigError(f"{self.run / NAME} cannot be read; if no run goes on there, remove it")
+        raise ConfigError(f"{self.run / NAME} cannot be read; if no run is active there, remove it")
 
-    def beat(self, over: threading.Event) -> None:
-        """Give signs of life until it is over; a lock that another has by now ends this process's run."""
-        while not over.wait(self.pace.beat_s):
-            # A storage out of reach for a while is no reason to stop.
+    def renew_until(self, stop: threading.Event) -> None:
+        """Renew the lock until ``stop`` is set; if another process has taken it over, end this process."""
+        while not stop.wait(self.heartbeat.interval_s):
+            # Storage that is temporarily out of reach does not stop the run.
             with contextlib.suppress(OSError):
-                seen = self.file.look()
-                if seen is None:
+                current = self.file.read()
+                if current is None:
                     self.file.create(self.me.data)
-                elif seen.data == self.me.data:
-                    self.file.beat(seen)
+                elif current.data == self.me.data:
+                    self.file.renew(current)
                 else:
-                    self.say(f"{_name(Owner.of(seen.data))} took over the lock of {self.run}: this run ends")
-                    # Not the signal of Ctrl-C, to which background jobs are deaf.
+                    name = _name(Owner.of(current.data))
+                    self.notify(f"{name} took over the lock of {self.run}: this run ends")
+                    # SIGTERM, because background jobs of a shell ignore SIGINT.
                     os.kill(os.getpid(), signal.SIGTERM)
                     return
 
     def release(self) -> None:
-        """Give it back, if it is still ours."""
+        """Remove the lock if this process still owns it."""
         with contextlib.suppress(OSError):
-            seen = self.file.look()
-            if seen is not None and seen.data == self.me.data:
-                self.file.remove(seen)
+            current = self.file.read()
+            if current is not None and current.data == self.me.data:
+                self.file.remove(current)
 
-    def _dead(self, who: Owner | None, seen: LockStat) -> str | None:
-        """Tell why a lock's holder counts as dead; None if it may live."""
-        if who is not None and (who.host, who.machine) == (self.me.host, self.me.machine):
-            return death_of(who)
-        if abs(seen.age_s) <= self.pace.stale_s:
+    def _dead(self, holder: Owner | None, current: LockStat) -> str | None:
+        """Return why the owner counts as dead, None if it may be alive."""
+        if holder is not None and (holder.host, holder.machine) == (self.me.host, self.me.machine):
+            return exit_reason(holder)
+        if abs(current.age_s) <= self.heartbeat.stale_s:
             return None
-        watch_s = 1.5 * self.pace.beat_s
-        self.say(f"watching the lock of {_name(who)} for {watch_s:.0f} s, to see whether it lives")
+        watch_s = 1.5 * self.heartbeat.interval_s
+        self.notify(f"watching the lock of {_name(holder)} for {watch_s:.0f} s, to see whether it is renewed")
         time.sleep(watch_s)
-        again = self.file.look()
-        if again is None or again.written != seen.written:
+        later = self.file.read()
+        if later is None or later.written != current.written:
             return None
-        return f"no sign of life for {watch_s if seen.age_s < 0 else seen.age_s:.0f} s"
+        return f"no sign of life for {watch_s if current.age_s < 0 else current.age_s:.0f} s"
 
-    def _refusal(self, who: Owner | None, seen: LockStat) -> str:
-        text = f"{self.run} is in use by {_name(who)}{f' since {who.since}' if who else ''}"
-        if who is not None and (who.host, who.machine) == (self.me.host, self.me.machine):
-            return f"{text}; wait for it, or end it with `kill {who.pid}`"
-        # From here only its signs of life can be seen.
+    def _refusal(self, holder: Owner | None, current: LockStat) -> str:
+        """Return the error message for a lock that another process holds."""
+        text = f"{self.run} is in use by {_name(holder)}{f' since {holder.since}' if holder else ''}"
+        if holder is not None and (holder.host, holder.machine) == (self.me.host, self.me.machine):
+            return f"{text}; wait for it, or end it with `kill {holder.pid}`"
+        # A process on another machine can be judged only by the age of its lock.
         return (
-            f"{text}, last sign of life {abs(seen.age_s):.0f} s ago; "
-            f"if it is dead, the same command takes over {self.pace.stale_s:.0f} s after the last one"
+            f"{text}, last sign of life {abs(current.age_s):.0f} s ago; "
+            f"if it is dead, the same command takes over {self.heartbeat.stale_s:.0f} s after the last one"
         )
 
 
-def _file(path: Location) -> LockFile:
+def _lock_file(path: Location) -> LockFile:
     if isinstance(path, Path):
         return OnDisk(path)
     from flexroad.pipeline.run.lock_object import InBucket
@@ -257,8 +270,8 @@ def _file(path: Location) -> LockFile:
     return InBucket(path)
 
 
-def _name(who: Owner | None) -> str:
-    return f"pid {who.pid} on {who.host}" if who else "somebody unknown (it is damaged)"
+def _name(holder: Owner | None) -> str:
+    return f"pid {holder.pid} on {holder.host}" if holder else f"an unknown process ({NAME} is damaged)"
 
 
 def _read(path: str) -> str:
@@ -269,6 +282,7 @@ def _read(path: str) -> str:
 
 
 def _namespace() -> str:
+    """Return the process namespace, which differs between containers; ``""`` if it is unknown."""
     try:
         return str(Path("/proc/self/ns/pid").readlink())
     except OSError:

@@ -1,6 +1,6 @@
-"""The file of a lock: made only where there is none, replaced only if it is still the one seen.
+"""The file of a lock: created only if it does not exist, replaced only if unchanged since it was read.
 
-Its age is told by the clock of the storage alone: the time of a file written just now less its own.
+Its age is measured with the clock of the storage: the time of a file written now minus its own time.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from flexroad.catalog.storage.paths import write
 
 @dataclass(frozen=True)
 class LockStat:
-    """A lock as it was seen."""
+    """Content, time and version of a lock file when it was read."""
 
     data: bytes
     written: float
-    """Time of the last heartbeat by the storage's clock."""
+    """Time of the last renewal by the storage's clock (s since the epoch)."""
     age_s: float
-    """How long ago that was; negative where the clock was set back since."""
+    """Time since the last renewal (s); negative if the clock was set back."""
     version: str = ""
-    """What the bucket calls it."""
+    """ETag of the object in a bucket; empty on disk."""
 
 
 class LockFile(Protocol):
-    """What a lock asks of the storage; everything may raise OSError."""
+    """The storage operations of a lock; each may raise OSError."""
 
     def create(self, data: bytes) -> bool:
-        """Make it; False if there is one."""
+        """Create the file; False if it exists."""
 
-    def look(self) -> LockStat | None:
-        """Return it, or None if there is none."""
+    def read(self) -> LockStat | None:
+        """Return content and age of the file, None if it does not exist."""
 
-    def replace(self, seen: LockStat, data: bytes) -> bool:
-        """Put another in its place; False if it is no longer the one seen."""
+    def replace(self, expected: LockStat, data: bytes) -> bool:
+        """Replace the content; False if the file has changed since ``expected`` was read."""
 
-    def beat(self, seen: LockStat) -> None:
-        """Renew its time."""
+    def renew(self, expected: LockStat) -> None:
+        """Set the file's time to now."""
 
-    def remove(self, seen: LockStat) -> None:
-        """Take it away if it is still the one seen."""
+    def remove(self, expected: LockStat) -> None:
+        """Remove the file if it has not changed since ``expected`` was read."""
 
 
 @dataclass(frozen=True)
 class OnDisk:
-    """A file in a folder, of this machine or of a network."""
+    """A lock file on a local or network disk."""
 
     path: Path
 
     def create(self, data: bytes) -> bool:
-        """Make it; False if there is one."""
+        """Create the file; False if it exists."""
         try:
             descriptor = os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
         except FileExistsError:
@@ -68,47 +68,47 @@ class OnDisk:
             raise
         return True
 
-    def look(self) -> LockStat | None:
-        """Return it, or None if there is none."""
+    def read(self) -> LockStat | None:
+        """Return content and age of the file, None if it does not exist."""
         try:
             with self.path.open("rb") as file:
                 data, written = file.read(), os.fstat(file.fileno()).st_mtime
         except FileNotFoundError:
             return None
         age_s = 0.0
-        # On a full disk no age can be told: others' locks count as young, and one's own is given back.
+        # On a full disk the age is unknown and 0 is returned, so that locks of other processes stay valid.
         with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=self.path.parent) as probe:
             age_s = os.fstat(probe.fileno()).st_mtime - written
         return LockStat(data, written, age_s)
 
-    def replace(self, seen: LockStat, data: bytes) -> bool:
-        """Put another in its place; False if it is no longer the one seen."""
+    def replace(self, expected: LockStat, data: bytes) -> bool:
+        """Replace the content; False if the file has changed since ``expected`` was read."""
         with contextlib.ExitStack() as stack:
-            same = self._guarded(stack, seen)
-            if same:
+            unchanged = self._locked_unchanged(stack, expected)
+            if unchanged:
                 write(self.path, data)
-        return same
+        return unchanged
 
-    def beat(self, seen: LockStat) -> None:
-        """Renew its time."""
-        # Without a time of ours, a network's server takes its own.
+    def renew(self, expected: LockStat) -> None:
+        """Set the file's time to now."""
+        # Without an explicit time, a network file server uses its own clock.
         os.utime(self.path)
 
-    def remove(self, seen: LockStat) -> None:
-        """Take it away if it is still the one seen."""
+    def remove(self, expected: LockStat) -> None:
+        """Remove the file if it has not changed since ``expected`` was read."""
         with contextlib.ExitStack() as stack:
-            if self._guarded(stack, seen):
+            if self._locked_unchanged(stack, expected):
                 self.path.unlink()
 
-    def _guarded(self, stack: contextlib.ExitStack, seen: LockStat) -> bool:
-        """Keep others from replacing this very file for a moment; tell whether it is the one seen."""
+    def _locked_unchanged(self, stack: contextlib.ExitStack, expected: LockStat) -> bool:
+        """Lock the file with flock until ``stack`` is closed; return whether its content is as expected."""
         try:
             file = stack.enter_context(self.path.open("rb+"))
-            # Where the file system knows no such locks, two may replace it in the same millisecond.
+            # On a file system without flock, two processes could replace the file at the same moment.
             with contextlib.suppress(OSError):
                 fcntl.flock(file, fcntl.LOCK_EX)
-            # Whoever waited here finds that the name leads to another file by now.
-            named = os.path.samestat(os.fstat(file.fileno()), self.path.stat())
+            # While this process waited for flock, another may have replaced the file.
+            same_file = os.path.samestat(os.fstat(file.fileno()), self.path.stat())
         except FileNotFoundError:
             return False
-        return named and file.read() == seen.data
+        return same_file and file.read() == expected.data

@@ -1,4 +1,4 @@
-"""The file of a lock in object storage: conditional requests do what a disk's exclusive creation does."""
+"""The file of a lock in object storage, created and replaced by conditional requests."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from flexroad.catalog.storage.paths import named, read, remove
 from flexroad.pipeline.run.lock_file import LockStat
 
 REFUSED = (409, 412)
-"""Answers to a conditional request: another came in between, a condition not met."""
+"""HTTP status of a rejected conditional request: a conflicting request, or the condition is not met."""
 
 
 @dataclass(frozen=True)
 class InBucket:
-    """An object that is replaced only if it is still the one seen."""
+    """A lock file in a bucket."""
 
     path: UPath
 
     def create(self, data: bytes) -> bool:
-        """Make it; False if there is one."""
+        """Create the object; False if it exists."""
         try:
             return self._put(data, REFUSED, IfNoneMatch="*")
         except FileNotFoundError as error:
             raise OSError(errno.EIO, "there is no such bucket", str(self.path)) from error
 
-    def look(self) -> LockStat | None:
-        """Return it, or None if there is none."""
+    def read(self) -> LockStat | None:
+        """Return content, age and ETag of the object, None if it does not exist."""
         bucket, key, _ = self.path.fs.split_path(self.path.path)
         try:
             with named(self.path):
@@ -39,24 +39,26 @@ class InBucket:
         except FileNotFoundError:
             return None
         written = head["LastModified"].timestamp()
-        # Every answer tells the server's own time.
+        # The server's time is a header of every response.
         now = parsedate_to_datetime(head["ResponseMetadata"]["HTTPHeaders"]["date"]).timestamp()
         return LockStat(data, written, now - written, head["ETag"])
 
-    def replace(self, seen: LockStat, data: bytes) -> bool:
-        """Put another in its place; False if it is no longer the one seen."""
-        return self._put(data, (404, *REFUSED), IfMatch=seen.version)
+    def replace(self, expected: LockStat, data: bytes) -> bool:
+        """Replace the content; False if the object has changed since ``expected`` was read."""
+        return self._put(data, (404, *REFUSED), IfMatch=expected.version)
 
-    def beat(self, seen: LockStat) -> None:
-        """Renew its time."""
-        self.replace(seen, seen.data)
+    def renew(self, expected: LockStat) -> None:
+        """Set the object's time to now, by writing the same content."""
+        self.replace(expected, expected.data)
 
-    def remove(self, seen: LockStat) -> None:
-        """Take it away, seen a moment ago."""
-        # Not every storage knows conditions on that; only who was silent for minutes can have lost it since.
+    def remove(self, expected: LockStat) -> None:
+        """Remove the object; the caller has just read it."""
+        # Not all storages support conditional deletion. Another process takes a lock over only if it has not
+        # been renewed for minutes.
         remove(self.path)
 
     def _put(self, data: bytes, refusals: tuple[int, ...], **condition: str) -> bool:
+        """Write the object under a condition; False if the storage answers with one of ``refusals``."""
         try:
             with named(self.path):
                 self.path.fs.pipe_file(self.path.path, data, **condition)
@@ -68,7 +70,7 @@ class InBucket:
 
 
 def _status(error: BaseException | None) -> int | None:
-    """Return the HTTP status that an error goes back to."""
+    """Return the HTTP status of an error or of its causes, None if it has none."""
     while error is not None:
         response: dict[str, Any] | None = getattr(error, "response", None)
         if isinstance(response, dict):

@@ -1,9 +1,9 @@
-"""A run: a folder that remembers what was asked, and the loop that brings its tiles up to date.
+"""A run: the folder with its configuration, catalog and results.
 
 ::
 
     RUN/config.yaml      the configuration, resolved
-    RUN/catalog.parquet  the tiles asked for
+    RUN/catalog.parquet  the tiles of the run
     RUN/run.json         store, origin, versions
     RUN/tiles/           products and markers
     RUN/store/           artefacts, unless the store is shared
@@ -59,13 +59,15 @@ class Run:
     catalog: Catalog
     store: Location
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) all meshes are placed against; fixed when the run is made."""
+    """Whole-metre (easting, northing) that mesh translations are relative to; fixed when the run is made."""
     checksum: bool
+    """Whether fingerprints hash the bytes of source files instead of their size and time."""
     versions: dict[str, str]
+    """Versions of Python and of the packages in `PACKAGES`."""
     allowed: tuple[str, ...] = ()
-    """Folders and addresses outside the catalog's own that sources may lie in."""
+    """Folders and addresses outside the catalog's folder that sources may be read from."""
     exported: tuple[str, ...] = ()
-    """Variants whose products the run has, or had when its configuration was another."""
+    """Variants exported by this or an earlier configuration of the run."""
 
     @classmethod
     def create(
@@ -77,7 +79,7 @@ class Run:
         checksum: bool = False,
         allowed: Sequence[str] = (),
     ) -> Run:
-        """Make a run folder, or bring an old one up to date with a new configuration or catalog.
+        """Create a run folder, or update an existing one with a new configuration or catalog.
 
         Raises
         ------
@@ -86,12 +88,12 @@ class Run:
         """
         check_models(config)
         old = _record(path)
-        # Meshes of before are placed against it: the last summary has it, too.
+        # Existing meshes are relative to the earlier origin, which the last summary contains, too.
         origin = (old or read_summary(path)).get("origin") or _origin(catalog)
         store = store or (parse_location(old["store"]) if old and old["shared_store"] else path / "store")
         exported = _exported(old, config)
-        place_of = (origin[0], origin[1])
-        run = cls(path, config, catalog, store, place_of, checksum, versions(), tuple(allowed), exported)
+        origin = (origin[0], origin[1])
+        run = cls(path, config, catalog, store, origin, checksum, versions(), tuple(allowed), exported)
         try:
             for folder in (path, store):
                 check_writable(folder)
@@ -105,64 +107,64 @@ class Run:
 
     @classmethod
     def open(cls, path: Location | str) -> Run:
-        """Open a run made before, with its configuration and catalog as they are now.
+        """Open an existing run with its current configuration and catalog.
 
         Raises
         ------
         ConfigError
-            If the folder is no run, or its configuration was edited into something invalid.
+            If the folder is no run, or its configuration is invalid.
         CatalogError
             If its catalog is damaged.
         """
         path = parse_location(path)
-        found = _record(path)
-        if found is None:
+        record = _record(path)
+        if record is None:
             raise ConfigError(
-                f"{path} is no run: it has no sound run.json; make one with `flexroad run --out {path}`"
+                f"{path} is no run: run.json is missing or damaged; make one with `flexroad run --out {path}`"
             )
-        store = parse_location(found["store"]) if found["shared_store"] else path / "store"
-        config = _config(path / "config.yaml").model_copy(update={"name": found["config"]})
+        store = parse_location(record["store"]) if record["shared_store"] else path / "store"
+        config = _config(path / "config.yaml").model_copy(update={"name": record["config"]})
         catalog = Catalog.read(path / "catalog.parquet")
-        origin = (found["origin"][0], found["origin"][1])
+        origin = (record["origin"][0], record["origin"][1])
         return cls(
             path,
             config,
             catalog,
             store,
             origin,
-            found["checksum"],
-            found["versions"],
-            tuple(found.get("allowed", ())),
-            _exported(found, config),
+            record["checksum"],
+            record["versions"],
+            tuple(record.get("allowed", ())),
+            _exported(record, config),
         )
 
     @cached_property
     def pattern(self) -> Pattern:
-        """What the graphs of all tiles have in common."""
+        """The part of the graph that is the same for all tiles."""
         return Pattern.of(self.config)
 
-    def graph(self, tile: Tile, look: Stat = stat, recorded: Recorded = ()) -> TileGraph:
-        """Return the graph of a tile, as configuration and sources are now (`Pattern.graph`)."""
-        return self.pattern.graph(tile, self.checksum, look, recorded)
+    def graph(self, tile: Tile, stat_file: Stat = stat, recorded: Recorded = ()) -> TileGraph:
+        """Return the graph of a tile for the current configuration and sources (`Pattern.graph`)."""
+        return self.pattern.graph(tile, self.checksum, stat_file, recorded)
 
-    def sightings(self) -> Stat:
-        """Return what looks at many sources: those of a bucket by a list of each folder, once."""
-        many = StatCache()
-        # On disk a look costs next to nothing, and late is better than early.
-        return lambda file: many(file) if is_remote(file) else stat(file)
+    def stat_cache(self) -> Stat:
+        """Return a stat function for many source files; in a bucket it lists each folder once."""
+        remote = StatCache()
+        # On disk a stat is cheap and always current, so it is not cached.
+        return lambda file: remote(file) if is_remote(file) else stat(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
-        """Return what a worker needs to do one tile."""
+        """Return the job that a worker needs to process one tile."""
         return TileJob(graph, str(absolute(self.path)), str(absolute(self.store)), self.origin, force)
 
     def folder(self, tile_id: str) -> TileProducts:
-        """Return where a tile's products are."""
+        """Return the folder of a tile's products."""
         return TileProducts.of(self.path, tile_id)
 
     def _write(self) -> None:
         write(self.path / "config.yaml", yaml.safe_dump(self.config.raw, sort_keys=False).encode())
         self.catalog.write(self.path / "catalog.parquet", movable=False)
-        found = {
+        record = {
             "config": self.config.name,
             "store": str(absolute(self.store)),
             "shared_store": absolute(self.store) != absolute(self.path / "store"),
@@ -172,39 +174,39 @@ class Run:
             "allowed": list(self.allowed),
             "exported": list(self.exported),
         }
-        write(self.path / "run.json", json.dumps(found, indent=1).encode())
+        write(self.path / "run.json", json.dumps(record, indent=1).encode())
 
 
 def check_models(config: Config) -> None:
-    """Refuse a configuration that names a model which is not there, before any tile is tried.
+    """Check that all models named by a configuration exist.
 
     Raises
     ------
     ConfigError
-        If a file that options name is missing; the line says how to get one.
+        If a file named by the options is missing; the message says how to make one.
     """
     for chain in config.chains.values():
         for stage, options in chain.items():
             for path in model_files(options):
                 if path.is_file():
                     continue
-                chosen = options.model_dump()
+                values = options.model_dump()
                 remedy = "restore it, or name another one"
-                if path == chosen.get("model"):
-                    how = f"--method {chosen['method']} --labels mask -o {path}"
-                    remedy = f"make it with `flexroad train CATALOG {how}`"
+                if path == values.get("model"):
+                    arguments = f"--method {values['method']} --labels mask -o {path}"
+                    remedy = f"make it with `flexroad train CATALOG {arguments}`"
                 raise ConfigError(f"{config.name}: {stage}: {path} does not exist; {remedy}")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what computes, for the record."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and of the packages in `PACKAGES`, by name."""
+    by_name = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            by_name[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            by_name[package] = "not installed"
+    return by_name
 
 
 def _origin(catalog: Catalog) -> tuple[float, float]:
@@ -213,28 +215,28 @@ def _origin(catalog: Catalog) -> tuple[float, float]:
 
 
 def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
-    before = (record or {}).get("exported", ())
-    return tuple(dict.fromkeys([*before, *config.export.variants]))
+    earlier = (record or {}).get("exported", ())
+    return tuple(dict.fromkeys([*earlier, *config.export.variants]))
 
 
-def _config(where: Location) -> Config:
-    seen = stat(where)
-    if seen is not None and not seen.size:
-        # It would be read as one that changes no default.
-        raise ConfigError(f"{where} is empty, as a power failure leaves it; `flexroad run` writes it anew")
-    if isinstance(where, Path):
-        return load_config(where)
-    return compose(yaml.safe_load(read(where)), str(where))
+def _config(path: Location) -> Config:
+    file = stat(path)
+    if file is not None and not file.size:
+        # An empty file would be valid: a configuration with all defaults.
+        raise ConfigError(f"{path} is empty, as after a power failure; `flexroad run` writes it again")
+    if isinstance(path, Path):
+        return load_config(path)
+    return compose(yaml.safe_load(read(path)), str(path))
 
 
 def _record(run: Location) -> dict[str, Any] | None:
-    """Return what run.json holds, or None if it is not there or damaged."""
+    """Return the content of run.json, None if it is missing or damaged."""
     try:
-        found: dict[str, Any] = json.loads(read(run / "run.json"))
+        record: dict[str, Any] = json.loads(read(run / "run.json"))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:
-        # Storage that refuses or does not answer is no proof that there is no run.
+        # After an access or connection error it is unknown whether there is a run.
         raise ConfigError(f"cannot read {run / 'run.json'}: {error.strerror or error}") from error
-    known = {"config", "store", "shared_store", "origin", "checksum", "versions"}
-    return found if isinstance(found, dict) and known <= found.keys() else None
+    required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
+    return record if isinstance(record, dict) and required <= record.keys() else None

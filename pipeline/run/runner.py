@@ -1,4 +1,4 @@
-"""Bring the tiles of a run up to date: look at each, do what is to do, write the tables."""
+"""Bring the tiles of a run up to date: check each tile, process those that need it, write the tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import partial
 from flexroad.catalog import Tile
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.graph.graph import TileGraph, any_gone
+from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import tile_statuses
@@ -22,16 +22,16 @@ from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.database import RunDatabase, TileState
 from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.store.tables import write_tables
-from flexroad.pipeline.worker.profiling import now
+from flexroad.pipeline.worker.profiling import utc_now
 from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row, process_tile, record_failure
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run has to do, and what became of its tiles since the last one."""
+    """The tiles to process, and counts of changes since the last run (see `Summary`)."""
 
     todo: array[int]
-    """Where in the catalog the tiles to do are."""
+    """Indices in the catalog of the tiles to process."""
     new: int
     changed: int
     vanished: int
@@ -50,38 +50,38 @@ def run_tiles(
     Parameters
     ----------
     only : callable
-        Which tiles; the tables are over all of them.
-    anew : frozenset of str
-        Stages to compute even if the store has them.
+        Filter of the tiles to process; the tables contain all tiles.
+    force : frozenset of str
+        Stages to compute even if their results are in the store.
     watch : callable
-        Told of every result as it comes, those found done included.
+        Receives every result when it is available, including those of cached tiles.
     verify : bool
-        Read all products, and do again the tiles whose are not what was written.
+        Compare all products with their checksums, and process tiles with a difference again.
 
     Raises
     ------
     ConfigError
         If a model is missing, or each of several tiles lacks a file.
     OSError
-        If the database or the tables cannot be written, as on a full disk.
+        If the database or the tables cannot be written, for example on a full disk.
     """
     check_models(run.config)
-    with RunDatabase.open(run.path / DATABASE) as database, EventLog(run.path) as journal:
-        journal.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
-        close = partial(_close, run, database, journal, now(), time.perf_counter())
-        stock = None
+    with RunDatabase.open(run.path / DATABASE) as database, EventLog(run.path) as log:
+        log.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
+        close = partial(_close, run, database, log, utc_now(), time.perf_counter())
+        plan = None
         try:
-            stock = plan_run(run, database, only, force, watch, verify)
-            with contextlib.closing(_results(run, executor, database, _jobs(run, stock, force))) as results:
+            plan = plan_run(run, database, only, force, watch, verify)
+            with contextlib.closing(_results(run, executor, database, _jobs(run, plan, force))) as results:
                 for result in results:
                     database.record(result.entry)
-                    journal.tile(result)
+                    log.tile(result)
                     watch(result)
         except BaseException as error:
-            # What is done is in the tables.
-            close(stock, error)
+            # The tables are written also after an error, with the tiles done so far.
+            close(plan, error)
             raise
-        return close(stock)
+        return close(plan)
 
 
 def plan_run(
@@ -92,104 +92,109 @@ def plan_run(
     watch: Callable[[TileResult], None],
     verify: bool,
 ) -> Plan:
-    """Look at every tile once, bring the database up to date, and tell what there is to do.
+    """Check every tile once, update the database and return the tiles to process.
 
     Raises
     ------
     ConfigError
         If each of several tiles lacks a file.
     """
-    todo, standings, new, changed, gone = array("L"), list[TileState](), 0, 0, 0
-    for position, found in enumerate(tile_statuses(run, database)):
-        gone += any_gone(found.graph)
-        wanted = only(found.graph.tile)
-        if wanted and verify and found.done and not run.folder(found.graph.tile.id).verified():
-            found = replace(found, up_to_date=False)
-        new += found.last_record is None
-        changed += found.last_record is not None and not found.up_to_date
-        standing: TileState = "done" if found.done else "failed" if found.failed else "pending"
-        if found.last_record and found.from_marker:
-            database.record(found.last_record)
-        if found.last_record and wanted and found.done and found.sources_present and not force:
-            standing = "cached"
-            watch(TileResult(found.last_record, "cached"))
-        elif wanted:
+    todo, states, new, changed, incomplete = array("L"), list[TileState](), 0, 0, 0
+    for position, status in enumerate(tile_statuses(run, database)):
+        incomplete += any_file_missing(status.graph)
+        selected = only(status.graph.tile)
+        if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
+            status = replace(status, up_to_date=False)
+        new += status.last_record is None
+        changed += status.last_record is not None and not status.up_to_date
+        state: TileState = "done" if status.done else "failed" if status.failed else "pending"
+        if status.last_record and status.from_marker:
+            database.record(status.last_record)
+        if status.last_record and selected and status.done and status.sources_present and not force:
+            state = "cached"
+            watch(TileResult(status.last_record, "cached"))
+        elif selected:
             todo.append(position)
-        standings.append(standing)
-    if gone == len(run.catalog.tiles) > 1:
-        # Not to be told by each tile, whose results would be lost by it.
-        raise ConfigError(_nothing_there(run, found.graph))
+        states.append(state)
+    if incomplete == len(run.catalog.tiles) > 1:
+        # One error for the run: if each tile failed by itself, all existing results would be lost.
+        raise ConfigError(_all_incomplete(run, status.graph))
     database.flush()
-    names = (tile.id for tile in run.catalog.tiles)
-    vanished = database.ask(zip(names, standings, strict=True))
+    ids = (tile.id for tile in run.catalog.tiles)
+    vanished = database.set_states(zip(ids, states, strict=True))
     return Plan(todo, new, changed, vanished)
 
 
-def _nothing_there(run: Run, graph: TileGraph) -> str:
-    path = next(path for path, seen in graph.seen.items() if seen is None)
+def _all_incomplete(run: Run, graph: TileGraph) -> str:
+    """Return the error message of a run in which each tile lacks a file."""
+    path = next(path for path, stat in graph.file_stats.items() if stat is None)
     return (
-        f"each of the {len(run.catalog.tiles)} tiles lacks a file, as tile {graph.tile.id} does {path}; "
+        f"each of the {len(run.catalog.tiles)} tiles lacks a file, for example tile {graph.tile.id}: {path}; "
         "is the disk with the survey mounted?"
     )
 
 
-def _jobs(run: Run, stock: Plan, force: frozenset[str]) -> Iterator[TileJob]:
-    look = run.sightings()
-    for position in stock.todo:
-        # Made a second time: thousands kept since the stocktaking would fill the memory, and be old by now.
-        yield run.job(run.graph(run.catalog.tiles[position], look), force)
+def _jobs(run: Run, plan: Plan, force: frozenset[str]) -> Iterator[TileJob]:
+    stat_file = run.stat_cache()
+    for position in plan.todo:
+        # The graph is made again, because thousands of graphs kept since planning would need much memory and
+        # could be outdated.
+        yield run.job(run.graph(run.catalog.tiles[position], stat_file), force)
 
 
 def _results(
     run: Run, executor: Executor, database: RunDatabase, jobs: Iterator[TileJob]
 ) -> Generator[TileResult, None, None]:
-    """Yield what tiles come to; at the end record those that got done although nobody heard of it."""
-    flying: dict[str, Tile] = {}
+    """Yield the results of the jobs; at the end record tiles that were finished but whose result was lost."""
+    in_progress: dict[str, Tile] = {}
 
-    def noted() -> Iterator[TileJob]:
+    def submitted() -> Iterator[TileJob]:
         for job in jobs:
-            flying[job.graph.tile.id] = job.graph.tile
+            in_progress[job.graph.tile.id] = job.graph.tile
             yield job
 
-    found = executor.map(process_tile, noted(), _lost, partial(check_writable, run.store))
+    results = executor.map(process_tile, submitted(), _lost, partial(check_writable, run.store))
     try:
-        for result in found:
-            flying.pop(result.tile_id)
+        for result in results:
+            in_progress.pop(result.tile_id)
             yield result
     finally:
-        # Interrupted: first nobody works any more, then what lies there counts.
-        found.close()
-        for stand in tile_statuses(run, database, flying.values()):
-            if stand.last_record and stand.from_marker:
-                database.record(stand.last_record)
+        # After an interruption: stop all workers first, then read the markers they have written.
+        results.close()
+        for status in tile_statuses(run, database, in_progress.values()):
+            if status.last_record and status.from_marker:
+                database.record(status.last_record)
 
 
 def _close(
     run: Run,
     database: RunDatabase,
-    journal: EventLog,
+    log: EventLog,
     start: str,
-    began: float,
-    stock: Plan | None,
+    start_s: float,
+    plan: Plan | None,
     error: BaseException | None = None,
 ) -> Summary:
-    """Write the tables and the summary, as far as the run came."""
+    """Write the tables, the event ``end`` and the summary; also after an error, with the results so far.
+
+    ``start`` is the start time (ISO 8601), ``start_s`` the value of `time.perf_counter` at the start.
+    """
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
-    how = replace(summarise(len(run.catalog.tiles), database), interrupted=interrupted, refused=refused)
-    if stock:
-        how = replace(how, new=stock.new, changed=stock.changed, vanished=stock.vanished)
+    summary = replace(summarise(len(run.catalog.tiles), database), interrupted=interrupted, refused=refused)
+    if plan:
+        summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         write_tables(run.path, database.rows(), database.failures())
-    how = replace(how, seconds=round(time.perf_counter() - began, 3))
-    journal.note("end", **{name: value for name, value in asdict(how).items() if name != "failures"})
-    about = {"start": start, "end": now(), "config": run.config.name, "origin": list(run.origin)}
-    write_summary(run.path, how, **about)
-    return how
+    summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
+    log.note("end", **{name: value for name, value in asdict(summary).items() if name != "failures"})
+    about = {"start": start, "end": utc_now(), "config": run.config.name, "origin": list(run.origin)}
+    write_summary(run.path, summary, **about)
+    return summary
 
 
-def _lost(job: TileJob, why: str) -> TileResult:
-    """Make the failed result of a tile whose worker died."""
+def _lost(job: TileJob, reason: str) -> TileResult:
+    """Return the failed result of a tile whose worker died."""
     graph = job.graph
-    failure = Failure(graph.tile.id, "worker", "WorkerDied", why)
+    failure = Failure(graph.tile.id, "worker", "WorkerDied", reason)
     rows = [failed_row(graph, variant, failure.line) for variant in graph.variants]
     return TileResult(record_failure(job, rows, [failure]), "failed")

@@ -1,4 +1,4 @@
-"""Which tiles a run or a rerun is about."""
+"""Selection of the tiles of a run or rerun."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexroad.pipeline.store.records import FAILED
 
 
 def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
-    """Return which tiles a rerun means: those named, those failed, both, or all.
+    """Return a filter for the tiles of a rerun: the given tiles, the failed ones, both, or all.
 
     Raises
     ------
@@ -23,23 +23,24 @@ def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile
         If a tile is not in the run's catalog.
     """
     folders = Folders(run.path)
-    named = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
+    ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
 
-    def chosen(tile: Tile) -> bool:
-        if tile.id in named or not (named or failed):
+    def selected(tile: Tile) -> bool:
+        if tile.id in ids or not (ids or failed):
             return True
-        # Whatever it failed of: a file mended since is why it is tried again.
+        # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
         return failed and FAILED in folders(tile.id)
 
-    return chosen
+    return selected
 
 
 def merged_catalog(path: Location, whole: Catalog, wanted: Catalog) -> Catalog:
-    """Return the tiles a run is about when some tiles of a catalog are asked for.
+    """Return the tiles of the run at ``path`` when the tiles ``wanted`` of a catalog are requested.
 
-    Those, and those it was asked for before that the catalog still has: their results stay in the tables.
+    They are those tiles and the earlier tiles of the run that are still in the catalog, so that the results
+    of these stay in the tables.
     """
     record = path / "catalog.parquet"
-    before = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
-    known = before | {tile.id for tile in wanted.tiles}
-    return Catalog(tuple(tile for tile in whole.tiles if tile.id in known))
+    earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
+    ids = earlier | {tile.id for tile in wanted.tiles}
+    return Catalog(tuple(tile for tile in whole.tiles if tile.id in ids))

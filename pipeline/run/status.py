@@ -1,7 +1,7 @@
-"""The state of a run's tiles: the database compared with the tiles' folders and their sources.
+"""The state of a run's tiles: the database compared with the tiles' folders and source files.
 
-Each tile costs one row of the database, one listing of its folder and one stat of each source file. A marker
-is read only if it is not the one in the database.
+Each tile takes one row of the database, one listing of its folder and one stat of each source file. A marker
+is read only if it differs from the one in the database.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from functools import cached_property
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import FileStat, Location, is_remote, listing, read
-from flexroad.pipeline.graph.graph import Stat, TileGraph, any_gone
+from flexroad.pipeline.graph.graph import Stat, TileGraph, any_file_missing
 from flexroad.pipeline.run.lock import Owner
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.summary import MOST_TOLD, Summary, read_summary, summarise
+from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise
 from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
@@ -37,33 +37,33 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 
 @dataclass(frozen=True)
 class TileStatus:
-    """How one tile stands."""
+    """The current state of one tile."""
 
     graph: TileGraph
-    """As its sources and the options are now; sources that are gone as they were when the tile was done."""
+    """Graph of the current sources and options; missing sources count as recorded when the tile was done."""
     last_record: TileRecord | None
-    """Its last result, of whatever sources and options."""
+    """Record of its last result, which may be of other sources or options; None if there is none."""
     up_to_date: bool
-    """Whether that result is of this graph, and its products are there."""
+    """Whether that result has the graph's fingerprint and its products exist."""
     sources_present: bool
-    """Whether besides its sources are all there."""
+    """Whether it is up to date and all its source files exist."""
     from_marker: bool
-    """Whether the database does not have that result: it was read from the marker."""
+    """Whether the record was read from the marker, because the database does not have it."""
 
     @property
     def done(self) -> bool:
-        """Whether the tile has the result that is asked for."""
+        """Whether the tile has an up-to-date result."""
         return self.up_to_date and self.last_record is not None and self.last_record.state == "done"
 
     @property
     def failed(self) -> bool:
-        """Whether it was tried as it is now, and failed."""
+        """Whether the tile failed with the current sources and options."""
         return self.up_to_date and self.last_record is not None and self.last_record.state == "failed"
 
 
 @dataclass(frozen=True)
 class Folders:
-    """The files of a run's tiles: folder by folder on disk, by one list of a bucket."""
+    """The files of a run's tiles: one listing per tile on disk, one listing for all tiles in a bucket."""
 
     run: Location
 
@@ -74,44 +74,47 @@ class Folders:
 
     @cached_property
     def _listed(self) -> dict[str, dict[str, FileStat]]:
-        found: defaultdict[str, dict[str, FileStat]] = defaultdict(dict)
-        for name, seen in listing(self.run / "tiles").items():
+        folders: defaultdict[str, dict[str, FileStat]] = defaultdict(dict)
+        for name, stat in listing(self.run / "tiles").items():
             folder, _, file = name.partition("/")
-            found[folder][file] = seen
-        return dict(found)
+            folders[folder][file] = stat
+        return dict(folders)
 
 
 def peek_statuses(run: Run, tiles: Iterable[Tile]) -> Iterator[TileStatus]:
-    """Yield how tiles of a run stand now."""
-    with RunDatabase.peek(run.path / NAME) as database:
+    """Yield the current state of tiles of a run; opens the database read-only."""
+    with RunDatabase.open_readonly(run.path / NAME) as database:
         yield from tile_statuses(run, database, tiles)
 
 
 def tile_statuses(
     run: Run, database: RunDatabase, tiles: Iterable[Tile] | None = None
 ) -> Iterator[TileStatus]:
-    """Yield how tiles of a run stand now, all in the catalog's order if none are named; changes nothing."""
-    folders, look = Folders(run.path), run.sightings()
+    """Yield the current state of tiles of a run, by default of all, in the catalog's order; read-only."""
+    folders, stat_file = Folders(run.path), run.stat_cache()
     for tile in run.catalog.tiles if tiles is None else tiles:
-        yield _stand(run, tile, database, folders(tile.id), look)
+        yield _status(run, tile, database, folders(tile.id), stat_file)
 
 
-def _stand(run: Run, tile: Tile, database: RunDatabase, files: dict[str, FileStat], look: Stat) -> TileStatus:
+def _status(
+    run: Run, tile: Tile, database: RunDatabase, files: dict[str, FileStat], stat_file: Stat
+) -> TileStatus:
+    """Return the state of one tile whose folder has ``files``."""
     entry = database.get(tile.id)
-    known = _last_result(run.folder(tile.id).path, entry, files)
-    graph = run.graph(tile, look)
-    current, unknown = _fits(known, graph, files), known is not entry
-    if known is None or current or not any_gone(graph):
-        return TileStatus(graph, known, current, current, unknown)
-    graph = run.graph(tile, look, known.sources)
-    return TileStatus(graph, known, _fits(known, graph, files), False, unknown)
+    record = _last_record(run.folder(tile.id).path, entry, files)
+    graph = run.graph(tile, stat_file)
+    current, from_marker = _matches(record, graph, files), record is not entry
+    if record is None or current or not any_file_missing(graph):
+        return TileStatus(graph, record, current, current, from_marker)
+    graph = run.graph(tile, stat_file, record.sources)
+    return TileStatus(graph, record, _matches(record, graph, files), False, from_marker)
 
 
-def _last_result(folder: Location, entry: TileRecord | None, files: dict[str, FileStat]) -> TileRecord | None:
-    """Return a tile's last result: by the database, if that is of the marker, else by the marker."""
+def _last_record(folder: Location, entry: TileRecord | None, files: dict[str, FileStat]) -> TileRecord | None:
+    """Return a tile's last record: the database entry if it is of the current marker, else the marker's."""
     name = DONE if DONE in files else FAILED if FAILED in files else None
     if name is None:
-        # A full disk leaves no marker, but what failed is known.
+        # A failure on a full disk has no marker, only a database entry.
         return entry if entry and entry.state == "failed" and entry.marker is None else None
     marker = (name, files[name].size, files[name].version)
     return entry if entry and entry.marker == marker else _from_marker(folder, marker)
@@ -119,46 +122,47 @@ def _last_result(folder: Location, entry: TileRecord | None, files: dict[str, Fi
 
 def _from_marker(folder: Location, marker: MarkerStat) -> TileRecord | None:
     try:
-        found = json.loads(read(folder / marker[0]))
-        return (from_item if marker[0] == DONE else from_failed)(found, marker)
+        content = json.loads(read(folder / marker[0]))
+        return (from_item if marker[0] == DONE else from_failed)(content, marker)
     except DAMAGED:
         return None
 
 
-def _fits(known: TileRecord | None, graph: TileGraph, files: dict[str, FileStat]) -> bool:
-    if known is None or known.fingerprint != graph.fingerprint:
+def _matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileStat]) -> bool:
+    """Return whether a record has the graph's fingerprint and all its products exist in their full size."""
+    if record is None or record.fingerprint != graph.fingerprint:
         return False
-    return all(name in files and files[name].size == size for name, size in known.sizes.items())
+    return all(name in files and files[name].size == size for name, size in record.sizes.items())
 
 
 def summary(run: Run) -> Summary:
-    """Return how a run stands now: every tile, its sources and its products are looked at."""
+    """Return the current summary of a run; checks every tile, its sources and its products."""
     counts: Counter[str] = Counter()
     failures: list[Failure] = []
-    with RunDatabase.peek(run.path / NAME) as database:
-        for now in tile_statuses(run, database):
-            counts["done"] += now.done
-            counts["failed"] += now.failed
-            counts["cached"] += now.done and database.standing(now.graph.tile.id) == "cached"
-            if now.failed and now.last_record and len(failures) < MOST_TOLD:
-                failures += now.last_record.failures
-    tiles = len(run.catalog.tiles)
-    left = tiles - counts["done"] - counts["failed"]
-    found = Summary(tiles, counts["done"], counts["failed"], counts["cached"], left, failures=tuple(failures))
+    with RunDatabase.open_readonly(run.path / NAME) as database:
+        for status in tile_statuses(run, database):
+            counts["done"] += status.done
+            counts["failed"] += status.failed
+            counts["cached"] += status.done and database.state(status.graph.tile.id) == "cached"
+            if status.failed and status.last_record and len(failures) < MAX_FAILURES:
+                failures += status.last_record.failures
+    tiles, done, failed = len(run.catalog.tiles), counts["done"], counts["failed"]
+    current = Summary(tiles, done, failed, counts["cached"], tiles - done - failed, failures=tuple(failures))
     last = read_summary(run.path)
-    known = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
-    return replace(found, **{name: last[name] for name in known if name in last})
+    names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
+    return replace(current, **{name: last[name] for name in names if name in last})
 
 
-def progress(run: Run, who: Owner) -> tuple[Summary, str]:
-    """Return how a run that a process is at work on stands, and how fast it goes, in words.
+def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
+    """Return the summary of an active run and its rate as text, ``""`` if no tile is finished yet.
 
-    By the database alone, so that it can be repeated every few seconds.
+    Only the database is read, so it can be repeated every few seconds. ``owner`` is the process that runs it.
     """
-    with RunDatabase.peek(run.path / NAME) as database:
-        how, tried = summarise(len(run.catalog.tiles), database), database.tried_since(who.since)
-    minutes = (time.time() - datetime.fromisoformat(who.since).timestamp()) / 60
-    if not tried or minutes <= 0:
-        return how, ""
-    left = how.pending / (tried / minutes)
-    return how, f", {tried / minutes:.1f} tiles a minute, about {left:.0f} min left"
+    with RunDatabase.open_readonly(run.path / NAME) as database:
+        summary = summarise(len(run.catalog.tiles), database)
+        finished = database.finished_since(owner.since)
+    minutes = (time.time() - datetime.fromisoformat(owner.since).timestamp()) / 60
+    if not finished or minutes <= 0:
+        return summary, ""
+    left = summary.pending / (finished / minutes)
+    return summary, f", {finished / minutes:.1f} tiles a minute, about {left:.0f} min left"

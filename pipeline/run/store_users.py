@@ -1,4 +1,4 @@
-"""Which runs use a shared store: a small file of each in ``STORE/runs``, so that `clean` knows them all."""
+"""The runs that use a shared store: one small file for each in ``STORE/runs``, read by `flexroad clean`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FOLDER = "runs"
 
 
 def register(store: Location, run: Location) -> None:
-    """Write down that a run uses its store; of a store in its own folder it goes without saying.
+    """Register a run with its store; not needed for a store in the run's own folder.
 
     Raises
     ------
@@ -35,14 +35,14 @@ def register(store: Location, run: Location) -> None:
 
 
 def runs_using(store: Location) -> Iterator[Location]:
-    """Yield the folders of the runs that use a store, as far as they were written down.
+    """Yield the folders of the runs registered with a store.
 
     Raises
     ------
     OSError, ValueError, KeyError
         If an entry cannot be read.
     """
-    # A store in a run's folder is that run's.
+    # A store in a run's folder belongs to that run.
     if exists(store.parent / "run.json"):
         yield absolute(store.parent)
     for name in sorted(listing(store / FOLDER)):
@@ -51,11 +51,11 @@ def runs_using(store: Location) -> Iterator[Location]:
 
 
 def unregister(store: Location, run: Location) -> bool:
-    """Take a run from those that use a store; tell whether it was among them."""
+    """Remove a run from the runs of a store; return whether it was registered."""
     path = _entry(store, run)
-    known = exists(path)
+    registered = exists(path)
     remove(path)
-    return known
+    return registered
 
 
 def _entry(store: Location, run: Location) -> Location:

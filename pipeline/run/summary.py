@@ -1,4 +1,4 @@
-"""How a run stands, over all its tiles: for people, and as ``RUN/summary.json`` for programs."""
+"""The summary of a run: counts over all its tiles, also written to ``RUN/summary.json``."""
 
 from __future__ import annotations
 
@@ -14,74 +14,75 @@ from flexroad.pipeline.store.database import RunDatabase
 from flexroad.pipeline.store.records import Failure
 
 NAME = "summary.json"
-MOST_TOLD = 1000
-"""Failures told of; the table of failures has all."""
+MAX_FAILURES = 1000
+"""Number of failures in a summary; the table of failures has all."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """How a run stands, and what its last execution did."""
+    """The state of a run and the result of its last execution."""
 
     tiles: int
     done: int
-    """Tiles with results, those of earlier runs included."""
+    """Tiles with a result, including those of earlier executions."""
     failed: int
     cached: int
-    """Of those done, how many the last run found done already."""
+    """Done tiles that were already done when the last execution started."""
     pending: int
-    """Tiles without a result of the files and options as they are."""
+    """Tiles without a result for the current files and options."""
     new: int = 0
-    """Tiles that had no result before the last run."""
+    """Tiles without any result when the last execution started."""
     changed: int = 0
-    """Tiles whose result was of other files or options when the last run began."""
+    """Tiles whose files or options had changed when the last execution started."""
     vanished: int = 0
-    """Tiles with results that the catalog no longer had when the last run began."""
+    """Tiles with a result that were no longer in the catalog when the last execution started."""
     seconds: float = 0.0
-    """How long the last run took."""
+    """Duration of the last execution (s)."""
     interrupted: bool = False
+    """Whether the last execution was interrupted by the user."""
     refused: str = ""
-    """Why the last run did not go on, where that was not for single tiles to tell."""
+    """Error that stopped the last execution as a whole; empty if there was none."""
     failures: tuple[Failure, ...] = ()
-    """The first of them, in the catalog's order."""
+    """The first `MAX_FAILURES` failures, in the catalog's order."""
 
     @property
     def exit_code(self) -> int:
-        """What the command ends with: 0 if all is done, 1 if not, 2 if refused, 130 after an interruption."""
+        """Exit code of the command: 0 if all tiles are done, 1 if not, 2 if refused, 130 if interrupted."""
         if self.interrupted:
             return 130
         return 2 if self.refused else int(self.failed + self.pending > 0)
 
 
 def summarise(tiles: int, database: RunDatabase) -> Summary:
-    """Return how the tiles stand by the database, without another look at them."""
+    """Return the summary of a run with ``tiles`` tiles from the database, without checking any files."""
     counts = database.counts()
     done = counts["done"] + counts["cached"]
-    failures = tuple(islice(database.failures(), MOST_TOLD))
-    left = tiles - done - counts["failed"]
-    return Summary(tiles, done, counts["failed"], counts["cached"], left, failures=failures)
+    failures = tuple(islice(database.failures(), MAX_FAILURES))
+    pending = tiles - done - counts["failed"]
+    return Summary(tiles, done, counts["failed"], counts["cached"], pending, failures=failures)
 
 
-def write_summary(run: Location, how: Summary, **about: Any) -> None:
-    """Write summary.json: the figures, and what is given about the run beside them.
+def write_summary(run: Location, summary: Summary, **about: Any) -> None:
+    """Write summary.json: the fields of the summary and those in ``about``.
 
     Raises
     ------
     OSError
         If it cannot be written.
     """
-    failures = [{key: value for key, value in asdict(f).items() if key != "trace"} for f in how.failures]
-    told = asdict(how) | {
+    failures = [{key: value for key, value in asdict(f).items() if key != "trace"} for f in summary.failures]
+    content = asdict(summary) | {
         "failures": failures,
-        "exit_code": how.exit_code,
+        "exit_code": summary.exit_code,
         **about,
         "flexroad": importlib.metadata.version("flexroad"),
     }
-    write(run / NAME, json.dumps(told, indent=1).encode())
+    write(run / NAME, json.dumps(content, indent=1).encode())
 
 
 def read_summary(run: Location) -> dict[str, Any]:
-    """Return what summary.json holds; nothing if there is no sound one."""
+    """Return the content of summary.json, empty if it is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
-        found = json.loads(read(run / NAME))
-        return found if isinstance(found, dict) else {}
+        content = json.loads(read(run / NAME))
+        return content if isinstance(content, dict) else {}
     return {}

@@ -1,1 +1,1 @@
-"""The only writers of results: artefacts, products, database and tables."""
+"""Storage of results: artefacts, products, database and tables; no other package writes them."""

@@ -1,12 +1,12 @@
-"""The only writer of results: artefacts by fingerprint, and tiles whose marker is written last.
+"""Artefacts: the results of stages, stored by fingerprint.
 
-Everything is written to a temporary name in the same folder and then renamed, or put into a bucket by one
-request, so that a reader sees a whole file or none, whatever killed the writer. ::
+Every file of a store or run is written to a temporary name in the same folder and then renamed, or put into
+a bucket by one request. A reader therefore reads a complete file or none, even if the writer was killed. ::
 
-    STORE/<stage>/<ab>/<fingerprint>.npz
-    RUN/tiles/<tile>/<tile>_<variant>.glb ...   the products
-    RUN/tiles/<tile>/item.json                  STAC item with rows and checksums, last: the tile is done
-    RUN/tiles/<tile>/failed.json                instead, if a stage failed
+    STORE/<stage>/<ab>/<fingerprint>.npz        artefacts
+    RUN/tiles/<tile>/<tile>_<variant>.glb ...   products
+    RUN/tiles/<tile>/item.json                  STAC item with rows and checksums, written last: tile done
+    RUN/tiles/<tile>/failed.json                written instead if a stage failed
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFil
 
 @dataclass(frozen=True)
 class ArtefactStore:
-    """Results of stages by fingerprint; may be shared by runs."""
+    """Results of stages by fingerprint; runs may share a store."""
 
     root: Location
 
     def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
-        """Return a result and what each stage up to it took, or None if it is not there or damaged."""
+        """Return a result and the seconds of each stage up to it, None if it is missing or damaged."""
         try:
             return codec.decode(paths.read(self._path(node)))
         except DAMAGED:
-            # What cannot be read is as good as absent: it is computed and written anew.
+            # A damaged artefact counts as missing: it is computed and written again.
             return None
 
     def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
-        """Keep a result and what each stage up to it took; return how many bytes that is."""
+        """Store a result and the seconds of each stage up to it; return the size in bytes."""
         data = codec.encode(value, seconds)
         paths.write(self._path(node), data)
         return len(data)
 
     def has(self, node: Node) -> bool:
-        """Tell whether a result is there, unread."""
+        """Return whether the artefact exists; its content is not checked."""
         return paths.exists(self._path(node))
 
     def _path(self, node: Node) -> Location:
@@ -55,12 +55,12 @@ class ArtefactStore:
 
 
 def check_writable(folder: Location) -> None:
-    """Fail early if nothing can be written below ``folder``.
+    """Check that files can be written in ``folder``.
 
     Raises
     ------
     OSError
-        With the reason and the path.
+        If not; with the reason and the path.
     """
     probe = folder / f".probe-{uuid.uuid4().hex}"
     paths.write(probe, b"")

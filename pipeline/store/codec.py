@@ -1,7 +1,7 @@
-"""Turn a stage's result into bytes and back, exactly: arrays as they are, the rest as JSON, in one npz.
+"""Lossless conversion of a stage's result to bytes and back: one npz with the arrays and a JSON header.
 
-The SHA-256 of it all stands behind the zip, where readers of npz files do not mind it: a damaged artefact is
-told on reading. No pickle: a store may be shared.
+The SHA-256 of the npz is appended to it, where npz readers ignore it; it detects damage on reading. No pickle
+is used, because a store may be shared.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SHA256_BYTES = 32
 
 
 def encode(value: Any, seconds: Mapping[str, float]) -> bytes:
-    """Return the bytes of a result; ``seconds`` tells what each stage up to it took."""
+    """Return the bytes of a result and of ``seconds``, the computing time of each stage up to it."""
     arrays: dict[str, Any] = {}
     plain: dict[str, Any] = {}
     for field in fields(value):
@@ -43,16 +43,16 @@ def encode(value: Any, seconds: Mapping[str, float]) -> bytes:
 
 
 def decode(data: bytes) -> tuple[Any, dict[str, float]]:
-    """Return the result and the seconds that each stage up to it took.
+    """Return the result and the seconds of each stage up to it.
 
     Raises
     ------
     ValueError, KeyError, OSError, zipfile.BadZipFile, zlib.error
-        If the bytes are damaged or of an unknown kind.
+        If the bytes are damaged or of an unknown type.
     """
     payload, checksum = data[:-SHA256_BYTES], data[-SHA256_BYTES:]
     if hashlib.sha256(payload).digest() != checksum:
-        raise ValueError("the checksum is not that of the bytes")
+        raise ValueError("the checksum does not match the data")
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     header = json.loads(arrays.pop(HEADER).tobytes())
@@ -63,13 +63,13 @@ def decode(data: bytes) -> tuple[Any, dict[str, float]]:
 def _plain(item: Any) -> Any:
     if isinstance(item, dict):
         return Grid(**item["grid"])
-    # Frozen types hold tuples where JSON knows only lists.
+    # The result types hold tuples, which JSON stores as lists.
     return tuple(_plain(part) for part in item) if isinstance(item, list) else item
 
 
 def _types() -> dict[str, type]:
-    kinds = (Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
-    known: dict[str, type] = {kind.__name__: kind for kind in kinds}
+    shared = (Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
+    types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():
-        known |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
-    return known
+        types |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}
+    return types

@@ -1,12 +1,12 @@
-"""What is known of all tiles of a run, in one file that answers at once: ``RUN/database.sqlite``.
+"""The records of all tiles of a run, in one SQLite file: ``RUN/database.sqlite``.
 
-A cache of the tiles' markers, which stay the truth: a database that is missing, damaged or of another version
-begins empty, and a tile without an entry, or whose marker is not the one the entry was read from, is looked
-up in its folder. One run writes; others may read meanwhile. Everything is read in pages, so that nobody holds
-the file for long, nor much of it in memory. ::
+The database is a cache of the tiles' markers. If it is missing, damaged or of another version, it starts
+empty. If a tile has no entry, or its marker differs from the one in the entry, the marker is read instead.
+One run writes the database; other processes may read it at the same time. Tables are read in pages, which
+keeps read locks short and memory use small. ::
 
-    entry   one line per tile that was ever tried: `TileRecord`
-    asked   the tiles of the catalog, in its order, and how each stands
+    entry   one row per tile that was ever processed: `TileRecord`
+    asked   the tiles of the catalog, in its order, each with its state
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord
 NAME = "database.sqlite"
 VERSION = 1
 TileState = Literal["cached", "done", "failed", "pending"]
-"""Cached: found done by the last run. Pending: no result of the files and options as they are."""
+"""cached: already done when the last run started; pending: no result for the current files and options."""
 
 PAGE = 500
+"""Rows read at a time."""
 WAIT_S = 60.0
-"""How long one side waits for the other to let go of the file."""
+"""Longest wait for another process to release its lock on the file (s)."""
 FLUSH_S = 1.0
+"""Interval between writes of recorded tiles (s)."""
 FIELDS = "tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker"
 SCHEMA = f"""
 CREATE TABLE entry (tile TEXT PRIMARY KEY, state TEXT, fingerprint TEXT, rows TEXT, failures TEXT,
@@ -46,47 +48,47 @@ PRAGMA user_version = {VERSION};
 
 
 class RunDatabase:
-    """Entries by tile; use it as a context, so that what waits is written at the end."""
+    """Records and states of a run's tiles; a context manager that writes all pending records on exit."""
 
-    def __init__(self, connection: sqlite3.Connection, mirror: StagedFile) -> None:
+    def __init__(self, connection: sqlite3.Connection, staged: StagedFile) -> None:
         self._connection = connection
-        self._staged = mirror
-        self._waiting: dict[str, TileRecord] = {}
+        self._staged = staged
+        self._pending: dict[str, TileRecord] = {}
         self._flushed = time.monotonic()
 
     @classmethod
-    def open(cls, where: Location) -> RunDatabase:
-        """Open a database to write, empty if there is no sound one.
+    def open(cls, path: Location) -> RunDatabase:
+        """Open a database for writing; it is created empty if it is missing or damaged.
 
         Raises
         ------
         OSError
             If it cannot be written.
         """
-        mirror = StagedFile(where)
-        mirror.fetch()
+        staged = StagedFile(path)
+        staged.fetch()
         try:
-            connection = _sound(mirror.path, "rwc")
+            connection = _open_valid(staged.path, "rwc")
             if connection is None:
-                mirror.path.unlink(missing_ok=True)
-                connection = _connect(mirror.path, "rwc")
+                staged.path.unlink(missing_ok=True)
+                connection = _connect(staged.path, "rwc")
                 connection.executescript(SCHEMA)
         except sqlite3.Error as error:
-            raise _os_error(error, where) from error
-        return cls(connection, mirror)
+            raise _os_error(error, path) from error
+        return cls(connection, staged)
 
     @classmethod
-    def peek(cls, where: Location) -> RunDatabase:
-        """Open a database to read only, also while a run writes it; an empty one if there is no sound one."""
-        mirror = StagedFile(where, writable=False)
-        mirror.fetch()
+    def open_readonly(cls, path: Location) -> RunDatabase:
+        """Open a database for reading, also while a run writes it; empty if it is missing or damaged."""
+        staged = StagedFile(path, writable=False)
+        staged.fetch()
         connection = None
         with contextlib.suppress(sqlite3.Error):
-            connection = _sound(mirror.path, "ro", thorough=False)
+            connection = _open_valid(staged.path, "ro", check=False)
         if connection is None:
             connection = sqlite3.connect(":memory:")
             connection.executescript(SCHEMA)
-        return cls(connection, mirror)
+        return cls(connection, staged)
 
     def __enter__(self) -> RunDatabase:
         return self
@@ -95,12 +97,12 @@ class RunDatabase:
         self.close()
 
     def close(self) -> None:
-        """Write what waits, and let go of the file.
+        """Write all pending records and close the file.
 
         Raises
         ------
         OSError
-            If the disk is full, or the storage does not answer.
+            If the disk is full or the storage cannot be reached.
         """
         try:
             self.flush()
@@ -110,13 +112,13 @@ class RunDatabase:
             self._connection.close()
             self._staged.close()
 
-    def ask(self, tiles: Iterable[tuple[str, TileState]]) -> int:
-        """Set which tiles there are, in the catalog's order, and how each stands.
+    def set_states(self, tiles: Iterable[tuple[str, TileState]]) -> int:
+        """Replace the list of tiles: the id and state of each, in the catalog's order.
 
         Returns
         -------
         int
-            How many tiles with an entry are not among them; they are forgotten.
+            Number of tiles with a record that are not in the list; their records are deleted.
 
         Raises
         ------
@@ -129,20 +131,20 @@ class RunDatabase:
                 "INSERT INTO asked (tile, standing) VALUES (?, ?)",
                 tiles,
             )
-            gone = self._connection.execute("DELETE FROM entry WHERE tile NOT IN (SELECT tile FROM asked)")
-        return gone.rowcount
+            deleted = self._connection.execute("DELETE FROM entry WHERE tile NOT IN (SELECT tile FROM asked)")
+        return deleted.rowcount
 
     def record(self, entry: TileRecord) -> None:
-        """Keep how a tile went; written within seconds, or as soon as there is room on the disk."""
-        self._waiting[entry.tile_id] = entry
+        """Add a tile's record; it is written within seconds, on a full disk as soon as there is space."""
+        self._pending[entry.tile_id] = entry
         if time.monotonic() - self._flushed > FLUSH_S:
-            # On a full disk the tiles go on; what waits is tried again.
+            # A full disk does not stop the run; the write is repeated later.
             with contextlib.suppress(OSError):
                 self.flush()
                 self._staged.sync_if_due()
 
     def flush(self) -> None:
-        """Write what waits.
+        """Write all pending records.
 
         Raises
         ------
@@ -150,56 +152,56 @@ class RunDatabase:
             If the disk is full.
         """
         self._flushed = time.monotonic()
-        if not self._waiting:
+        if not self._pending:
             return
-        entries = list(self._waiting.values())
+        entries = list(self._pending.values())
         with self._writing():
             self._connection.executemany(
                 f"INSERT OR REPLACE INTO entry ({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                map(_to_line, entries),
+                map(_to_row, entries),
             )
             self._connection.executemany(
                 "UPDATE asked SET standing = ? WHERE tile = ?",
                 [(entry.state, entry.tile_id) for entry in entries],
             )
-        self._waiting.clear()
+        self._pending.clear()
 
     def get(self, tile_id: str) -> TileRecord | None:
-        """Return what is known of a tile."""
-        if tile_id in self._waiting:
-            return self._waiting[tile_id]
-        line = self._line(f"SELECT {FIELDS} FROM entry WHERE tile = ?", tile_id)
-        return _from_line(line) if line else None
+        """Return a tile's record, None if it has none."""
+        if tile_id in self._pending:
+            return self._pending[tile_id]
+        row = self._row(f"SELECT {FIELDS} FROM entry WHERE tile = ?", tile_id)
+        return _from_row(row) if row else None
 
     def counts(self) -> Counter[TileState]:
-        """Return how many tiles of the catalog stand how, as the last run knows."""
+        """Return the number of tiles in each state, as set by the last run."""
         self.flush()
         return Counter(
             dict(self._connection.execute("SELECT standing, count(*) FROM asked GROUP BY standing"))
         )
 
-    def tried_since(self, when: str) -> int:
-        """Return how many tiles were finished, done or failed, since a time (ISO 8601, UTC)."""
+    def finished_since(self, start: str) -> int:
+        """Return the number of tiles finished (done or failed) since a time (ISO 8601, UTC)."""
         self.flush()
-        line = self._line("SELECT count(*) FROM entry WHERE finished >= ?", when)
-        return int(line[0]) if line else 0
+        row = self._row("SELECT count(*) FROM entry WHERE finished >= ?", start)
+        return int(row[0]) if row else 0
 
-    def standing(self, tile_id: str) -> TileState | None:
-        """Return how a tile stood when the last run looked at it, None if it was not asked for."""
-        line = self._line("SELECT standing FROM asked WHERE tile = ?", tile_id)
-        return line[0] if line else None
+    def state(self, tile_id: str) -> TileState | None:
+        """Return a tile's state as set by the last run, None if the tile was not part of it."""
+        row = self._row("SELECT standing FROM asked WHERE tile = ?", tile_id)
+        return row[0] if row else None
 
     def entries(self) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        """Yield every tile of the catalog in its order: id, how it stands, and what is known of it."""
+        """Yield id, state and record (None if there is none) of every tile, in the catalog's order."""
         fields = ", ".join(f"entry.{name.strip()}" for name in FIELDS.split(","))
-        for _, tile, standing, *line in self._pages(
+        for _, tile, state, *row in self._pages(
             f"SELECT position, asked.tile, standing, {fields} FROM asked LEFT JOIN entry USING (tile)"
             " WHERE position > ?"
         ):
-            yield tile, standing, _from_line(line) if line[0] else None
+            yield tile, state, _from_row(row) if row[0] else None
 
     def rows(self) -> Iterator[MetricsRow]:
-        """Yield the rows of all tiles that were tried as they are now, in the catalog's order."""
+        """Yield the metrics rows of all tiles that are not pending, in the catalog's order."""
         for _, rows in self._pages(
             "SELECT position, rows FROM asked JOIN entry USING (tile)"
             " WHERE position > ? AND standing != 'pending'"
@@ -207,29 +209,27 @@ class RunDatabase:
             yield from json.loads(rows)
 
     def failures(self) -> Iterator[Failure]:
-        """Yield the failures of all tiles that failed as they are now, in the catalog's order."""
+        """Yield the failures of all failed tiles, in the catalog's order."""
         for _, failures in self._pages(
             "SELECT position, failures FROM asked JOIN entry USING (tile)"
             " WHERE position > ? AND standing = 'failed'"
         ):
             yield from (Failure(**failure) for failure in json.loads(failures))
 
-    def _line(self, query: str, value: str) -> Sequence[Any] | None:
-        # What cannot be read is not known: the marker tells.
+    def _row(self, query: str, value: str) -> Sequence[Any] | None:
+        """Return the first row of a query, None if there is none or the database is damaged."""
         with contextlib.suppress(sqlite3.DatabaseError):
-            found: Sequence[Any] | None = self._connection.execute(query, (value,)).fetchone()
-            return found
+            row: Sequence[Any] | None = self._connection.execute(query, (value,)).fetchone()
+            return row
         return None
 
     def _pages(self, query: str) -> Iterator[Sequence[Any]]:
-        """Yield the lines of a query whose first column is a position and whose first parameter the last."""
+        """Yield a query's rows in pages; column 0 is ``position``, the parameter the last position read."""
         self.flush()
         last = 0
-        while lines := self._connection.execute(
-            f"{query} ORDER BY position LIMIT {PAGE}", (last,)
-        ).fetchall():
-            yield from lines
-            last = lines[-1][0]
+        while rows := self._connection.execute(f"{query} ORDER BY position LIMIT {PAGE}", (last,)).fetchall():
+            yield from rows
+            last = rows[-1][0]
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -244,17 +244,17 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=WAIT_S)
 
 
-def _sound(path: Path, mode: str, thorough: bool = True) -> sqlite3.Connection | None:
-    """Return a connection to a database that is there, of this version and, on a thorough look, whole."""
+def _open_valid(path: Path, mode: str, check: bool = True) -> sqlite3.Connection | None:
+    """Return a connection, None if the file is missing, of another version or (with ``check``) damaged."""
     if not path.exists():
         return None
     connection = _connect(path, mode)
     try:
         (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version == VERSION and not (thorough and _damaged(connection)):
+        if version == VERSION and not (check and _damaged(connection)):
             return connection
     except sqlite3.OperationalError:
-        # Locked or not to be written: no fault of the file.
+        # The file is locked or read-only, not damaged.
         connection.close()
         raise
     except sqlite3.DatabaseError:
@@ -264,17 +264,17 @@ def _sound(path: Path, mode: str, thorough: bool = True) -> sqlite3.Connection |
 
 
 def _damaged(connection: sqlite3.Connection) -> bool:
-    (check,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    return bool(check != "ok")
+    (result,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    return bool(result != "ok")
 
 
-def _os_error(error: sqlite3.Error, where: Location) -> OSError:
+def _os_error(error: sqlite3.Error, path: Location) -> OSError:
     full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
-    number, why = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
-    return OSError(number, why, str(where))
+    number, reason = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
+    return OSError(number, reason, str(path))
 
 
-def _to_line(entry: TileRecord) -> tuple[Any, ...]:
+def _to_row(entry: TileRecord) -> tuple[Any, ...]:
     return (
         entry.tile_id,
         entry.state,
@@ -289,9 +289,9 @@ def _to_line(entry: TileRecord) -> tuple[Any, ...]:
     )
 
 
-def _from_line(line: Sequence[Any]) -> TileRecord:
-    tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker = line
-    found = json.loads(marker)
+def _from_row(row: Sequence[Any]) -> TileRecord:
+    tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker = row
+    file = json.loads(marker)
     return TileRecord(
         tile,
         state,
@@ -302,5 +302,5 @@ def _from_line(line: Sequence[Any]) -> TileRecord:
         json.loads(sizes),
         finished,
         seconds,
-        (found[0], found[1], found[2]) if found else None,
+        (file[0], file[1], file[2]) if file else None,
     )

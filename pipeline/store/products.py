@@ -1,4 +1,4 @@
-"""The products of one tile in a run, whose marker is written last."""
+"""The folder of one tile in a run: its products and its marker, which is written last."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flexroad.pipeline.graph.graph import TileGraph
 
 @dataclass(frozen=True)
 class TileProducts:
-    """The products of one tile in a run, and the marker that says they are whole."""
+    """The products of one tile in a run, and the marker that is written when they are complete."""
 
     path: Location
 
@@ -26,21 +26,23 @@ class TileProducts:
         return cls(run / "tiles" / safe_name(tile_id))
 
     def done(self, graph: TileGraph) -> dict[str, Any] | None:
-        """Return the tile's item if it is done as the graph asks and its products are there."""
+        """Return the tile's item, None unless it has the graph's fingerprint and all products exist."""
         item = self._read("item.json")
         try:
             if item is None or item["properties"]["flexroad:fingerprint"] != graph.fingerprint:
                 return None
-            # A marker without its rows is damaged, whatever else it holds.
+            # A marker without rows is damaged.
             iter(item["properties"]["flexroad:rows"])
             files = paths.listing(self.path)
-            whole = all(files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values())
+            complete = all(
+                files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values()
+            )
         except (OSError, KeyError, TypeError, AttributeError):
             return None
-        return item if whole else None
+        return item if complete else None
 
     def verified(self) -> bool:
-        """Tell whether the products that the item names are as they were written, byte for byte."""
+        """Return whether every product named by the item has the checksum it was written with."""
         item = self._read("item.json") or {}
         try:
             return all(
@@ -51,9 +53,9 @@ class TileProducts:
             return False
 
     def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
-        """Write the products, then the item that says so.
+        """Write the products, then the item that marks the tile as done.
 
-        An item of before goes first: until the new one is there, nothing vouches for a mixture of files.
+        An existing item is removed first, so that a tile with old and new products never counts as done.
         """
         paths.remove(self.path / "item.json")
         for name, data in products.items():
@@ -62,26 +64,26 @@ class TileProducts:
         paths.remove(self.path / "failed.json")
 
     def fail(self, failure: dict[str, Any]) -> None:
-        """Write down a failure; the tile no longer counts as done."""
+        """Write failed.json and remove the item, so that the tile no longer counts as done."""
         paths.remove(self.path / "item.json")
         paths.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
-            found = json.loads(paths.read(self.path / name))
+            content = json.loads(paths.read(self.path / name))
         except (OSError, ValueError):
             return None
-        return found if isinstance(found, dict) else None
+        return content if isinstance(content, dict) else None
 
 
 def safe_name(tile_id: str) -> str:
-    """Return what folders and files of a tile are called: its id, or one like it that makes a file name."""
+    """Return the name of a tile's folder and files: its id, changed if it is not a valid file name."""
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
     return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
-    """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension wants)."""
+    """Return a STAC asset with size and checksum (a sha256 multihash, as the file extension requires)."""
     return {
         "href": name,
         "type": media_type,
@@ -95,5 +97,5 @@ def _checksum(data: bytes) -> str:
 
 
 def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row with null for what JSON has no number for."""
+    """Return the row with None for NaN and infinities, which JSON cannot represent."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

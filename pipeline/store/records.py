@@ -1,4 +1,4 @@
-"""What is known of one tile of a run: what its marker says, in the fields that tables and resumes need."""
+"""The record of one tile of a run: the content of its marker that tables and resumed runs need."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 MetricsRow = dict[str, Any]
+"""One row of metrics.parquet, by column."""
 State = Literal["done", "failed"]
 MarkerStat = tuple[str, int, int | str]
-"""Name, size and version (time or ETag) of the file that an entry was read from, or written to."""
+"""Name, size (bytes) and version (time or ETag) of a tile's marker file."""
 
 DONE, FAILED = "item.json", "failed.json"
 MARKERS: dict[State, str] = {"done": DONE, "failed": FAILED}
+"""Name of the marker file of each state."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a tile has no result."""
+    """An error that left a tile without a result."""
 
     tile_id: str
     stage: str
@@ -24,65 +26,65 @@ class Failure:
     message: str
     file: str = ""
     trace: str = ""
-    """The traceback, for faults that are not the input's."""
+    """The traceback; empty for expected errors, such as invalid input."""
 
     @property
     def line(self) -> str:
-        """One line for tables."""
+        """Stage, kind and message in one line, for tables."""
         return f"{self.stage}: {self.kind}: {self.message}"
 
     @property
     def notice(self) -> str:
-        """One line for people: tile, what is wrong, and the file at fault."""
+        """Tile, error and file in one line, for the command line and reports."""
         return f"{self.tile_id}: {self.line}{f'  [{self.file}]' if self.file else ''}"
 
 
 @dataclass(frozen=True)
 class TileRecord:
-    """How a tile went when it was last tried."""
+    """The result of a tile's last attempt."""
 
     tile_id: str
     state: State
     fingerprint: str
-    """Of the graph that was carried out."""
+    """Fingerprint of the graph that was computed."""
     rows: tuple[MetricsRow, ...]
     failures: tuple[Failure, ...] = ()
     sources: list[Any] = field(default_factory=list)
-    """The source layers as `TileGraph.sources` named them."""
+    """`TileGraph.sources` of that graph."""
     sizes: dict[str, int] = field(default_factory=dict)
-    """Bytes of each product, by file name."""
+    """Size of each product in bytes, by file name."""
     finished: str = ""
-    """When, as ISO 8601 in UTC."""
+    """Time of completion, ISO 8601 in UTC."""
     seconds: float = 0.0
-    """What computing it took, in the worker."""
+    """Computing time in the worker (s)."""
     marker: MarkerStat | None = None
-    """None where none could be written, as on a full disk."""
+    """None if the marker could not be written, for example on a full disk."""
 
 
 def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
-    """Return what a STAC item of a finished tile says.
+    """Return the record of a finished tile from its STAC item.
 
     Raises
     ------
     KeyError, TypeError, AttributeError
-        If it is damaged: a marker without its rows is, whatever else it holds.
+        If the item is damaged, for example has no rows.
     """
-    told = item["properties"]
+    properties = item["properties"]
     return TileRecord(
         item["id"],
         "done",
-        told["flexroad:fingerprint"],
-        tuple(told["flexroad:rows"]),
-        sources=told.get("flexroad:sources") or [],
+        properties["flexroad:fingerprint"],
+        tuple(properties["flexroad:rows"]),
+        sources=properties.get("flexroad:sources") or [],
         sizes={asset["href"]: asset["file:size"] for asset in item["assets"].values()},
-        finished=told.get("created", ""),
-        seconds=told.get("flexroad:seconds", 0.0),
+        finished=properties.get("created", ""),
+        seconds=properties.get("flexroad:seconds", 0.0),
         marker=marker,
     )
 
 
 def to_failed(entry: TileRecord) -> dict[str, Any]:
-    """Return what failed.json holds."""
+    """Return the content of failed.json."""
     return {
         "tile": entry.tile_id,
         "fingerprint": entry.fingerprint,
@@ -93,8 +95,8 @@ def to_failed(entry: TileRecord) -> dict[str, Any]:
     }
 
 
-def from_failed(found: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
-    """Return what failed.json says.
+def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
+    """Return the record of a failed tile from the content of its failed.json.
 
     Raises
     ------
@@ -102,12 +104,12 @@ def from_failed(found: dict[str, Any], marker: MarkerStat | None) -> TileRecord:
         If it is damaged.
     """
     return TileRecord(
-        found["tile"],
+        content["tile"],
         "failed",
-        found["fingerprint"],
-        tuple(found["rows"]),
-        tuple(Failure(**failure) for failure in found["failures"]),
-        finished=found.get("finished", ""),
-        seconds=found.get("seconds", 0.0),
+        content["fingerprint"],
+        tuple(content["rows"]),
+        tuple(Failure(**failure) for failure in content["failures"]),
+        finished=content.get("finished", ""),
+        seconds=content.get("seconds", 0.0),
         marker=marker,
     )

@@ -14,8 +14,8 @@ from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import Failure, MetricsRow
 
-PIECE = 10_000
-"""Rows held at a time; also the table's row groups."""
+CHUNK = 10_000
+"""Rows held in memory at a time; also the row groups of metrics.parquet."""
 
 COLUMNS: dict[str, str] = {
     "tile_id": "str",
@@ -54,30 +54,30 @@ COLUMNS: dict[str, str] = {
     "suspect_m2": "float64",
     "flags": "str",
 }
-"""Columns of metrics.parquet and their types; the fixed ones first."""
+"""Columns of metrics.parquet and their types, in the table's order."""
 
 
 def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
-    """Return the rows as a table with the fixed columns."""
+    """Return the rows as a table with the columns of metrics.parquet."""
     frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
     return frame.astype(COLUMNS)
 
 
 def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure]) -> None:
-    """Write metrics.parquet and failures.csv, piece by piece.
+    """Write metrics.parquet and failures.csv in chunks.
 
     Raises
     ------
     OSError
-        If they cannot be written, as on a full disk.
+        If they cannot be written, for example on a full disk.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
     with atomic_file(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
-        for piece in _pieces(rows):
-            table.write_table(pa.Table.from_pandas(metrics_frame(piece), schema, preserve_index=False))
+        for chunk in _chunks(rows):
+            table.write_table(pa.Table.from_pandas(metrics_frame(chunk), schema, preserve_index=False))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
     with atomic_file(run / "failures.csv") as path, path.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
@@ -85,10 +85,10 @@ def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[F
         lines.writerows([getattr(failure, name) for name in names] for failure in failures)
 
 
-def _pieces(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
-    left = iter(rows)
-    while piece := list(islice(left, PIECE)):
-        yield piece
+def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
+    remaining = iter(rows)
+    while chunk := list(islice(remaining, CHUNK)):
+        yield chunk
 
 
 def read_metrics(run: Location) -> pd.DataFrame:
@@ -97,30 +97,30 @@ def read_metrics(run: Location) -> pd.DataFrame:
     Raises
     ------
     ConfigError
-        If there are none yet, or the table is damaged.
+        If the table does not exist yet or is damaged.
     """
     path = run / "metrics.parquet"
     if not exists(path):
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
-        # Runs of earlier days lack the later columns.
+        # Tables of older versions lack the newer columns.
         return frame_of(read(path)).reindex(columns=list(COLUMNS))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it anew") from error
+        raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it again") from error
 
 
 def frame_of(data: bytes) -> pd.DataFrame:
-    """Return a table of a Parquet file's bytes.
+    """Return the table in the bytes of a Parquet file.
 
     Raises
     ------
     OSError, ValueError
-        If they are no such file.
+        If they are not a Parquet file.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    # pandas' own way starts threads, which may be alive when a short command ends, and abort it then.
+    # pandas.read_parquet starts threads; those still running when a short command exits can abort it.
     file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
-    found: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
-    return found
+    table: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
+    return table

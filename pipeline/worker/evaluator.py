@@ -1,7 +1,7 @@
-"""Pull what is asked for through a tile's graph: a stage runs only if something needs what the store lacks.
+"""Lazy evaluation of a tile's graph: a node is computed only if its result is needed and not in the store.
 
-After a stage that reads files the files are looked at again: what was read must be what the fingerprint says,
-or a result would be kept under a name that is not its own.
+After a stage that reads files, size and version of the files are compared with those in the graph. If a file
+has changed, the stage fails, so that no result is stored under a wrong fingerprint.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flexroad.tasks.errors import TaskError
 
 
 class StageError(Exception):
-    """A stage failed; carries what the table of failures needs."""
+    """A stage failed; ``failure`` is its row in the table of failures."""
 
     def __init__(self, failure: Failure) -> None:
         super().__init__(failure.line)
@@ -30,45 +30,48 @@ class StageError(Exception):
 
 
 class SourceChanged(Exception):
-    """A file is no longer the one that the tile's graph was made for."""
+    """A source file changed after the tile's graph was made."""
 
     def __init__(self, file: str) -> None:
-        super().__init__("changed while the tile was being done; the same command takes the tile up again")
+        super().__init__("changed while the tile was processed; run the same command again")
         self.file = file
 
 
 @dataclass
 class Evaluator:
-    """Results of one tile's nodes, each computed or read at most once."""
+    """The results of one tile's nodes; each node is computed or read from the store at most once."""
 
     graph: TileGraph
     store: ArtefactStore
     force: frozenset[str] = frozenset()
     keep: bool = False
-    """Whether to put into the store what is computed; who only looks at a run leaves it as it is."""
+    """Whether computed results are stored; false when a run is only read."""
     results: dict[str, Any] = field(default_factory=dict)
+    """Results by fingerprint."""
     chain_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Fingerprint -> stage -> computing time (s) of the node and the nodes it depends on."""
     spans: defaultdict[str, StageCost] = field(default_factory=lambda: defaultdict(StageCost))
-    """What each stage cost here."""
-    faults: dict[str, StageError] = field(default_factory=dict)
+    """Cost of each stage in this process."""
+    errors: dict[str, StageError] = field(default_factory=dict)
+    """Errors by fingerprint."""
 
     def __call__(self, fingerprint: str) -> Any:
-        """Return the node's result.
+        """Return the result of a node.
 
         Raises
         ------
         StageError
-            If it or something it needs failed, now or before.
+            If the node or one of its inputs fails or has failed before.
         """
-        if fingerprint in self.faults:
-            raise self.faults[fingerprint]
+        if fingerprint in self.errors:
+            raise self.errors[fingerprint]
         if fingerprint not in self.results:
             node = self.graph.nodes[fingerprint]
-            found = self.store.get(node) if node.stored and node.stage not in self.force else None
-            if found is None:
+            artefact = self.store.get(node) if node.stored and node.stage not in self.force else None
+            if artefact is None:
                 self._compute(node)
             else:
-                self.results[fingerprint], self.chain_seconds[fingerprint] = found
+                self.results[fingerprint], self.chain_seconds[fingerprint] = artefact
                 self.spans[node.stage].reused += 1
         return self.results[fingerprint]
 
@@ -77,49 +80,50 @@ class Evaluator:
         span = self.spans[node.stage]
         before = span.seconds
         try:
-            with span.measured():
-                result = self._carry_out(node, inputs)
+            with span.measure():
+                result = self._run_stage(node, inputs)
         except Exception as error:
             failed = StageError(failure_of(self.graph.tile, node.stage, error))
-            self.faults[node.fingerprint] = failed
+            self.errors[node.fingerprint] = failed
             raise failed from error
         span.computed += 1
-        known = [self.chain_seconds[fingerprint] for fingerprint in node.inputs]
-        spent = {stage: value for seconds in known for stage, value in seconds.items()}
-        spent[node.stage] = span.seconds - before
-        self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, spent
+        of_inputs = [self.chain_seconds[fingerprint] for fingerprint in node.inputs]
+        seconds = {stage: value for by_stage in of_inputs for stage, value in by_stage.items()}
+        seconds[node.stage] = span.seconds - before
+        self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
         if node.stored and self.keep:
-            self._keep(node, result, spent)
+            self._store(node, result, seconds)
 
-    def _carry_out(self, node: Node, inputs: list[Any]) -> Any:
+    def _run_stage(self, node: Node, inputs: list[Any]) -> Any:
         try:
             return node.function(*inputs, node.options)
         finally:
-            # Also after a fault: a file that is just being replaced may well be unreadable.
+            # Also after an error: a file that is being replaced may be unreadable.
             for file in files_read(self.graph, node):
-                if stat(file) != self.graph.seen[str(file)]:
+                if stat(file) != self.graph.file_stats[str(file)]:
                     raise SourceChanged(str(file))
 
-    def _keep(self, node: Node, result: Any, spent: Mapping[str, float]) -> None:
+    def _store(self, node: Node, result: Any, seconds: Mapping[str, float]) -> None:
         try:
-            self.spans[node.stage].bytes += self.store.put(node, result, spent)
+            self.spans[node.stage].bytes += self.store.put(node, result, seconds)
         except OSError as error:
-            # The same for every artefact: a full disk is one failure, not one for each variant.
+            # The error names the store, not the file, so that a full disk is one failure for all variants.
             full = OSError(error.errno, error.strerror, str(self.store.root))
             failed = StageError(failure_of(self.graph.tile, "store", full))
-            self.faults[node.fingerprint] = failed
+            self.errors[node.fingerprint] = failed
             raise failed from error
 
 
 def failure_of(tile: Tile, stage: str, error: BaseException) -> Failure:
-    """Return an error as a line of the table of failures."""
+    """Return the row of an error in the table of failures."""
     message = " ".join(str(error).split()) or repr(error)
     expected = isinstance(error, TaskError | OSError | SourceChanged)
     trace = "" if expected else "".join(traceback.format_exception(error))
-    return Failure(tile.id, stage, type(error).__name__, message, _file(tile, error), trace)
+    return Failure(tile.id, stage, type(error).__name__, message, _file_of(tile, error), trace)
 
 
-def _file(tile: Tile, error: BaseException) -> str:
+def _file_of(tile: Tile, error: BaseException) -> str:
+    """Return the file that caused an error, ``""`` if there is none."""
     if isinstance(error, TaskError):
         layer = tile.layer(error.layer)
         return error.file or (str(tile.paths(layer)[0]) if layer else "")

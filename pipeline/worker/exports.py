@@ -1,4 +1,4 @@
-"""What a tile gives its user: meshes, rasters and the surface itself, in formats that open as they are."""
+"""The products of a tile: meshes, rasters and the surface itself, in standard formats."""
 
 from __future__ import annotations
 
@@ -12,72 +12,74 @@ from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
 
 Product = tuple[bytes, str]
-"""Bytes and media type."""
+"""Content (bytes) and media type of a file."""
 SUFFIXES = {
     "glb": (glb.NAME,),
     "ply": (ply.NAME,),
     "cog": (cog.NAME_HEIGHT, cog.NAME_ROAD, cog.NAME_SUPPORT),
     "npz": (npz.NAME,),
 }
-"""What the files of each format are called, after tile and variant."""
+"""Ends of the file names of each format, after tile and variant."""
 
 
-def products(graph: TileGraph, pull: Callable[[str], Any], origin: tuple[float, float]) -> dict[str, Product]:
-    """Return every product asked for, by file name.
+def products(
+    graph: TileGraph, evaluate: Callable[[str], Any], origin: tuple[float, float]
+) -> dict[str, Product]:
+    """Return the products of the graph's export variants and formats, by file name.
 
     Parameters
     ----------
     graph : TileGraph
-        The tile, and what is asked for.
-    pull : callable
-        Gives the result of a node by its fingerprint.
+        The tile's graph, with the export options.
+    evaluate : callable
+        Returns the result of a node by its fingerprint.
     origin : tuple of float
-        Whole-metre (easting, northing) that the run's meshes are placed against.
+        Origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
     """
-    made: dict[str, Product] = {}
+    files: dict[str, Product] = {}
     tile = safe_name(graph.tile.id)
     for variant in graph.export.variants:
         for kind in graph.export.formats:
-            found = _MAKERS[kind](graph, graph.variants[variant], pull, origin)
-            made |= {f"{tile}_{variant}{suffix}": product for suffix, product in found.items()}
-    return made
+            by_suffix = _ENCODERS[kind](graph, graph.variants[variant], evaluate, origin)
+            files |= {f"{tile}_{variant}{suffix}": product for suffix, product in by_suffix.items()}
+    return files
 
 
 def _glb(
-    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
 ) -> dict[str, Product]:
-    return {glb.NAME: (glb.encode(pull(made["sample"]), (*origin, 0.0)), glb.MEDIA_TYPE)}
+    return {glb.NAME: (glb.encode(evaluate(nodes["sample"]), (*origin, 0.0)), glb.MEDIA_TYPE)}
 
 
 def _ply(
-    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
 ) -> dict[str, Product]:
-    mesh = pull(made["sample"])
-    support = of_faces(pull(made["assess"]).support, pull(made["segment"]), mesh)
+    mesh = evaluate(nodes["sample"])
+    support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
     return {ply.NAME: (ply.encode(mesh, support), ply.MEDIA_TYPE)}
 
 
 def _cog(
-    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
 ) -> dict[str, Product]:
-    core, road, surface = graph.tile.grid, pull(made["segment"]), pull(made["fit"])
+    core, road, surface = graph.tile.grid, evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
-    kept = pull(made["ecsrc"]).mask[window]
+    kept = evaluate(nodes["ecsrc"]).mask[window]
     return {
         cog.NAME_HEIGHT: (cog.encode_height(heights, core), cog.MEDIA_TYPE),
         cog.NAME_ROAD: (cog.encode_mask(kept, core), cog.MEDIA_TYPE),
-        cog.NAME_SUPPORT: (cog.encode_support(pull(made["assess"]).support, core), cog.MEDIA_TYPE),
+        cog.NAME_SUPPORT: (cog.encode_support(evaluate(nodes["assess"]).support, core), cog.MEDIA_TYPE),
     }
 
 
 def _npz(
-    graph: TileGraph, made: dict[str, str], pull: Callable[[str], Any], origin: tuple[float, float]
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
 ) -> dict[str, Product]:
-    surface = pull(made["fit"])
-    # A plane and a raster are no NURBS, and no more than what they were made from.
+    surface = evaluate(nodes["fit"])
+    # Planes and rasters have no NURBS form, and their npz would only repeat the input.
     return {npz.NAME: (npz.encode(surface), npz.MEDIA_TYPE)} if isinstance(surface, NurbsSurface) else {}
 
 
-_MAKERS = {"glb": _glb, "ply": _ply, "cog": _cog, "npz": _npz}
+_ENCODERS = {"glb": _glb, "ply": _ply, "cog": _cog, "npz": _npz}

@@ -1,4 +1,4 @@
-"""What a stage costs on one tile: time, memory, bytes written."""
+"""Time, memory and bytes written by one stage of one tile."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ class StageCost:
     """The cost of one stage over all variants of a tile."""
 
     time: str = ""
-    """When it was first begun, as ISO 8601 in UTC; empty if it never was."""
+    """Start of the first computation, ISO 8601 in UTC; empty if nothing was computed."""
     seconds: float = 0.0
+    """Computing time (s)."""
     bytes: int = 0
-    """Written to the store or among the products."""
+    """Bytes written to the store or as products."""
     peak_mb: float = 0.0
-    """Most memory the process held meanwhile, all it holds anyway included."""
+    """Peak memory of the whole process during the stage (MB)."""
     computed: int = 0
-    """How many of its nodes were computed."""
+    """Number of nodes computed."""
     reused: int = 0
-    """How many were read from the store."""
+    """Number of nodes read from the store."""
 
     @contextlib.contextmanager
-    def measured(self) -> Iterator[None]:
-        """Add what happens inside, whether it ends well or not."""
-        self.time = self.time or now()
-        _forget_peak()
+    def measure(self) -> Iterator[None]:
+        """Add time and peak memory of the ``with`` block, also if it raises."""
+        self.time = self.time or utc_now()
+        _reset_peak()
         start = perf_counter()
         try:
             yield
@@ -42,17 +43,17 @@ class StageCost:
             self.peak_mb = max(self.peak_mb, peak_mb())
 
 
-def now() -> str:
-    """Return the time as ISO 8601 in UTC."""
+def utc_now() -> str:
+    """Return the current time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def peak_mb() -> float:
-    """Return the most memory this process held (MB) since `_forget_peak`, or ever where that is unknown."""
+    """Return the peak memory of this process (MB) since `_reset_peak`; outside Linux since its start."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _forget_peak() -> None:
-    # Linux alone can; elsewhere a stage's peak is that of the process so far.
+def _reset_peak() -> None:
+    # Only Linux can reset the peak.
     with contextlib.suppress(OSError):
         (PROC / "clear_refs").write_text("5")

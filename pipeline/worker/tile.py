@@ -1,6 +1,6 @@
-"""What happens to one tile: do what its graph asks for, keep it, say how it went.
+"""Processing of one tile: evaluate its graph, write its products and marker, return a small result.
 
-Runs in a worker process; only small rows go back.
+`process_tile` runs in a worker process; arrays stay there, only rows are returned.
 """
 
 from __future__ import annotations
@@ -30,103 +30,103 @@ from flexroad.pipeline.store.records import (
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
 from flexroad.pipeline.worker.exports import products
-from flexroad.pipeline.worker.profiling import StageCost, now
+from flexroad.pipeline.worker.profiling import StageCost, utc_now
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
-"""Figures of a row that need no ground truth."""
+"""Columns of a row that are computed without ground truth."""
 Status = Literal["done", "failed", "cached"]
 
 
 @dataclass(frozen=True)
 class TileJob:
-    """One tile to do, and where its results go; travels to a worker."""
+    """One tile to process and the paths of its results; sent to a worker."""
 
     graph: TileGraph
     run: str
     store: str
     origin: tuple[float, float]
-    """Whole-metre (easting, northing) that all meshes of the run are placed against."""
+    """Origin of the run: whole-metre (easting, northing) that mesh translations are relative to."""
     force: frozenset[str] = frozenset()
-    """Stages to compute even if the store has them."""
+    """Stages to compute even if their results are in the store."""
 
     @property
     def key(self) -> str:
-        """What the job is called on Dask's dashboard."""
+        """Name of the job on Dask's dashboard."""
         return f"tile-{self.graph.tile.id}"
 
     @property
     def folder(self) -> TileProducts:
-        """Where the tile's products go."""
+        """The folder of the tile's products."""
         return TileProducts.of(parse_location(self.run), self.graph.tile.id)
 
 
 @dataclass(frozen=True)
 class TileResult:
-    """How one tile went now; what travels back."""
+    """The result of one tile in this run, as returned by a worker."""
 
     entry: TileRecord
     status: Status
-    """Cached if its result was there and nothing had to be done."""
+    """``cached`` if the tile was up to date before."""
     spans: dict[str, StageCost] = field(default_factory=dict)
-    """What each stage cost."""
+    """Cost of each stage."""
     notes: tuple[str, ...] = ()
     host: str = ""
     pid: int = 0
 
     @property
     def tile_id(self) -> str:
-        """Which tile."""
+        """Id of the tile."""
         return self.entry.tile_id
 
     @property
     def rows(self) -> tuple[MetricsRow, ...]:
-        """One per variant."""
+        """Metrics, one row per variant."""
         return self.entry.rows
 
     @property
     def failures(self) -> tuple[Failure, ...]:
-        """Why it has no result."""
+        """Errors that left the tile without a result; empty if it is done."""
         return self.entry.failures
 
     @property
     def computed(self) -> dict[str, int]:
-        """Stage -> how many of its nodes were computed now."""
+        """Stage -> number of nodes computed in this run."""
         return {stage: span.computed for stage, span in self.spans.items() if span.computed}
 
     @property
     def reused(self) -> dict[str, int]:
-        """Stage -> how many of its nodes came from the store."""
+        """Stage -> number of nodes read from the store."""
         return {stage: span.reused for stage, span in self.spans.items() if span.reused}
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Stage -> time spent computing now."""
+        """Stage -> computing time in this run (s)."""
         return {stage: span.seconds for stage, span in self.spans.items() if span.computed}
 
     @property
     def peak_mb(self) -> float:
-        """Most memory that the worker held meanwhile."""
+        """Peak memory of the worker while it processed the tile (MB)."""
         return max((span.peak_mb for span in self.spans.values()), default=0.0)
 
 
 def process_tile(job: TileJob) -> TileResult:
-    """Bring one tile up to date with its graph; never raises for what is one tile's own fault."""
+    """Bring one tile up to date with its graph; errors of the tile are returned as failures, not raised."""
     graph = job.graph
-    pull = Evaluator(graph, ArtefactStore(parse_location(job.store)), job.force, keep=True)
+    evaluator = Evaluator(graph, ArtefactStore(parse_location(job.store)), job.force, keep=True)
     rows, failures = [], []
     for variant in graph.variants:
         try:
-            rows.append(_row(graph, variant, pull))
+            rows.append(_row(graph, variant, evaluator))
         except StageError as error:
             rows.append(failed_row(graph, variant, error.failure.line))
             failures.append(error.failure)
     failures = list(dict.fromkeys(failures))
-    notes = tuple(dict.fromkeys(note for fp, node in graph.nodes.items() for note in _noted(fp, node, pull)))
+    notes = tuple(dict.fromkeys(note for node in graph.nodes.values() for note in _notes(node, evaluator)))
     entry = None
     if not failures:
         try:
-            entry = _finish(job, pull, rows, notes)
+            entry = _finish(job, evaluator, rows, notes)
         except StageError as error:
             failures.append(error.failure)
         except Exception as error:
@@ -134,34 +134,34 @@ def process_tile(job: TileJob) -> TileResult:
         if failures:
             rows = [failed_row(graph, row["variant"], failures[0].line) for row in rows]
     if entry is None:
-        entry = record_failure(job, rows, failures, _seconds(pull))
-    return TileResult(entry, entry.state, dict(pull.spans), notes, socket.gethostname(), os.getpid())
+        entry = record_failure(job, rows, failures, _seconds(evaluator))
+    return TileResult(entry, entry.state, dict(evaluator.spans), notes, socket.gethostname(), os.getpid())
 
 
 def record_failure(
     job: TileJob, rows: Sequence[MetricsRow], failures: Sequence[Failure], seconds: float = 0.0
 ) -> TileRecord:
-    """Write down that the tile failed, and why."""
+    """Write the tile's failed.json and return the record of the failure."""
     tile_id, fingerprint = job.graph.tile.id, job.graph.fingerprint
     entry = TileRecord(
-        tile_id, "failed", fingerprint, tuple(rows), tuple(failures), finished=now(), seconds=seconds
+        tile_id, "failed", fingerprint, tuple(rows), tuple(failures), finished=utc_now(), seconds=seconds
     )
     marker = None
-    # Where even this cannot be written (disk full), the entry that goes back still tells.
+    # If the marker cannot be written (disk full), the returned record still has the failure.
     with contextlib.suppress(OSError):
         job.folder.fail(to_failed(entry))
-        marker = marker_of(job.folder, "failed")
+        marker = marker_stat(job.folder, "failed")
     return replace(entry, marker=marker)
 
 
-def marker_of(folder: TileProducts, state: State) -> MarkerStat | None:
-    """Return how the marker that was just written looks."""
-    seen = stat(folder.path / MARKERS[state])
-    return (MARKERS[state], seen.size, seen.version) if seen else None
+def marker_stat(folder: TileProducts, state: State) -> MarkerStat | None:
+    """Return name, size and version of a tile's marker, None if it does not exist."""
+    file = stat(folder.path / MARKERS[state])
+    return (MARKERS[state], file.size, file.version) if file else None
 
 
 def failed_row(graph: TileGraph, variant: str, error: str) -> MetricsRow:
-    """Return the row of a variant without figures."""
+    """Return the row of a failed variant: all metrics None, with the error."""
     return (
         _head(graph, variant, "failed")
         | dict.fromkeys((*Metrics.__annotations__, *QUALITY))
@@ -169,14 +169,14 @@ def failed_row(graph: TileGraph, variant: str, error: str) -> MetricsRow:
     )
 
 
-def _row(graph: TileGraph, variant: str, pull: Evaluator) -> MetricsRow:
-    evaluated = graph.variants[variant]["evaluate"]
-    figures = asdict(pull(evaluated))
-    quality: Quality = pull(graph.variants[variant]["assess"])
-    figures |= {name: getattr(quality, name) for name in QUALITY}
-    seconds = sum(pull.chain_seconds[evaluated].values())
-    told = {"seconds": seconds, "error": "", "flags": ", ".join(quality.flags)}
-    return no_nan(_head(graph, variant, "done") | figures | told)
+def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:
+    node = graph.variants[variant]["evaluate"]
+    metrics = asdict(evaluator(node))
+    quality: Quality = evaluator(graph.variants[variant]["assess"])
+    metrics |= {name: getattr(quality, name) for name in QUALITY}
+    seconds = sum(evaluator.chain_seconds[node].values())
+    status = {"seconds": seconds, "error": "", "flags": ", ".join(quality.flags)}
+    return no_nan(_head(graph, variant, "done") | metrics | status)
 
 
 def _head(graph: TileGraph, variant: str, status: Status) -> MetricsRow:
@@ -190,42 +190,43 @@ def _head(graph: TileGraph, variant: str, status: Status) -> MetricsRow:
     }
 
 
-def _seconds(pull: Evaluator) -> float:
-    return sum(span.seconds for span in pull.spans.values())
+def _seconds(evaluator: Evaluator) -> float:
+    return sum(span.seconds for span in evaluator.spans.values())
 
 
-def _noted(fingerprint: str, node: Node, pull: Evaluator) -> tuple[str, ...]:
-    """Return what a stage that reads sources had to say of them, as far as it was asked."""
-    if node.stage not in ("load", "segment") or fingerprint not in pull.results:
+def _notes(node: Node, evaluator: Evaluator) -> tuple[str, ...]:
+    """Return the notes of a stage about its sources; empty if the node was not evaluated."""
+    if node.stage not in ("load", "segment") or node.fingerprint not in evaluator.results:
         return ()
-    notes: tuple[str, ...] = pull.results[fingerprint].notes
+    notes: tuple[str, ...] = evaluator.results[node.fingerprint].notes
     return notes
 
 
-def _finish(job: TileJob, pull: Evaluator, rows: list[MetricsRow], notes: tuple[str, ...]) -> TileRecord:
-    span = pull.spans["export"]
-    with span.measured():
-        made = products(job.graph, pull, job.origin)
-        seconds = round(_seconds(pull), 4)
-        written = _item(job.graph, rows, made, notes, seconds)
-        job.folder.finish(written, {name: data for name, (data, _) in made.items()})
+def _finish(job: TileJob, evaluator: Evaluator, rows: list[MetricsRow], notes: tuple[str, ...]) -> TileRecord:
+    """Write the products and the item of a finished tile; return its record."""
+    span = evaluator.spans["export"]
+    with span.measure():
+        files = products(job.graph, evaluator, job.origin)
+        seconds = round(_seconds(evaluator), 4)
+        written = _item(job.graph, rows, files, notes, seconds)
+        job.folder.finish(written, {name: data for name, (data, _) in files.items()})
     span.computed += 1
-    span.bytes += sum(len(data) for data, _ in made.values())
-    return from_item(written, marker_of(job.folder, "done"))
+    span.bytes += sum(len(data) for data, _ in files.values())
+    return from_item(written, marker_stat(job.folder, "done"))
 
 
 def _item(
     graph: TileGraph,
     rows: list[MetricsRow],
-    made: Mapping[str, tuple[bytes, str]],
+    files: Mapping[str, tuple[bytes, str]],
     notes: tuple[str, ...],
     seconds: float,
 ) -> dict[str, Any]:
-    found = item(graph.tile)
-    found["stac_extensions"].append("https://stac-extensions.github.io/file/v2.1.0/schema.json")
-    found["assets"] = {name: file_entry(name, data, kind) for name, (data, kind) in made.items()}
-    found["properties"] |= {
-        "created": now(),
+    content = item(graph.tile)
+    content["stac_extensions"].append("https://stac-extensions.github.io/file/v2.1.0/schema.json")
+    content["assets"] = {name: file_entry(name, data, kind) for name, (data, kind) in files.items()}
+    content["properties"] |= {
+        "created": utc_now(),
         "flexroad:fingerprint": graph.fingerprint,
         "flexroad:rows": rows,
         "flexroad:notes": list(notes),
@@ -234,7 +235,7 @@ def _item(
         "flexroad:versions": _versions(graph),
         "flexroad:seconds": seconds,
     }
-    return found
+    return content
 
 
 def _versions(graph: TileGraph) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Fingerprints change with what makes a result, and with nothing else."""
+"""Fingerprints depend on stage, version, options and inputs, and on nothing else."""
 
 import hashlib
 import json
@@ -25,15 +25,17 @@ PAPER = {
 }
 
 
-def names(catalog, raw=PAPER, variant="flexroad", **how) -> dict[str, str]:
-    return tile_graph(Catalog.read(catalog).tiles[0], compose(raw, "x"), **how).variants[variant]
+def names(catalog, raw=PAPER, variant="flexroad", **options) -> dict[str, str]:
+    """Return stage -> fingerprint of the first tile."""
+    return tile_graph(Catalog.read(catalog).tiles[0], compose(raw, "x"), **options).variants[variant]
 
 
 def changed(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """Return the stages whose fingerprints differ."""
     return [stage for stage in STAGE_NAMES if before[stage] != after[stage]]
 
 
-def test_the_same_again_is_the_same(survey):
+def test_equal_inputs_give_equal_fingerprints(survey):
     assert names(survey) == names(survey)
 
 
@@ -49,45 +51,45 @@ def test_the_same_again_is_the_same(survey):
         ({"export": {"formats": ["glb"]}}, []),
     ],
 )
-def test_an_option_changes_its_stage_and_what_follows(survey, override, stages):
+def test_changed_option_changes_its_stage_and_dependents(survey, override, stages):
     assert changed(names(survey), names(survey, {**PAPER, **override})) == stages
 
 
-def literally(graph, config) -> dict[str, dict[str, str]]:
-    """Name every node as the page says, one by one."""
+def reference_fingerprints(graph, config) -> dict[str, dict[str, str]]:
+    """Compute variant -> stage -> fingerprint directly from the definition in `graph.py`."""
     tile, names = graph.tile, {}
     for variant, chain in config.chains.items():
-        made = names[variant] = {}
+        by_stage = names[variant] = {}
         for stage in STAGES:
             options = chain[stage.name]
             module = stage_module(options)
-            made_of = [
+            hashed = [
                 stage.name,
                 module.VERSION,
                 options.model_dump(mode="json"),
-                [made[name] for name in stage.inputs] or asdict(tile.grid),
+                [by_stage[name] for name in stage.inputs] or asdict(tile.grid),
                 [source for source in graph.sources if source[0] in getattr(module, "READS", ())],
                 [],
             ]
-            text = json.dumps(made_of, sort_keys=True, separators=(",", ":"))
-            made[stage.name] = hashlib.sha256(text.encode()).hexdigest()[:32]
+            text = json.dumps(hashed, sort_keys=True, separators=(",", ":"))
+            by_stage[stage.name] = hashlib.sha256(text.encode()).hexdigest()[:32]
     return names
 
 
 @pytest.mark.parametrize("name", ["paper", "ablation"])
-def test_names_are_the_hash_of_what_makes_a_node(name, survey):
+def test_fingerprint_is_hash_of_stage_version_options_and_inputs(name, survey):
     config = load_config(name)
     pattern = Pattern.of(config)
     for tile in Catalog.read(survey).tiles:
         graph = pattern.graph(tile)
-        assert graph.variants == literally(graph, config)
+        assert graph.variants == reference_fingerprints(graph, config)
 
 
-def test_an_option_at_its_default_changes_nothing(survey):
+def test_option_at_default_keeps_fingerprints(survey):
     assert names(survey) == names(survey, {**PAPER, "fit": {"method": "nurbs", "degree": 3}})
 
 
-def test_a_version_changes_its_stage_and_what_follows(survey, monkeypatch):
+def test_changed_version_changes_its_stage_and_dependents(survey, monkeypatch):
     before = names(survey)
     monkeypatch.setattr(ecsrc, "VERSION", ecsrc.VERSION + 1)
     assert changed(before, names(survey)) == ["ecsrc", "fit", "sample", "evaluate", "assess"]
@@ -109,7 +111,7 @@ def versions_of(node) -> tuple[str, int]:
     return stage_version(node.stage, node.options)
 
 
-def test_variants_share_what_they_have_in_common(survey):
+def test_variants_share_equal_nodes(survey):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(PAPER, "x"))
     assert len(graph.nodes) == 3 + 3 * 4
     stages = [node.stage for node in graph.nodes.values()]
@@ -119,51 +121,51 @@ def test_variants_share_what_they_have_in_common(survey):
     assert [node.stage for node in graph.nodes.values() if not node.stored].count("load") == 1
 
 
-def test_tiles_and_moved_surveys(survey, tmp_path):
+def test_fingerprint_differs_by_tile_and_not_by_folder(survey, tmp_path):
     tiles = Catalog.read(survey).tiles
     config = compose(PAPER, "x")
     assert tile_graph(tiles[0], config).fingerprint != tile_graph(tiles[1], config).fingerprint
     before = names(survey)
-    # copytree keeps times; relative names do the rest.
+    # copytree keeps the file times, and fingerprints hash relative paths.
     moved = shutil.copytree(survey.parent, tmp_path / "moved") / survey.name
     assert names(moved) == before
 
 
-def test_sources_count_by_size_and_time_or_by_bytes(survey):
+def test_changed_source_changes_fingerprints_by_time_or_checksum(survey):
     tile = Catalog.read(survey).tiles[0]
     path = tile.paths(tile.layers[0])[0]
-    plain, summed = names(survey), names(survey, checksum=True)
-    assert changed(plain, summed) == list(STAGE_NAMES)
+    by_time, by_bytes = names(survey), names(survey, checksum=True)
+    assert changed(by_time, by_bytes) == list(STAGE_NAMES)
     os.utime(path, (1, 1))
-    assert changed(plain, names(survey)) == list(STAGE_NAMES)
-    assert names(survey, checksum=True) == summed
+    assert changed(by_time, names(survey)) == list(STAGE_NAMES)
+    assert names(survey, checksum=True) == by_bytes
     path.write_bytes(path.read_bytes() + b"\0")
-    assert changed(summed, names(survey, checksum=True)) == list(STAGE_NAMES)
+    assert changed(by_bytes, names(survey, checksum=True)) == list(STAGE_NAMES)
     path.unlink()
     missing = names(survey)
-    assert changed(plain, missing) == list(STAGE_NAMES)
+    assert changed(by_time, missing) == list(STAGE_NAMES)
 
 
-def test_a_layer_changes_the_stages_that_read_it(survey, tmp_path, monkeypatch):
+def test_changed_layer_changes_only_stages_that_read_it(survey, tmp_path, monkeypatch):
     (tile, *_) = Catalog.read(survey).tiles
     photo = tmp_path / "dop.tif"
     photo.write_bytes(b"old")
     tile = replace(tile, layers=(*tile.layers, Layer("dop", (str(photo),))))
 
-    def made():
+    def fingerprints():
         return tile_graph(tile, compose(PAPER, "x")).variants["flexroad"]
 
-    unread = made()
+    unread = fingerprints()
     photo.write_bytes(b"newer")
-    assert made() == unread
+    assert fingerprints() == unread
     monkeypatch.setattr(mask, "READS", ("dop",), raising=False)
-    read = made()
+    read = fingerprints()
     assert changed(unread, read) == list(STAGE_NAMES[1:])
     photo.write_bytes(b"newest of all")
-    assert changed(read, made()) == list(STAGE_NAMES[1:])
+    assert changed(read, fingerprints()) == list(STAGE_NAMES[1:])
 
 
-def test_files_that_options_name_count_by_their_bytes(survey, tmp_path, monkeypatch):
+def test_changed_model_file_changes_fingerprints_by_checksum(survey, tmp_path, monkeypatch):
     model = tmp_path / "model"
     monkeypatch.setattr(mask, "files", lambda options: (model,), raising=False)
     missing = names(survey)

@@ -25,12 +25,12 @@ def run(made_survey, quick_config, tmp_path) -> Run:
         {"variant": name, "error_estimate_m": doubt} for name, doubt in (("rgt", 9.0), ("flexroad", 0.25))
     )
     with RunDatabase.open(run.path / NAME) as database:
-        database.ask([(one, "done"), (two, "cached"), (three, "failed")])
+        database.set_states([(one, "done"), (two, "cached"), (three, "failed")])
         database.record(TileRecord(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
         database.record(
             TileRecord(three, "failed", "f", (), (Failure(three, "load", "TaskError", "no, file"),))
         )
-        database.ask([(one, "done"), (two, "cached"), (three, "failed")])
+        database.set_states([(one, "done"), (two, "cached"), (three, "failed")])
     return run
 
 

@@ -1,4 +1,4 @@
-"""configs/ablation.yaml is Table II, and its variants share what they have in common."""
+"""configs/ablation.yaml contains Table II, and its variants share equal nodes."""
 
 from collections import Counter
 
@@ -22,19 +22,19 @@ NODES = {
     "fit": 18,
     "sample": VARIANTS,
     "evaluate": VARIANTS,
-    # as many as there are surfaces: how they are sampled is no matter
+    # one per surface: independent of the sampling
     "assess": 18,
 }
 
 
-def test_every_row_of_table_ii_and_table_i(survey):
+def test_ablation_graph_has_expected_node_counts(survey):
     config = load_config("ablation")
     graph = tile_graph(Catalog.read(survey).tiles[0], config)
     assert len(config.chains) == VARIANTS
     assert Counter(node.stage for node in graph.nodes.values()) == NODES
 
 
-def test_flexroad_is_that_of_the_main_comparison(survey):
+def test_main_variants_equal_those_of_paper_configuration(survey):
     tile = Catalog.read(survey).tiles[0]
     ours, paper = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "paper"))
     for variant in ("plane", "rgt", "flexroad"):
@@ -42,12 +42,12 @@ def test_flexroad_is_that_of_the_main_comparison(survey):
         assert ours[variant] == paper[variant]
 
 
-def test_the_true_mask_changes_the_evaluation_alone(survey):
+def test_true_mask_changes_only_evaluation(survey):
     tile = Catalog.read(survey).tiles[0]
     ours, true = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "ablation_true"))
     assert ours.keys() == true.keys()
-    for variant, made in ours.items():
-        assert {stage for stage in made if made[stage] != true[variant][stage]} == {"evaluate"}
+    for variant, nodes in ours.items():
+        assert {stage for stage in nodes if nodes[stage] != true[variant][stage]} == {"evaluate"}
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +58,12 @@ def one_tile(tmp_path_factory):
 
 
 def brief(name):
-    """Return a shipped configuration with few Adam steps: counts and shapes want no accuracy."""
+    """Return a shipped configuration with few Adam steps, which is enough for counts and shapes."""
     raw = load_config(name).raw
     return compose({**raw, "fit": {**raw["fit"], "iterations": 3}}, name)
 
 
-def test_stages_in_common_run_once(one_tile, tmp_path):
+def test_shared_nodes_are_computed_once(one_tile, tmp_path):
     store = tmp_path / "store"
     run = Run.create(tmp_path / "ours", brief("ablation"), one_tile, store)
     results = []
@@ -76,7 +76,7 @@ def test_stages_in_common_run_once(one_tile, tmp_path):
     true = Run.create(tmp_path / "true", brief("ablation_true"), one_tile, store)
     run_tiles(true, SerialExecutor(), watch=results.append)
     again = results[-1]
-    # Rasters are not stored, as `load` reads them anyway, and of meshes only the exported one.
+    # Raster surfaces are not stored, because `load` reads the rasters; of the meshes, one is exported.
     rasters = 2
     once_more = {"load": 1, "fit": rasters, "sample": VARIANTS - 1, "evaluate": VARIANTS, "export": 1}
     assert again.computed == once_more

@@ -157,7 +157,7 @@ FAULTS = (
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.spoil.__name__.lstrip("_"))
-def test_a_bad_file_costs_its_tile_and_says_so_in_one_line(fault, run, flexroad, survey, tmp_path):
+def test_load_broken_file_fails_only_its_tile(fault, run, flexroad, survey, tmp_path):
     tile = Catalog.read(survey).tiles[1]
     fault.spoil(tile)
     only_its_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", str(layer(tile, fault.name)))
@@ -190,7 +190,7 @@ def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Pa
 
 
 @pytest.mark.parametrize("name", ["dsm", "road_mask"])
-def test_a_file_cut_short_costs_no_neighbour(name, run, flexroad, survey, tmp_path):
+def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, flexroad, survey, tmp_path):
     """A catalog of rasters names for each tile the files around it as well, for a halo."""
     into = survey.parent / "cut.json"
     words = ["--road-mask", "road_mask/*.tif", "--tile-size", 60, "-o", into]
@@ -219,7 +219,7 @@ def test_a_file_cut_short_costs_no_neighbour(name, run, flexroad, survey, tmp_pa
         ("dtm", "load", "the tile has no dtm; give its files to `flexroad catalog` with --dtm"),
     ],
 )
-def test_a_layer_the_catalog_lacks(name, stage, message, run, flexroad, survey, tmp_path):
+def test_tile_without_layer_fails_alone(name, stage, message, run, flexroad, survey, tmp_path):
     tiles = list(Catalog.read(survey).tiles)
     tiles[1] = replace(tiles[1], layers=tuple(found for found in tiles[1].layers if found.name != name))
     Catalog(tuple(tiles)).write(survey)
@@ -227,7 +227,7 @@ def test_a_layer_the_catalog_lacks(name, stage, message, run, flexroad, survey, 
     only_its_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
 
 
-def test_a_road_only_in_the_halo(run, survey, tmp_path):
+def test_road_only_in_halo_fails_tile(run, survey, tmp_path):
     tile = Catalog.read(survey).tiles[1]
     mask = np.zeros((100, 100), np.uint8)
     mask[:, :15] = 1
@@ -284,7 +284,7 @@ def _specks(tile: Tile) -> None:
         (_specks, "dsm: 12 cells outside -500..9000 m taken as nodata"),
     ],
 )
-def test_odd_input_is_done_with_finite_figures(spoil, note, run, survey, tmp_path):
+def test_unusual_input_gives_finite_metrics(spoil, note, run, survey, tmp_path):
     tile = Catalog.read(survey).tiles[1]
     spoil(tile)
     said = run("--tile", tile.id)
@@ -299,7 +299,7 @@ def test_odd_input_is_done_with_finite_figures(spoil, note, run, survey, tmp_pat
 
 
 @pytest.mark.parametrize("cell", [0.5, 2.0])
-def test_cells_of_another_size(cell, run, flexroad, tmp_path):
+def test_other_cell_size_gives_correct_heights(cell, run, flexroad, tmp_path):
     grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
     tilted_ground(tmp_path / "folder", "a", grid)
     catalog = cataloged(tmp_path / "folder")
@@ -333,7 +333,7 @@ def cataloged(folder: Path) -> Path:
     return folder / "catalog.json"
 
 
-def test_a_tile_of_2_by_2_cells(run, tmp_path):
+def test_tile_of_2_by_2_cells_fails_only_nurbs(run, tmp_path):
     tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
     catalog = cataloged(tmp_path / "tiny")
     said = run(catalog=catalog, config="paper")
@@ -351,7 +351,7 @@ def test_a_tile_of_2_by_2_cells(run, tmp_path):
 
 
 @pytest.mark.parametrize("tile_id", ["Köln 1/2", "../../escape", "..."])
-def test_a_tile_id_that_makes_no_file_name(tile_id, run, flexroad, survey, tmp_path):
+def test_tile_id_invalid_as_file_name_gets_safe_folder(tile_id, run, flexroad, survey, tmp_path):
     first, *_ = Catalog.read(survey).tiles
     Catalog((replace(first, id=tile_id),)).write(survey)
     before = {path for path in tmp_path.rglob("*") if "run" not in path.parts}
@@ -366,7 +366,7 @@ def test_a_tile_id_that_makes_no_file_name(tile_id, run, flexroad, survey, tmp_p
     assert "nothing had changed" in again.out
 
 
-def test_a_tile_named_twice_is_done_once(run, survey, tmp_path):
+def test_tile_given_twice_is_processed_once(run, survey, tmp_path):
     tile = Catalog.read(survey).tiles[2].id
     said = run("--tile", tile, tile, "--tile", tile)
     assert said.code == 0
@@ -395,17 +395,17 @@ DEEP = "{a: " * 2000 + "1" + "}" * 2000
         ("- a", "expected a mapping, not ['a']"),
         ("variants: [a, b]", "variants: expected a mapping, not ['a', 'b']"),
         ("load: 3", "load: expected a mapping of options, not 3"),
-        ("variants: {a/b: {}}", "variants.a/b: its files bear the name; use letters, digits, - and _"),
+        ("variants: {a/b: {}}", "variants.a/b: the name is part of file names; use letters, digits, - and _"),
         ("export: {variants: []}", "export.variants: tuple should have at least 1 item"),
         ("export: {variants: [b]}\nvariants: {a: {}}", "export.variants: no variant 'b', only a"),
-        ("extends: bad.yaml", "extends: leads back to itself"),
+        ("extends: bad.yaml", "extends: the file extends itself"),
         ("extends: [a]", "extends: expected a file or a shipped name, not ['a']"),
         ("extends: papr", "did you mean paper?"),
         (DEEP, "not readable as YAML"),
     ],
     ids=lambda value: value[:30],
 )
-def test_a_bad_configuration_starts_nothing(text, message, run, tmp_path):
+def test_invalid_configuration_creates_no_run(text, message, run, tmp_path):
     config = tmp_path / "bad.yaml"
     config.write_text(text + "\n")
     said = run(config=config)
@@ -416,21 +416,21 @@ def test_a_bad_configuration_starts_nothing(text, message, run, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_an_empty_configuration_is_the_default(flexroad, tmp_path):
+def test_empty_configuration_is_default(flexroad, tmp_path):
     (tmp_path / "empty.yaml").write_text("")
     said = flexroad("config", "show", tmp_path / "empty.yaml")
     assert (said.code, said.errors) == (0, [])
     assert "control_points" in said.out
 
 
-def test_a_parent_lies_beside_its_child(flexroad, tmp_path):
+def test_extends_path_is_relative_to_file(flexroad, tmp_path):
     (tmp_path / "parent.yaml").write_text("fit: {degree: 4}\n")
     (tmp_path / "child.yaml").write_text("extends: parent.yaml\n")
     assert "degree: 4" in flexroad("config", "show", tmp_path / "child.yaml").out
 
 
 @pytest.mark.parametrize("fit", ["{control_points: [100000, 100000]}", "{spacing_m: 1.0e-9}"])
-def test_more_control_points_than_there_is_memory_for(fit, run, survey, tmp_path):
+def test_too_many_control_points_fail_each_tile(fit, run, survey, tmp_path):
     config = tmp_path / "huge.yaml"
     config.write_text(f"fit: {fit}\n")
     said = run(config=config)
@@ -441,7 +441,7 @@ def test_more_control_points_than_there_is_memory_for(fit, run, survey, tmp_path
     assert all("60 x 60 cells are fewer than" in line for line in said.errors)
 
 
-def test_two_configurations_in_one_folder(run, flexroad, quick_config, tmp_path):
+def test_second_configuration_replaces_rows_of_first(run, flexroad, quick_config, tmp_path):
     other = tmp_path / "other.yaml"
     other.write_text("fit: {control_points: [8, 8], iterations: 3}\nvariants: {smooth: {}}\n")
     assert run().code == 0
@@ -478,7 +478,7 @@ def mount(tmp_path):
 
 
 @pytest.mark.parametrize("size", ["100k", "300k"])
-def test_a_full_disk(size, mount, run, flexroad, tmp_path):
+def test_full_disk_fails_tiles_until_there_is_space(size, mount, run, flexroad, tmp_path):
     out = mount(f"size={size}") / "run"
     said = run(out=out)
     assert said.code == 1
@@ -492,7 +492,7 @@ def test_a_full_disk(size, mount, run, flexroad, tmp_path):
     assert set(read_metrics(out).status) == {"done"}
 
 
-def test_a_disk_that_may_only_be_read(mount, run, flexroad, survey, tmp_path):
+def test_read_only_disk_allows_only_reading(mount, run, flexroad, survey, tmp_path):
     disk = mount("size=20m")
     assert run(out=disk / "run").code == 0
     tile = Catalog.read(survey).tiles[0]
@@ -516,7 +516,7 @@ def test_a_disk_that_may_only_be_read(mount, run, flexroad, survey, tmp_path):
     assert (said.code, len(said.errors)) == (2, 1)
 
 
-def test_an_output_that_is_a_file(run, flexroad, survey, tmp_path):
+def test_output_path_that_is_a_file_is_refused(run, flexroad, survey, tmp_path):
     (tmp_path / "file").write_text("mine")
     folder = survey.parent
     into = ["catalog", "rasters", folder, "--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", 60, "-o"]
@@ -544,7 +544,7 @@ def test_an_output_that_is_a_file(run, flexroad, survey, tmp_path):
         (b"PAR1 and no more", "is not a FlexRoad catalog"),
     ],
 )
-def test_a_catalog_that_cannot_be_read(content, message, run, survey):
+def test_unreadable_catalog_is_refused(content, message, run, survey):
     survey.unlink()
     survey.mkdir() if content is None else survey.write_bytes(content)
     said = run()
@@ -555,18 +555,20 @@ def test_a_catalog_that_cannot_be_read(content, message, run, survey):
 
 
 @pytest.mark.parametrize("size", ["0", "-5", "nan", "inf", "33.3"])
-def test_a_tile_size_that_cannot_be(size, flexroad, survey, tmp_path):
+def test_invalid_tile_size_is_refused(size, flexroad, survey, tmp_path):
     words = ["--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", size, "-o", tmp_path / "c.json"]
     said = flexroad("catalog", "rasters", survey.parent, *words)
     assert said.code == 2
     assert len(said.errors) == 1
 
 
-def test_a_catalog_of_files_that_moved(run, flexroad, survey, tmp_path):
+def test_catalog_with_moved_files_is_refused(run, flexroad, survey, tmp_path):
     (survey.parent / "dsm").rename(tmp_path / "elsewhere")
     said = run()
     assert said.code == 2
-    assert re.search(r"each of the 4 tiles lacks a file, as tile \d+_\d+ does .*dsm/\d+_\d+.tif;", said.err)
+    assert re.search(
+        r"each of the 4 tiles lacks a file, for example tile \d+_\d+: .*dsm/\d+_\d+.tif;", said.err
+    )
     (tmp_path / "elsewhere").rename(survey.parent / "dsm")
     mended = flexroad("rerun", tmp_path / "run", "--executor", "serial")
     assert mended.code == 0
@@ -577,7 +579,7 @@ def test_a_catalog_of_files_that_moved(run, flexroad, survey, tmp_path):
 
 
 @pytest.mark.slow
-def test_sources_that_are_gone_take_nothing_from_what_is_done(run, flexroad, survey, tmp_path):
+def test_missing_sources_keep_finished_results(run, flexroad, survey, tmp_path):
     tile = Catalog.read(survey).tiles[0]
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
@@ -596,7 +598,7 @@ def test_sources_that_are_gone_take_nothing_from_what_is_done(run, flexroad, sur
     assert flexroad("query", tmp_path / "a moved run", "--points", points).out == whole[0]
 
 
-def test_the_store_may_go(run, flexroad, survey, tmp_path):
+def test_deleted_store_keeps_finished_results(run, flexroad, survey, tmp_path):
     tile = Catalog.read(survey).tiles[0]
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
@@ -612,7 +614,7 @@ def test_the_store_may_go(run, flexroad, survey, tmp_path):
     assert flexroad("query", out, "--points", points).out == whole
 
 
-def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_path, monkeypatch):
+def test_relative_paths_work_from_other_folder(flexroad, survey, quick_config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = ["--catalog", "survey/catalog.parquet", "--out", "my runs/1", "--store", "shared", "--executor"]
     said = flexroad("run", "--config", "quick.yaml", *run, "serial")
@@ -628,8 +630,8 @@ def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_
 @pytest.mark.parametrize(
     ("name", "content", "status", "message"),
     [
-        ("run.json", "{}", 2, "is no run: it has no sound run.json"),
-        ("run.json", "[]", 2, "is no run: it has no sound run.json"),
+        ("run.json", "{}", 2, "is no run: run.json is missing or damaged"),
+        ("run.json", "[]", 2, "is no run: run.json is missing or damaged"),
         ("config.yaml", "fit: {degre: 3}", 2, "fit.degre: unknown key"),
         ("config.yaml", None, 2, "no configuration"),
         ("catalog.parquet", "", 2, "is not a FlexRoad catalog"),
@@ -640,7 +642,7 @@ def test_relative_paths_hold_from_elsewhere(flexroad, survey, quick_config, tmp_
         ("tiles/*/*.glb", "", 0, "4 pending"),
     ],
 )
-def test_a_damaged_run_is_said_and_mended(
+def test_damaged_run_is_reported_and_repaired(
     name, content, status, message, run, flexroad, finished, made_survey, tmp_path
 ):
     out = shutil.copytree(finished, tmp_path / "run")
@@ -658,7 +660,7 @@ def test_a_damaged_run_is_said_and_mended(
 
 
 @pytest.mark.slow
-def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path):
+def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
     words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
     words += ["--store", tmp_path / "store"]
     call = [*PROCESS, "run", *map(str, words), "--out"]
@@ -701,14 +703,14 @@ def test_two_runs_share_a_store_at_the_same_time(survey, quick_config, tmp_path)
         ("catalog rasters SURVEY --dsm dsm/* --dtm dtm/* -o X.txt --tile-size 60", "ends in .parquet, .json"),
     ],
 )
-def test_slips(words, message, slips_at, flexroad):
+def test_invalid_arguments_give_one_error(words, message, slips_at, flexroad):
     said = flexroad(*[slips_at.get(word, word) for word in words.split()])
     assert said.code == 2
     assert message in said.err
     assert len([line for line in said.err.splitlines() if "rror: " in line]) == 1
 
 
-def test_points_off_the_run_are_told_of(run, flexroad, survey, tmp_path):
+def test_query_points_outside_run_gives_note(run, flexroad, survey, tmp_path):
     grid = Catalog.read(survey).tiles[0].grid
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{grid.west + 9},{grid.south + 9}\n7.1,50.2\n,\ninf,0\n")

@@ -1,4 +1,4 @@
-"""`segment: {method: dinov2}` in a run: one line of the config, and a tile without a photo fails alone."""
+"""`segment: {method: dinov2}` in a run: selected by the configuration; a tile without a photo fails alone."""
 
 import json
 
@@ -24,7 +24,7 @@ from tests.make_backbone import save_backbone
 
 @pytest.fixture
 def place(tmp_path):
-    """A catalog of two tiles, the first without its photo; a backbone; a head trained on the second tile."""
+    """A folder with a catalog of two tiles (the first without photo), a backbone and a trained head."""
     write_scenes(tmp_path / "scenes", 2, seed=3, size_m=60, dop=True)
     first, second = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
     first.paths(first.layer("dop"))[0].unlink()
@@ -39,7 +39,7 @@ def place(tmp_path):
     return tmp_path
 
 
-def done(place, **segment):
+def results_of(place, **segment):
     options = {"method": "dinov2", "model": str(place / "head.safetensors"), **segment}
     config = place / "config.yaml"
     config.write_text(yaml.safe_dump({**QUICK, "segment": options}, sort_keys=False))
@@ -49,30 +49,30 @@ def done(place, **segment):
     return {result.tile_id: result for result in results}
 
 
-def test_one_line_of_the_config_chooses_dinov2(place):
-    first, second = done(place, backbone=str(place / "backbone")).values()
+def test_run_with_dinov2_fails_only_tile_without_photo(place):
+    first, second = results_of(place, backbone=str(place / "backbone")).values()
     assert (first.status, second.status) == ("failed", "done")
     (failure,) = {fault.line for fault in first.failures}
     assert failure.startswith("segment: TaskError: no orthophoto (layer dop)")
     rows = read_metrics(place / "run")
     assert (rows[rows.tile_id == second.tile_id].road_fraction > 0).all()
-    # Nothing changed: nothing is computed. A head with other numbers is another stage result.
-    again = done(place, backbone=str(place / "backbone"))[second.tile_id]
+    # A repeated run computes nothing; a head with other weights computes the stage again.
+    again = results_of(place, backbone=str(place / "backbone"))[second.tile_id]
     assert "segment" not in again.computed
     head = read_head(place / "head.safetensors")
     other = Head(head.weight, head.bias - 1, head.about)
     (place / "head.safetensors").write_bytes(other.encode())
-    force = done(place, backbone=str(place / "backbone"))[second.tile_id]
-    assert force.computed["segment"] == 1
+    changed = results_of(place, backbone=str(place / "backbone"))[second.tile_id]
+    assert changed.computed["segment"] == 1
 
 
 @pytest.mark.slow
-def test_the_head_names_its_backbone(place):
-    """It need not be given again; what the file says can be read without this program."""
+def test_run_uses_backbone_named_in_head(place):
+    """The backbone need not be given again, and the head's metadata is readable with safetensors alone."""
     from safetensors import safe_open
 
     with safe_open(place / "head.safetensors", framework="numpy") as file:
-        said = json.loads(file.metadata()["flexroad"])
-    assert said["backbone"] == str(place / "backbone")
-    assert said["registers"] == 2
-    assert [result.status for result in done(place).values()] == ["failed", "done"]
+        metadata = json.loads(file.metadata()["flexroad"])
+    assert metadata["backbone"] == str(place / "backbone")
+    assert metadata["registers"] == 2
+    assert [result.status for result in results_of(place).values()] == ["failed", "done"]

@@ -455,8 +455,9 @@ def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbe
 
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
+        frozen = "2001-01-01T00:00:00.000+00:00"
         for module in ("worker.profiling", "worker.tile", "run.event_log", "run.runner"):
-            monkeypatch.setattr(f"flexroad.pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
+            monkeypatch.setattr(f"flexroad.pipeline.{module}.utc_now", lambda: frozen)
         monkeypatch.setattr(paths, "write", write_then)
 
     def write_then(where, data) -> None:

@@ -1,4 +1,4 @@
-"""`flexroad clean`: all that nobody needs goes, nothing else does; the truth is a run made from nothing."""
+"""`flexroad clean` deletes all files that are not needed, and no others; compared with a new run."""
 
 import shutil
 from dataclasses import replace
@@ -31,7 +31,7 @@ LATER = QUICK | {
 
 @pytest.fixture(scope="module")
 def catalog(made_survey) -> Catalog:
-    """Three tiles, of which one fails: its DTM is not there."""
+    """A catalog of three tiles; the third fails because its DTM is missing."""
     one, two, three, _ = Catalog.read(made_survey / "catalog.parquet").tiles
     broken = tuple(
         replace(layer, files=("gone.tif",)) if layer.name == "dtm" else layer for layer in three.layers
@@ -41,7 +41,7 @@ def catalog(made_survey) -> Catalog:
 
 @pytest.fixture(scope="module")
 def made(catalog, tmp_path_factory):
-    """Make a run of options and tiles in a folder; what was made once is copied."""
+    """Factory of finished runs with given options and number of tiles; equal runs are copied."""
     cache: dict[str, Path] = {}
 
     def make(path: Path, options: dict, tiles: int, store: Path | None = None) -> Run:
@@ -68,43 +68,43 @@ def files(folder: Path) -> set[str]:
     return set(listing(folder))
 
 
-def cleaned(run: Run, without=()) -> dict[str, set[str]]:
-    """Drop the waste; return the files dropped by kind, relative to the run's folder's parent."""
-    dropped: dict[str, set[str]] = {}
+def clean(run: Run, without=()) -> dict[str, set[str]]:
+    """Delete the garbage; return the deleted files by kind, relative to the parent of the run's folder."""
+    deleted: dict[str, set[str]] = {}
     with run_lock(run.path), exclusive(run, without, print) as runs:
-        for one in delete(find_garbage(runs)):
-            dropped.setdefault(one.kind, set()).add(str(one.path.relative_to(run.path.parent)))
-    return dropped
+        for file in delete(find_garbage(runs)):
+            deleted.setdefault(file.kind, set()).add(str(file.path.relative_to(run.path.parent)))
+    return deleted
 
 
-def test_what_is_left_is_what_a_new_run_makes(made, tmp_path):
-    """The configuration was another, with another export; then a tile vanished."""
+def test_clean_leaves_files_of_a_new_run(made, tmp_path):
+    """After a change of options and export, and after a tile left the catalog."""
     run = made(tmp_path / "run", (QUICK, 3), (LATER, 3), (LATER, 2))
     fresh = made(tmp_path / "fresh", (LATER, 2))
     before = files(run.path)
-    dropped = cleaned(run)
+    deleted = clean(run)
     for part in ("store", "tiles"):
         assert files(run.path / part) == files(fresh.path / part)
     assert before - files(run.path) == {
-        name.removeprefix("run/") for names in dropped.values() for name in names
+        name.removeprefix("run/") for names in deleted.values() for name in names
     }
-    # Folders, too.
+    # Empty folders are deleted, too.
     assert {path.name for path in (run.path / "tiles").iterdir()} == {
         path.name for path in (fresh.path / "tiles").iterdir()
     }
-    assert dropped.keys() == {"artefacts", "products", "tiles"}
-    assert {Path(name).suffix for name in dropped["products"]} == {".glb", ".tif"}
-    how = run_tiles(run, SerialExecutor())
-    assert (how.cached, how.done) == (2, 2)
+    assert deleted.keys() == {"artefacts", "products", "tiles"}
+    assert {Path(name).suffix for name in deleted["products"]} == {".glb", ".tif"}
+    summary = run_tiles(run, SerialExecutor())
+    assert (summary.cached, summary.done) == (2, 2)
 
 
-def test_after_it_no_stage_is_computed_that_was_not_before(made, tmp_path):
+def test_run_after_clean_computes_no_additional_stage(made, tmp_path):
     computed = []
     for name in ("cleaned", "not"):
         run = made(tmp_path / name, (QUICK, 3), (LATER, 3))
         if name == "cleaned":
-            assert cleaned(run)
-        # The artefacts of a tile that lost its marker serve it still.
+            assert clean(run)
+        # Tiles without a marker are processed again, from the remaining artefacts.
         for marker in (run.path / "tiles").glob("*/item.json"):
             marker.unlink()
         results = []
@@ -114,7 +114,7 @@ def test_after_it_no_stage_is_computed_that_was_not_before(made, tmp_path):
     assert not any("evaluate" in stages for stages in computed[0])
 
 
-def test_foreign_files_stay_and_those_of_killed_writers_go(made, tmp_path):
+def test_clean_keeps_foreign_files_and_deletes_temporary_files(made, tmp_path):
     run = made(tmp_path / "run", (QUICK, 3), (LATER, 3), (LATER, 2))
     gone = next(
         path for path in (run.path / "tiles").iterdir() if path.name not in {t.id for t in run.catalog.tiles}
@@ -141,13 +141,13 @@ def test_foreign_files_stay_and_those_of_killed_writers_go(made, tmp_path):
     for path in (*foreign, *killed):
         path.parent.mkdir(exist_ok=True, parents=True)
         path.write_text("x")
-    dropped = cleaned(run)
+    deleted = clean(run)
     assert all(path.exists() for path in foreign)
     assert not any(path.exists() for path in killed)
-    assert len(dropped["temporary files"]) == len(killed)
+    assert len(deleted["temporary files"]) == len(killed)
 
 
-def test_finding_drops_nothing(made, tmp_path):
+def test_find_garbage_deletes_nothing(made, tmp_path):
     run = made(tmp_path / "run", (QUICK, 3), (LATER, 2))
     before = listing(run.path)
     with exclusive(run, (), print) as runs:
@@ -155,43 +155,43 @@ def test_finding_drops_nothing(made, tmp_path):
     assert listing(run.path) == before
 
 
-def test_what_another_run_of_the_store_needs_stays(made, tmp_path):
+def test_clean_keeps_artefacts_of_other_runs_of_the_store(made, tmp_path):
     store, one, two = tmp_path / "store", tmp_path / "one", tmp_path / "two"
     first = made.into(one, QUICK, 2, store)
     kept = files(store / "fit")
     second = made.into(two, LATER, 2, store)
     assert set(runs_using(store)) == {one, two}
-    assert not cleaned(first)
-    assert not cleaned(second)
-    # Its tiles are gone from one of them.
+    assert not clean(first)
+    assert not clean(second)
+    # One of the two runs is deleted.
     shutil.rmtree(two)
-    with pytest.raises(ConfigError, match=rf"{two} uses the store .* not there.*--forget {two}"):
-        cleaned(first)
-    assert cleaned(first, [two]).keys() == {"artefacts"}
+    with pytest.raises(ConfigError, match=rf"{two} uses the store .* missing.*--forget {two}"):
+        clean(first)
+    assert clean(first, [two]).keys() == {"artefacts"}
     assert files(store / "fit") == kept
     assert unregister(store, two)
-    assert not cleaned(first)
+    assert not clean(first)
 
 
-def test_a_run_that_cannot_be_read_or_is_at_work_stops_it(made, tmp_path):
+def test_clean_with_other_run_active_or_unreadable_raises(made, tmp_path):
     store, one, two = tmp_path / "store", tmp_path / "one", tmp_path / "two"
     run = made.into(one, QUICK, 1, store)
     made.into(two, QUICK, 1, store)
     with run_lock(two), pytest.raises(ConfigError, match=f"{two} is in use by pid"):
-        cleaned(run)
+        clean(run)
     (two / "config.yaml").write_text("fit: {iterations: many}")
     before = files(store)
     with pytest.raises(ConfigError, match=f"{two} uses the store .* cannot be read"):
-        cleaned(run)
+        clean(run)
     (store / "runs" / "damaged.json").write_text("{")
     with pytest.raises(ConfigError, match="the list of runs"):
-        cleaned(run)
+        clean(run)
     assert files(store) - {"runs/damaged.json"} == before
 
 
-def test_a_store_in_another_runs_folder_is_that_runs_too(made, tmp_path):
+def test_clean_keeps_artefacts_of_run_that_contains_the_store(made, tmp_path):
     owner = made(tmp_path / "one", (QUICK, 2))
     guest = made.into(tmp_path / "two", LATER, 1, owner.path / "store")
-    dropped = cleaned(guest)
-    assert not dropped
-    assert not cleaned(owner)
+    deleted = clean(guest)
+    assert not deleted
+    assert not clean(owner)

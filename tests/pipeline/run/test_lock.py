@@ -1,4 +1,4 @@
-"""The lock of a run: one at a time, named; a dead holder's is taken over, a living one's never."""
+"""The lock of a run: one owner at a time; a dead owner's lock is taken over, a living one's never."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock import Heartbeat, Owner, at_work, owner, run_lock, started
+from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
 
 HOLD = """
 import sys, time
@@ -22,7 +22,7 @@ with run_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
-QUICK = Heartbeat(beat_s=0.05, stale_s=0.5)
+QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 
 
@@ -35,137 +35,137 @@ def process(tmp_path):
         other.kill()
 
 
-def written(folder, who: Owner, age_s: float = 0.0) -> None:
-    (folder / "lock.json").write_bytes(who.data)
-    then = time.time() - age_s
-    os.utime(folder / "lock.json", (then, then))
+def write_lock(folder, holder: Owner, age_s: float = 0.0) -> None:
+    (folder / "lock.json").write_bytes(holder.data)
+    modified = time.time() - age_s
+    os.utime(folder / "lock.json", (modified, modified))
 
 
-def taken(folder, pace: Heartbeat = QUICK) -> list[str]:
-    """Take the lock and give it back; return what was said."""
-    said: list[str] = []
-    with run_lock(folder, said.append, pace):
+def take_lock(folder, heartbeat: Heartbeat = QUICK) -> list[str]:
+    """Take and release the lock; return its messages."""
+    messages: list[str] = []
+    with run_lock(folder, messages.append, heartbeat):
         assert owner(folder).pid == os.getpid()
     assert not (folder / "lock.json").exists()
-    return said
+    return messages
 
 
-def test_a_second_holder_is_refused_by_host_and_pid(process, tmp_path):
+def test_lock_held_by_living_process_is_refused(process, tmp_path):
     me = Owner.me()
     with pytest.raises(ConfigError, match=rf"pid {process.pid} on {me.host} since .* `kill {process.pid}`"):
-        taken(tmp_path)
+        take_lock(tmp_path)
     assert owner(tmp_path).pid == process.pid
 
 
-def test_of_a_killed_holder_it_is_taken_over_at_once_and_said_in_one_line(process, tmp_path):
-    assert "at work since" in at_work(owner(tmp_path))
+def test_lock_of_killed_process_is_taken_over_at_once(process, tmp_path):
+    assert "at work since" in describe_owner(owner(tmp_path))
     process.send_signal(signal.SIGKILL)
-    # Not waited for: a dead process that nobody buried still has its number.
+    # The process is not waited for: as a zombie it still has its pid.
     while started(process.pid) is not None:
         time.sleep(0.01)
-    assert "ended in the middle (that process is gone)" in at_work(owner(tmp_path))
-    assert taken(tmp_path) == [
+    assert "ended before the run was complete (that process is gone)" in describe_owner(owner(tmp_path))
+    assert take_lock(tmp_path) == [
         f"took over the lock of pid {process.pid} on {Owner.me().host}: that process is gone"
     ]
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "reason"),
     [
         ({"start": 1}, "its number was given to another"),
         ({"boot": "before"}, "was restarted since"),
         ({"pid": 2**22 + 1}, "that process is gone"),
     ],
 )
-def test_a_holder_of_this_machine_is_judged_by_the_process_table(change, why, tmp_path):
-    # A heartbeat in the future, as after a clock set back, or a fresh one: neither counts.
-    written(tmp_path, replace(Owner.me(), **change), age_s=-3600)
-    (said,) = taken(tmp_path)
-    assert why in said
-    written(tmp_path, Owner.me(), age_s=86400)
+def test_owner_on_this_machine_is_checked_by_process_table(change, reason, tmp_path):
+    # The age of the lock is ignored, even if it is in the future, as after a clock set back.
+    write_lock(tmp_path, replace(Owner.me(), **change), age_s=-3600)
+    (message,) = take_lock(tmp_path)
+    assert reason in message
+    write_lock(tmp_path, Owner.me(), age_s=86400)
     with pytest.raises(ConfigError, match="is in use by pid"):
-        taken(tmp_path)
+        take_lock(tmp_path)
 
 
-def test_a_container_that_counts_processes_for_itself_is_another_machine(tmp_path):
-    written(tmp_path, replace(Owner.me(), machine="m pid:[2]", pid=2**22 + 1))
+def test_owner_in_other_pid_namespace_is_other_machine(tmp_path):
+    write_lock(tmp_path, replace(Owner.me(), machine="m pid:[2]", pid=2**22 + 1))
     with pytest.raises(ConfigError, match="last sign of life 0 s ago"):
-        taken(tmp_path)
+        take_lock(tmp_path)
 
 
-def test_of_another_machine_the_heartbeat_tells(tmp_path):
-    written(tmp_path, ELSEWHERE, age_s=0.1)
+def test_owner_on_other_machine_is_checked_by_lock_age(tmp_path):
+    write_lock(tmp_path, ELSEWHERE, age_s=0.1)
     with pytest.raises(ConfigError, match="pid 4711 on node7 since 2026-11-20.* the same command takes over"):
-        taken(tmp_path)
-    written(tmp_path, ELSEWHERE, age_s=400)
-    watching, said = taken(tmp_path)
+        take_lock(tmp_path)
+    write_lock(tmp_path, ELSEWHERE, age_s=400)
+    watching, taken_over = take_lock(tmp_path)
     assert watching.startswith("watching the lock of pid 4711 on node7")
-    assert said == "took over the lock of pid 4711 on node7: no sign of life for 400 s"
+    assert taken_over == "took over the lock of pid 4711 on node7: no sign of life for 400 s"
 
 
 @pytest.mark.parametrize("age_s", [3600, -3600], ids=["set forward", "set back"])
-def test_a_clock_that_jumped_kills_no_living_holder(age_s, tmp_path):
-    written(tmp_path, ELSEWHERE, age_s)
-    over = threading.Event()
+def test_clock_jump_keeps_lock_of_living_owner(age_s, tmp_path):
+    write_lock(tmp_path, ELSEWHERE, age_s)
+    stop = threading.Event()
 
-    def beat() -> None:
-        while not over.wait(0.05):
+    def renew() -> None:
+        while not stop.wait(0.05):
             os.utime(tmp_path / "lock.json")
 
-    alive = threading.Thread(target=beat)
-    alive.start()
+    renewal = threading.Thread(target=renew)
+    renewal.start()
     try:
         with pytest.raises(ConfigError, match="pid 4711 on node7"):
-            taken(tmp_path, Heartbeat(beat_s=1, stale_s=300))
+            take_lock(tmp_path, Heartbeat(interval_s=1, stale_s=300))
     finally:
-        over.set()
-        alive.join()
+        stop.set()
+        renewal.join()
 
 
-def test_a_clock_set_back_keeps_no_dead_holder(tmp_path):
-    written(tmp_path, ELSEWHERE, age_s=-86400)
-    assert "took over" in taken(tmp_path)[-1]
+def test_clock_set_back_lock_of_dead_owner_is_taken_over(tmp_path):
+    write_lock(tmp_path, ELSEWHERE, age_s=-86400)
+    assert "took over" in take_lock(tmp_path)[-1]
 
 
-def test_a_damaged_lock_is_refused_while_young_and_then_taken_over(tmp_path):
+def test_damaged_lock_is_taken_over_when_stale(tmp_path):
     (tmp_path / "lock.json").write_text('{"host": "no')
-    with pytest.raises(ConfigError, match="somebody unknown"):
-        taken(tmp_path)
+    with pytest.raises(ConfigError, match="an unknown process"):
+        take_lock(tmp_path)
     os.utime(tmp_path / "lock.json", (1, 1))
-    assert "took over" in taken(tmp_path)[-1]
+    assert "took over" in take_lock(tmp_path)[-1]
 
 
 @pytest.mark.parametrize("stale", [False, True])
-def test_of_many_that_race_exactly_one_wins(stale, tmp_path):
+def test_lock_requested_by_many_is_taken_by_one(stale, tmp_path):
     code = (
         "import sys, time\nfrom pathlib import Path\nfrom flexroad.pipeline.run.lock import run_lock\n"
         "print('ready', flush=True); sys.stdin.readline()\n"
         "with run_lock(Path(sys.argv[1])):\n    print('won', flush=True); sys.stdin.readline()"
     )
-    many = [
+    processes = [
         subprocess.Popen(
             [sys.executable, "-c", code, tmp_path],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )
         for _ in range(3)
     ]  # fmt: skip
-    assert [one.stdout.readline() for one in many] == ["ready\n"] * 3
+    assert [process.stdout.readline() for process in processes] == ["ready\n"] * 3
     if stale:
-        written(tmp_path, replace(Owner.me(), pid=2**22 + 1))
-    for one in many:
-        one.stdin.write("go\n")
-        one.stdin.flush()
-    winners = [one for one in many if one.stdout.readline() == "won\n"]
+        write_lock(tmp_path, replace(Owner.me(), pid=2**22 + 1))
+    for process in processes:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    winners = [process for process in processes if process.stdout.readline() == "won\n"]
     assert len(winners) == 1
     assert owner(tmp_path).pid == winners[0].pid
-    for one in many:
-        _, error = one.communicate("end\n")
-        assert one in winners or f"is in use by pid {winners[0].pid} on" in error
+    for process in processes:
+        _, error = process.communicate("end\n")
+        assert process in winners or f"is in use by pid {winners[0].pid} on" in error
     assert not (tmp_path / "lock.json").exists()
 
 
-def test_a_living_holder_gives_signs_of_life_and_mends_a_lock_removed_by_hand(tmp_path):
-    with run_lock(tmp_path, pace=QUICK):
+def test_held_lock_is_renewed_and_restored_after_deletion(tmp_path):
+    with run_lock(tmp_path, heartbeat=QUICK):
         os.utime(tmp_path / "lock.json", (1, 1))
         _until(lambda: (tmp_path / "lock.json").stat().st_mtime > 1)
         (tmp_path / "lock.json").unlink()
@@ -173,13 +173,13 @@ def test_a_living_holder_gives_signs_of_life_and_mends_a_lock_removed_by_hand(tm
         assert owner(tmp_path).pid == os.getpid()
 
 
-def test_who_lost_the_lock_ends_and_leaves_it_to_the_other(tmp_path):
-    said: list[str] = []
+def test_process_that_lost_its_lock_ends(tmp_path):
+    messages: list[str] = []
 
     def lose() -> None:
-        with run_lock(tmp_path, said.append, QUICK):
-            written(tmp_path, ELSEWHERE)
-            _until(lambda: bool(said), 10)
+        with run_lock(tmp_path, messages.append, QUICK):
+            write_lock(tmp_path, ELSEWHERE)
+            _until(lambda: bool(messages), 10)
             time.sleep(30)
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -188,20 +188,20 @@ def test_who_lost_the_lock_ends_and_leaves_it_to_the_other(tmp_path):
             lose()
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert "pid 4711 on node7 took over" in said[0]
+    assert "pid 4711 on node7 took over" in messages[0]
     assert json.loads((tmp_path / "lock.json").read_text())["token"] == "t7"
 
 
-def test_what_cannot_be_locked_is_said(tmp_path):
+def test_lock_in_unusable_folder_raises(tmp_path):
     with pytest.raises(ConfigError, match="is no run"):
-        taken(tmp_path / "nowhere")
+        take_lock(tmp_path / "nowhere")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write the run"):
-        taken(tmp_path / "file")
+        take_lock(tmp_path / "file")
 
 
-def _until(true, seconds: float = 30) -> None:
+def _until(condition, seconds: float = 30) -> None:
     end = time.monotonic() + seconds
-    while not true():
+    while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)

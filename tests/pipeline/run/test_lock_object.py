@@ -1,4 +1,4 @@
-"""The lock of a run in object storage: conditional requests to a server that speaks S3."""
+"""The lock of a run in object storage, tested with an S3 server."""
 
 import threading
 import time
@@ -13,7 +13,7 @@ from flexroad.pipeline.run.lock import Heartbeat, Owner, owner, run_lock
 pytestmark = pytest.mark.slow
 
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
-QUICK = Heartbeat(beat_s=0.05, stale_s=0.5)
+QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def run(bucket):
     return bucket / "run"
 
 
-def test_one_holds_it_and_gives_it_back(run):
+def test_lock_is_exclusive_and_released(run):
     with run_lock(run):
         assert owner(run).token != ELSEWHERE.token
         with pytest.raises(ConfigError, match="is in use by pid"), run_lock(run):
@@ -31,38 +31,38 @@ def test_one_holds_it_and_gives_it_back(run):
         pass
 
 
-def test_a_dead_holder_of_this_machine_is_taken_over_at_once(run):
+def test_lock_of_dead_process_is_taken_over_at_once(run):
     write(run / "lock.json", replace(Owner.me(), boot="before").data)
-    said = []
-    with run_lock(run, said.append):
+    messages = []
+    with run_lock(run, messages.append):
         assert owner(run).pid == Owner.me().pid
-    assert "was restarted since" in said[0]
+    assert "was restarted since" in messages[0]
 
 
-def test_of_another_machine_the_heartbeat_tells(run):
+def test_owner_on_other_machine_is_checked_by_lock_age(run):
     write(run / "lock.json", ELSEWHERE.data)
     with (
         pytest.raises(ConfigError, match="the same command takes over"),
-        run_lock(run, pace=Heartbeat(stale_s=60)),
+        run_lock(run, heartbeat=Heartbeat(stale_s=60)),
     ):
         pass
-    said = []
-    # A bucket's times are whole seconds.
+    messages = []
+    # Times of a bucket's objects are whole seconds.
     time.sleep(1.1)
-    with run_lock(run, said.append, QUICK):
+    with run_lock(run, messages.append, QUICK):
         assert owner(run).token != "t7"
-    assert said[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
+    assert messages[-1].startswith("took over the lock of pid 4711 on node7: no sign of life")
 
 
-def test_a_living_holder_gives_signs_of_life(run):
-    with run_lock(run, pace=QUICK):
+def test_held_lock_is_renewed(run):
+    with run_lock(run, heartbeat=QUICK):
         first = _time(run)
         while _time(run) == first:
             time.sleep(0.1)
 
 
 @pytest.mark.parametrize("stale", [False, True])
-def test_of_many_that_race_exactly_one_wins(stale, run):
+def test_lock_requested_by_many_is_taken_by_one(stale, run):
     if stale:
         write(run / "lock.json", replace(Owner.me(), boot="before").data)
     start, tried, outcomes = threading.Barrier(4), threading.Semaphore(0), []
@@ -72,7 +72,7 @@ def test_of_many_that_race_exactly_one_wins(stale, run):
         try:
             with run_lock(run):
                 outcomes.append("won")
-                # Until all others have been refused.
+                # Hold the lock until the other three have been refused.
                 for _ in range(3):
                     tried.acquire()
         except ConfigError as error:
@@ -89,8 +89,8 @@ def test_of_many_that_race_exactly_one_wins(stale, run):
     assert sum("is in use by pid" in outcome for outcome in outcomes) == 3
 
 
-def test_a_lost_answer_is_no_second_holder(run, monkeypatch):
-    """It was taken, but the answer was lost: what is sent again is refused because of ourselves."""
+def test_create_with_lost_response_takes_lock(run, monkeypatch):
+    """The lock was created but the response was lost; the repeated request is rejected."""
     from flexroad.pipeline.run.lock_object import InBucket
 
     create = InBucket.create
@@ -99,7 +99,7 @@ def test_a_lost_answer_is_no_second_holder(run, monkeypatch):
         assert owner(run).pid == Owner.me().pid
 
 
-def test_a_bucket_that_is_not_there_is_said(run):
+def test_lock_in_missing_bucket_names_run(run):
     with pytest.raises(ConfigError, match="s3://nowhere/run"), run_lock(parse_location("s3://nowhere/run")):
         pass
 
@@ -109,7 +109,7 @@ def _time(run):
     return run.fs.info((run / "lock.json").path)["LastModified"]
 
 
-def test_a_bucket_that_is_not_there_is_named(run):
+def test_lock_in_missing_bucket_names_reason(run):
     nowhere = parse_location("s3://nowhere/run")
     with (
         pytest.raises(ConfigError, match=r"cannot write the run to s3://nowhere/run: .*no such bucket"),

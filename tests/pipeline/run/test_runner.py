@@ -1,4 +1,4 @@
-"""Runs on both executors: what is computed, what is not, and what becomes of failures."""
+"""Runs on both executors: which nodes are computed, which are reused, and how failures are recorded."""
 
 import json
 import os
@@ -32,7 +32,7 @@ FIXED = (
     "p95_road_m mad_road_deg mad_terrain_deg triangles road_fraction completeness seconds error"
 ).split()
 EACH = {"load": 1, "segment": 1, "ecsrc": 1, "fit": 3, "sample": 3, "evaluate": 3, "assess": 3, "export": 1}
-"""What one tile costs with the paper's three variants: what they share is computed once."""
+"""Nodes of one tile with the paper's three variants; shared nodes are computed once."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def run(survey, quick_config, tmp_path):
 
 @pytest.fixture(scope="module")
 def made(made_survey, tmp_path_factory) -> Path:
-    """The folder of a finished run, to be copied."""
+    """The folder of a finished run, for copying."""
     folder = tmp_path_factory.mktemp("made") / "run"
     run = Run.create(folder, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
     run_tiles(run, SerialExecutor())
@@ -51,7 +51,7 @@ def made(made_survey, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def finished(made, run):
-    """A finished run of one's own, of a survey of one's own."""
+    """A finished run with its own survey, which the test may change."""
     shutil.copytree(made, run.path, dirs_exist_ok=True)
     return Run.create(run.path, run.config, run.catalog)
 
@@ -63,9 +63,9 @@ def computed(results) -> Counter:
     return total
 
 
-def results_of(run, executor, *how) -> list[TileResult]:
+def results_of(run, executor, *arguments) -> list[TileResult]:
     results = []
-    run_tiles(run, executor, *how, watch=results.append)
+    run_tiles(run, executor, *arguments, watch=results.append)
     return results
 
 
@@ -78,15 +78,16 @@ def changed(run: Run, **stages) -> Run:
     return Run.create(run.path, compose(raw, "changed"), run.catalog)
 
 
-def spoil(run: Run, tile: int, layer: str = "dsm") -> tuple[str, bytes]:
-    found = run.catalog.tiles[tile]
-    path = found.paths(found.layer(layer))[0]
+def truncate(run: Run, index: int, layer: str = "dsm") -> tuple[str, bytes]:
+    """Cut a source file of a tile in half; return the tile's id and the original bytes."""
+    tile = run.catalog.tiles[index]
+    path = tile.paths(tile.layer(layer))[0]
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    return found.id, whole
+    return tile.id, whole
 
 
-def test_rows_are_complete_and_what_is_shared_is_computed_once(run, executor):
+def test_run_writes_all_rows_and_computes_shared_nodes_once(run, executor):
     results = results_of(run, executor)
     assert computed(results) == times(4)
     rows = read_metrics(run.path)
@@ -103,40 +104,40 @@ def test_rows_are_complete_and_what_is_shared_is_computed_once(run, executor):
     assert rows.completeness.min() > 0.99
 
 
-def test_executors_agree(survey, quick_config, tmp_path, cluster):
+def test_executors_give_equal_tables(survey, quick_config, tmp_path, cluster):
     tables = []
-    for name, which in (("a", SerialExecutor()), ("b", DaskExecutor(scheduler=cluster.scheduler_address))):
+    for name, executor in (("a", SerialExecutor()), ("b", DaskExecutor(scheduler=cluster.scheduler_address))):
         run = Run.create(tmp_path / name, load_config(quick_config), Catalog.read(survey))
-        run_tiles(run, which)
+        run_tiles(run, executor)
         tables.append(read_metrics(run.path).drop(columns="seconds"))
     pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
-def test_the_same_again_computes_nothing(finished, executor):
+def test_repeated_run_computes_nothing(finished, executor):
     before = read_metrics(finished.path)
     results = results_of(Run.open(finished.path), executor)
     assert {result.status for result in results} == {"cached"}
     assert computed(results) == Counter()
     pd.testing.assert_frame_equal(before, read_metrics(finished.path), check_exact=True)
-    how = summary(finished)
-    assert (how.tiles, how.done, how.cached, how.failed, how.pending) == (4, 4, 4, 0, 0)
+    counts = summary(finished)
+    assert (counts.tiles, counts.done, counts.cached, counts.failed, counts.pending) == (4, 4, 4, 0, 0)
 
 
-def test_a_changed_option_computes_what_hangs_on_it(finished, executor):
+def test_changed_option_computes_its_stage_and_dependents(finished, executor):
     again = results_of(changed(finished, evaluate={"nearest": True}), executor)
-    # What load reads is not kept, nor are meshes that are not exported: they are made again on the way.
+    # Results of load and meshes that are not exported are not stored, so they are computed again.
     assert computed(again) == times(4, {"load": 1, "sample": 2, "fit": 1, "evaluate": 3, "export": 1})
     assert read_metrics(finished.path).nearest_road_m.notna().all()
     back = results_of(changed(finished), executor)
     assert computed(back) == times(4, {"export": 1})
 
 
-def test_a_changed_filter_leaves_the_segmentation_alone(finished, executor):
+def test_changed_filter_reuses_segmentation(finished, executor):
     again = results_of(changed(finished, ecsrc={"theta_z_m": 0.1}), executor)
     assert computed(again) == times(4, EACH) - times(4, {"segment": 1})
 
 
-def test_a_changed_source_costs_its_own_tile(finished, executor):
+def test_changed_source_computes_only_its_tile(finished, executor):
     tile = finished.catalog.tiles[1]
     path = tile.paths(tile.layer("dsm"))[0]
     with rasterio.open(path, "r+") as raster:
@@ -147,7 +148,7 @@ def test_a_changed_source_costs_its_own_tile(finished, executor):
     assert computed(results) == times(1)
 
 
-def test_a_shared_store_serves_another_run(finished, executor, tmp_path):
+def test_shared_store_is_reused_by_another_run(finished, executor, tmp_path):
     other = Run.create(tmp_path / "other", finished.config, finished.catalog, finished.store)
     assert computed(results_of(other, executor)) == times(4, {"export": 1})
     assert not (tmp_path / "other" / "store").exists()
@@ -156,8 +157,8 @@ def test_a_shared_store_serves_another_run(finished, executor, tmp_path):
     assert Run.open(other.path).store == finished.store.resolve()
 
 
-def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
-    broken, whole = spoil(run, 2)
+def test_broken_source_fails_only_its_tile(run, executor):
+    broken, whole = truncate(run, 2)
     results = results_of(run, executor)
     assert {r.tile_id for r in results if r.status == "failed"} == {broken}
     rows = read_metrics(run.path)
@@ -167,9 +168,9 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
     assert bad.error.str.startswith("load: TaskError: ").all()
     assert bad.l2_road_m.isna().all()
     assert set(rows[rows.tile_id != broken].status) == {"done"}
-    how = summary(run)
-    assert (how.done, how.failed) == (3, 1)
-    (failure,) = how.failures
+    counts = summary(run)
+    assert (counts.done, counts.failed) == (3, 1)
+    (failure,) = counts.failures
     assert failure.tile_id == broken
     assert failure.file.endswith(f"{broken}.tif")
     assert pd.read_csv(run.path / "failures.csv").tile_id.astype(str).tolist() == [broken]
@@ -177,14 +178,14 @@ def test_a_broken_tile_is_a_row_and_stops_nobody(run, executor):
     tile = run.catalog.tiles[2]
     tile.paths(tile.layer("dsm"))[0].write_bytes(whole)
     fixed = results_of(run, executor, rerun_filter(run, (), failed=True))
-    # The mended file has another time, so the failure on record is of another graph: it is pending.
+    # The restored file has another time, so the recorded failure is of another graph: the tile is pending.
     fixed = fixed or results_of(run, executor)
     assert computed(fixed) == times(1)
     assert summary(run).failed == 0
 
 
-def test_rerun_means_the_tiles_named_or_failed(run, executor):
-    broken, _ = spoil(run, 0)
+def test_rerun_filter_selects_given_or_failed_tiles(run, executor):
+    broken, _ = truncate(run, 0)
     run_tiles(run, executor)
     assert [r.tile_id for r in results_of(run, executor, rerun_filter(run, (), failed=True))] == [broken]
     one = run.catalog.tiles[3].id
@@ -193,14 +194,14 @@ def test_rerun_means_the_tiles_named_or_failed(run, executor):
     assert len(read_metrics(run.path)) == 12
 
 
-def test_from_a_stage_on_computes_it_and_what_follows(finished, executor):
+def test_forced_stages_are_computed_again(finished, executor):
     one = finished.catalog.tiles[3].id
     force = frozenset({"fit", "sample", "evaluate"})
     results = results_of(finished, executor, rerun_filter(finished, (one,), failed=False), force)
     assert computed(results) == times(1, {"load": 1, "fit": 3, "sample": 3, "evaluate": 3, "export": 1})
 
 
-def test_a_damaged_artefact_is_made_again(finished, executor):
+def test_damaged_artefact_is_computed_again(finished, executor):
     before = read_metrics(finished.path)
     tile = finished.catalog.tiles[0].id
     for path in (finished.path / "store" / "evaluate").rglob("*.npz"):
@@ -215,7 +216,7 @@ def test_a_damaged_artefact_is_made_again(finished, executor):
     assert finished.folder(tile).path.exists()
 
 
-def test_a_lost_product_is_written_again(finished, executor):
+def test_missing_product_is_written_again(finished, executor):
     folder = finished.folder(finished.catalog.tiles[0].id).path
     (mesh,) = folder.glob("*.glb")
     whole = mesh.read_bytes()
@@ -224,7 +225,7 @@ def test_a_lost_product_is_written_again(finished, executor):
     assert mesh.read_bytes() == whole
 
 
-def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
+def test_full_disk_fails_tile_and_leaves_no_temporary_file(run, monkeypatch):
     put = ArtefactStore.put
 
     def full(self, node, value, seconds):
@@ -242,177 +243,177 @@ def test_a_disk_full_costs_the_tile_and_leaves_no_half_file(run, monkeypatch):
     assert not list(run.path.rglob("*.tmp"))
 
 
-class Meddling(SerialExecutor):
-    """Does something before the n-th tile, when its graph is made already."""
+class CallBeforeTile(SerialExecutor):
+    """Calls a function before the n-th tile is processed, after its graph was made."""
 
-    def __init__(self, n, meddle):
-        self.n, self.meddle = n, meddle
+    def __init__(self, n, call):
+        self.n, self.call = n, call
 
     def map(self, function, jobs, lost, probe=None):
         for i, job in enumerate(jobs):
             if i == self.n:
-                self.meddle()
+                self.call()
             yield function(job)
 
 
-@pytest.mark.parametrize("how", ["replaced", "truncated"])
-def test_a_source_replaced_while_its_tile_is_done(how, run, survey, quick_config, tmp_path):
+@pytest.mark.parametrize("change", ["replaced", "truncated"])
+def test_source_changed_during_processing_fails_its_tile(change, run, survey, quick_config, tmp_path):
     tile = run.catalog.tiles[2]
     path = tile.paths(tile.layer("dsm"))[0]
 
-    def replace_it():
-        if how == "truncated":
+    def change_source():
+        if change == "truncated":
             path.write_bytes(path.read_bytes()[:700])
             return
         with rasterio.open(path, "r+") as raster:
             raster.write(raster.read(1) + 0.5, 1)
 
     whole = path.read_bytes()
-    results = results_of(run, Meddling(2, replace_it))
+    results = results_of(run, CallBeforeTile(2, change_source))
     assert [result.status for result in results] == ["done", "done", "failed", "done"]
     (failure,) = results[2].failures
     assert (failure.stage, failure.kind, failure.file) == ("load", "SourceChanged", str(path))
-    assert "the same command takes the tile up again" in failure.message
+    assert "run the same command again" in failure.message
     assert not failure.trace
     stored = {path.stem for path in (run.path / "store").rglob("*.npz")}
     assert not stored & set(run.graph(tile).nodes)
-    if how == "truncated":
+    if change == "truncated":
         path.write_bytes(whole)
-    how = run_tiles(run, SerialExecutor())
-    assert (how.done, how.cached, how.changed) == (4, 3, 1)
+    counts = run_tiles(run, SerialExecutor())
+    assert (counts.done, counts.cached, counts.changed) == (4, 3, 1)
     undisturbed = Run.create(tmp_path / "undisturbed", run.config, run.catalog)
     run_tiles(undisturbed, SerialExecutor())
     left, right = (read_metrics(r.path).drop(columns="seconds") for r in (run, undisturbed))
     pd.testing.assert_frame_equal(left, right, check_exact=True)
 
 
-def nothing_to_do(run) -> Summary:
-    """Execute a run that is done, and see that it knows."""
+def assert_nothing_to_do(run) -> Summary:
+    """Execute a finished run; fail if a tile is processed."""
     before = read_metrics(run.path)
-    how = run_tiles(run, Meddling(0, lambda: pytest.fail("there was something to do")))
-    assert (how.done, how.cached) == (4, 4)
+    counts = run_tiles(run, CallBeforeTile(0, lambda: pytest.fail("a tile was processed")))
+    assert (counts.done, counts.cached) == (4, 4)
     pd.testing.assert_frame_equal(before, read_metrics(run.path), check_exact=True)
-    return how
+    return counts
 
 
-def test_a_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatch):
+def test_resume_makes_each_graph_once_and_reads_no_marker(finished, monkeypatch):
     made = Counter()
     graph = Pattern.graph
 
-    def counted(self, tile, *how):
+    def counted(self, tile, *arguments):
         made[tile.id] += 1
-        return graph(self, tile, *how)
+        return graph(self, tile, *arguments)
 
     monkeypatch.setattr(Pattern, "graph", counted)
     monkeypatch.setattr(
         "flexroad.pipeline.run.status._from_marker", lambda *_: pytest.fail("a marker was read")
     )
-    nothing_to_do(Run.open(finished.path))
+    assert_nothing_to_do(Run.open(finished.path))
     assert made == {tile.id: 1 for tile in finished.catalog.tiles}
 
 
-@pytest.mark.parametrize("how", ["lost", "damaged", "of before"])
-def test_the_markers_are_the_truth(how, finished):
+@pytest.mark.parametrize("state", ["lost", "damaged", "outdated"])
+def test_outdated_database_is_restored_from_markers(state, finished):
     database = finished.path / "database.sqlite"
     before = database.read_bytes()
     run = changed(finished, evaluate={"nearest": True})
     run_tiles(run, SerialExecutor())
-    if how == "lost":
+    if state == "lost":
         database.unlink()
     else:
-        # As if the client had been killed before it wrote down anything.
-        database.write_bytes(before if how == "of before" else before[:5000])
+        # As if the client had been killed before it wrote any record.
+        database.write_bytes(before if state == "outdated" else before[:5000])
     assert summary(run).done == 4
-    nothing_to_do(run)
+    assert_nothing_to_do(run)
     assert read_metrics(run.path).nearest_road_m.notna().all()
 
 
-def test_a_summary_counts_what_is_new_changed_and_vanished(run):
+def test_summary_counts_new_changed_and_vanished_tiles(run):
     first = Run.create(run.path, run.config, Catalog(run.catalog.tiles[:3]))
-    how = run_tiles(first, SerialExecutor())
-    assert (how.new, how.changed, how.vanished, how.exit_code) == (3, 0, 0, 0)
+    counts = run_tiles(first, SerialExecutor())
+    assert (counts.new, counts.changed, counts.vanished, counts.exit_code) == (3, 0, 0, 0)
     tile = run.catalog.tiles[1]
     os.utime(tile.paths(tile.layer("dtm"))[0], (1, 1))
     second = Run.create(run.path, run.config, Catalog(run.catalog.tiles[1:]))
     assert [summary(second).pending, summary(second).done] == [2, 1]
-    how = run_tiles(second, SerialExecutor())
-    assert (how.new, how.changed, how.vanished) == (1, 1, 1)
-    assert (how.tiles, how.done, how.cached) == (3, 3, 1)
-    told = json.loads((run.path / "summary.json").read_text())
-    assert {name: told[name] for name in ("new", "changed", "vanished", "done", "exit_code")} == {
+    counts = run_tiles(second, SerialExecutor())
+    assert (counts.new, counts.changed, counts.vanished) == (1, 1, 1)
+    assert (counts.tiles, counts.done, counts.cached) == (3, 3, 1)
+    written = json.loads((run.path / "summary.json").read_text())
+    assert {name: written[name] for name in ("new", "changed", "vanished", "done", "exit_code")} == {
         "new": 1, "changed": 1, "vanished": 1, "done": 3, "exit_code": 0,
     }  # fmt: skip
-    assert told["start"] < told["end"]
+    assert written["start"] < written["end"]
     assert list(read_metrics(run.path).tile_id.unique()) == [tile.id for tile in second.catalog.tiles]
     assert run_tiles(second, SerialExecutor()).vanished == 0
 
 
-def test_an_interruption_leaves_tables_and_a_summary(run):
+def test_interrupted_run_writes_tables_and_summary(run):
     def interrupt():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_tiles(run, Meddling(2, interrupt))
-    told = json.loads((run.path / "summary.json").read_text())
-    assert {name: told[name] for name in ("interrupted", "exit_code", "done", "pending")} == {
+        run_tiles(run, CallBeforeTile(2, interrupt))
+    written = json.loads((run.path / "summary.json").read_text())
+    assert {name: written[name] for name in ("interrupted", "exit_code", "done", "pending")} == {
         "interrupted": True, "exit_code": 130, "done": 2, "pending": 2,
     }  # fmt: skip
     assert read_metrics(run.path).tile_id.nunique() == 2
-    how = run_tiles(run, SerialExecutor())
-    assert (how.done, how.cached, how.interrupted, how.exit_code) == (4, 2, False, 0)
+    counts = run_tiles(run, SerialExecutor())
+    assert (counts.done, counts.cached, counts.interrupted, counts.exit_code) == (4, 2, False, 0)
 
 
-def test_an_interrupted_run_keeps_no_rows_of_another_configuration(finished):
+def test_interrupted_run_drops_rows_of_earlier_configuration(finished):
     def interrupt():
         raise KeyboardInterrupt
 
     other = changed(finished, evaluate={"nearest": True})
     with pytest.raises(KeyboardInterrupt):
-        run_tiles(other, Meddling(1, interrupt))
+        run_tiles(other, CallBeforeTile(1, interrupt))
     rows = read_metrics(finished.path)
     assert list(rows.tile_id.unique()) == [finished.catalog.tiles[0].id]
     assert rows.nearest_road_m.notna().all()
 
 
-def test_products_are_compared_byte_for_byte_on_demand(finished):
+def test_verify_writes_changed_product_again(finished):
     folder = finished.folder(finished.catalog.tiles[0].id).path
     (mesh,) = folder.glob("*.glb")
     whole = mesh.read_bytes()
     mesh.write_bytes(bytes(len(whole)))
-    nothing_to_do(finished)
+    assert_nothing_to_do(finished)
     results = []
     run_tiles(finished, SerialExecutor(), watch=results.append, verify=True)
     assert computed(results) == times(1, {"export": 1})
     assert mesh.read_bytes() == whole
 
 
-def test_gone_sources_count_as_they_were_until_the_tile_is_asked_for(finished):
+def test_missing_source_keeps_result_until_tile_is_processed(finished):
     tile = finished.catalog.tiles[1]
     tile.paths(tile.layer("dsm"))[0].unlink()
     assert (summary(finished).done, summary(finished).pending) == (4, 0)
     other = finished.catalog.tiles[0].id
-    how = run_tiles(finished, SerialExecutor(), rerun_filter(finished, (other,), failed=False))
-    assert (how.done, how.cached, how.failed) == (4, 1, 0)
-    how = run_tiles(finished, SerialExecutor())
-    assert (how.done, how.cached, how.failed) == (3, 3, 1)
-    assert how.failures[0].tile_id == tile.id
+    counts = run_tiles(finished, SerialExecutor(), rerun_filter(finished, (other,), failed=False))
+    assert (counts.done, counts.cached, counts.failed) == (4, 1, 0)
+    counts = run_tiles(finished, SerialExecutor())
+    assert (counts.done, counts.cached, counts.failed) == (3, 3, 1)
+    assert counts.failures[0].tile_id == tile.id
 
 
-def test_log_has_one_event_per_tile(run, executor):
+def test_log_has_one_event_per_tile_and_stage(run, executor):
     run_tiles(run, executor)
     events = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
     kinds = Counter(event["event"] for event in events)
     assert kinds == {"run": 1, "stage": 4 * len(EACH), "tile": 4, "end": 1}
     stages = [event for event in events if event["event"] == "stage"]
     for tile in run.catalog.tiles:
-        here = {event["stage"]: event for event in stages if event["tile"] == tile.id}
-        assert {stage: event["computed"] for stage, event in here.items()} == EACH
-        assert here["fit"]["bytes"] > 1000
-        assert here["load"]["bytes"] == 0
+        by_stage = {event["stage"]: event for event in stages if event["tile"] == tile.id}
+        assert {stage: event["computed"] for stage, event in by_stage.items()} == EACH
+        assert by_stage["fit"]["bytes"] > 1000
+        assert by_stage["load"]["bytes"] == 0
     assert all(event["peak_mb"] > 10 and event["pid"] and event["host"] for event in stages)
 
 
-def test_item_is_stac_with_checksums(run, executor):
+def test_item_is_valid_stac_with_checksums(run, executor):
     import hashlib
 
     import pystac
@@ -428,7 +429,7 @@ def test_item_is_stac_with_checksums(run, executor):
         assert asset.extra_fields["file:checksum"] == "1220" + hashlib.sha256(data).hexdigest()
 
 
-def test_products_open_as_they_are(run, executor):
+def test_products_open_in_standard_readers(run, executor):
     import trimesh
 
     run_tiles(run, executor)
@@ -444,16 +445,16 @@ def test_products_open_as_they_are(run, executor):
         assert raster.crs.to_epsg() == 25832
 
 
-def test_a_large_run_is_judged_by_a_part_of_its_steps(finished):
+def test_edge_steps_of_large_run_are_a_sample(finished):
     whole, note = edge_steps(finished)
-    part, told = edge_steps(finished, most=2)
+    part, sample_note = edge_steps(finished, most=2)
     pairs = ["tile", "neighbour"]
     assert (len(whole), note) == (4, "")
     assert 0 < len(part) < len(whole)
     assert part.set_index(pairs).equals(whole.set_index(pairs).loc[pd.MultiIndex.from_frame(part[pairs])])
-    assert told == "Of one tile in 2, against its neighbours in the east and north."
+    assert sample_note == "Of one tile in 2, against its neighbours in the east and north."
 
 
-def test_what_is_no_run_is_said(tmp_path):
+def test_open_folder_without_run_raises(tmp_path):
     with pytest.raises(ConfigError, match="is no run"):
         Run.open(tmp_path)

@@ -1,4 +1,4 @@
-"""`flexroad status` of a run that goes on: seen from outside, without touching it."""
+"""`flexroad status` of an active run: read by another process, without changing it."""
 
 import re
 from datetime import UTC, datetime, timedelta
@@ -20,38 +20,41 @@ def run(made_survey, quick_config, tmp_path) -> Run:
     return Run.create(tmp_path / "run", load_config(quick_config), catalog)
 
 
-def test_progress_tells_how_it_stands_and_how_fast_it_goes(run):
+def test_progress_returns_counts_and_rate(run):
     now = datetime.now(UTC)
     one, two, three, _ = (tile.id for tile in run.catalog.tiles)
-    who = Owner("node7", "m", "b", 4711, 99, (now - timedelta(minutes=2)).isoformat(timespec="seconds"), "t")
+    holder = Owner(
+        "node7", "m", "b", 4711, 99, (now - timedelta(minutes=2)).isoformat(timespec="seconds"), "t"
+    )
     before, lately = ((now - timedelta(minutes=m)).isoformat(timespec="milliseconds") for m in (9, 1))
     with RunDatabase.open(run.path / NAME) as database:
-        database.ask([(tile.id, "pending") for tile in run.catalog.tiles])
+        database.set_states([(tile.id, "pending") for tile in run.catalog.tiles])
         database.record(TileRecord(one, "done", "f", (), finished=before))
         database.flush()
-        database.ask([(one, "cached"), *((tile.id, "pending") for tile in run.catalog.tiles[1:])])
-        assert progress(run, who)[1] == ""
+        database.set_states([(one, "cached"), *((tile.id, "pending") for tile in run.catalog.tiles[1:])])
+        assert progress(run, holder)[1] == ""
         for name in (two, three):
             database.record(TileRecord(name, "done", "f", (), finished=lately))
         database.flush()
-        how, pace = progress(run, who)
-    assert (how.tiles, how.done, how.cached, how.failed, how.pending) == (4, 3, 1, 0, 1)
-    rate, left = map(float, re.fullmatch(r", (\S+) tiles a minute, about (\S+) min left", pace).groups())
+        summary, text = progress(run, holder)
+    counts = (summary.tiles, summary.done, summary.cached, summary.failed, summary.pending)
+    assert counts == (4, 3, 1, 0, 1)
+    rate, left = map(float, re.fullmatch(r", (\S+) tiles a minute, about (\S+) min left", text).groups())
     assert rate == pytest.approx(1, abs=0.4)
     assert left == pytest.approx(1, abs=1)
 
 
-def test_a_run_is_seen_while_another_process_writes_it(run, flexroad):
+def test_status_of_active_run_shows_counts_and_owner(run, flexroad):
     one, two, *_ = (tile.id for tile in run.catalog.tiles)
     with run_lock(run.path), RunDatabase.open(run.path / NAME) as database:
-        database.ask([(tile.id, "pending") for tile in run.catalog.tiles])
+        database.set_states([(tile.id, "pending") for tile in run.catalog.tiles])
         assert "4 tiles: 0 done (0 cached), 0 failed, 4 pending" in flexroad("status", run.path).out
         database.record(TileRecord(one, "failed", "f", (), (Failure(one, "load", "TaskError", "gone"),)))
         database.record(TileRecord(two, "done", "f", ()))
         database.flush()
-        said = flexroad("status", run.path).out
-        who = owner(run.path)
-        assert "4 tiles: 1 done (0 cached), 1 failed, 2 pending" in said
-        assert f"pid {who.pid} on {who.host} at work since {who.since}" in said
-        assert f"  {one}: load: TaskError: gone" in said
+        output = flexroad("status", run.path).out
+        holder = owner(run.path)
+        assert "4 tiles: 1 done (0 cached), 1 failed, 2 pending" in output
+        assert f"pid {holder.pid} on {holder.host} at work since {holder.since}" in output
+        assert f"  {one}: load: TaskError: gone" in output
     assert "at work" not in flexroad("status", run.path).out

@@ -1,4 +1,4 @@
-"""What is written comes back to the last bit, or counts as not there."""
+"""Artefacts and products are read back exactly as written; damaged ones count as missing."""
 
 from dataclasses import fields
 
@@ -30,17 +30,17 @@ def same(a, b) -> bool:
 
 
 @pytest.fixture
-def pull(survey, tmp_path):
+def evaluator(survey, tmp_path):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
     return Evaluator(graph, ArtefactStore(tmp_path / "store"), keep=True)
 
 
-def test_every_result_comes_back_exactly(pull):
+def test_codec_restores_every_result_exactly(evaluator):
     kinds = set()
-    for fingerprint, node in pull.graph.nodes.items():
+    for fingerprint, node in evaluator.graph.nodes.items():
         if node.stage == "load":
             continue
-        value = pull(fingerprint)
+        value = evaluator(fingerprint)
         back, seconds = codec.decode(codec.encode(value, {"fit": 0.25}))
         assert seconds == {"fit": 0.25}
         assert type(back) is type(value)
@@ -53,25 +53,25 @@ def test_every_result_comes_back_exactly(pull):
     }  # fmt: skip
 
 
-def test_damage_counts_as_absence(pull):
-    fingerprint = pull.graph.variants["flexroad"]["fit"]
-    node = pull.graph.nodes[fingerprint]
-    pull(fingerprint)
-    (path,) = (pull.store.root / "fit").rglob(f"{fingerprint}.npz")
+def test_get_damaged_artefact_returns_none(evaluator):
+    fingerprint = evaluator.graph.variants["flexroad"]["fit"]
+    node = evaluator.graph.nodes[fingerprint]
+    evaluator(fingerprint)
+    (path,) = (evaluator.store.root / "fit").rglob(f"{fingerprint}.npz")
     whole = path.read_bytes()
-    assert pull.store.get(node) is not None
+    assert evaluator.store.get(node) is not None
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 0xFF
     for damaged in (b"", whole[:100], whole[:-1], bytes(flipped)):
         path.write_bytes(damaged)
-        assert pull.store.get(node) is None
+        assert evaluator.store.get(node) is None
 
 
-def test_every_damaged_byte_and_every_cut_is_noticed(pull):
-    """Also where the zip keeps no checksum of its own: in its names, dates and directory."""
-    node = pull.graph.nodes[pull.graph.variants["plane"]["evaluate"]]
-    pull(node.fingerprint)
-    (path,) = pull.store.root.rglob(f"{node.fingerprint}.npz")
+def test_decode_any_damaged_byte_or_truncation_raises(evaluator):
+    """Also in the parts of a zip that have no checksum: names, dates and directory."""
+    node = evaluator.graph.nodes[evaluator.graph.variants["plane"]["evaluate"]]
+    evaluator(node.fingerprint)
+    (path,) = evaluator.store.root.rglob(f"{node.fingerprint}.npz")
     whole = path.read_bytes()
     assert codec.decode(whole)
     flips = (whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole)))
@@ -81,15 +81,15 @@ def test_every_damaged_byte_and_every_cut_is_noticed(pull):
             codec.decode(damaged)
 
 
-def test_an_artefact_opens_without_us(pull):
-    fingerprint = pull.graph.variants["flexroad"]["segment"]
-    mask = pull(fingerprint).mask
-    (path,) = pull.store.root.rglob(f"{fingerprint}.npz")
+def test_artefact_opens_with_numpy(evaluator):
+    fingerprint = evaluator.graph.variants["flexroad"]["segment"]
+    mask = evaluator(fingerprint).mask
+    (path,) = evaluator.store.root.rglob(f"{fingerprint}.npz")
     with np.load(path) as archive:
         assert np.array_equal(archive["mask"], mask)
 
 
-def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
+def test_verified_changed_product_is_false(tmp_path):
     folder = TileProducts(tmp_path / "tile")
     item = {"assets": {"mesh.glb": file_entry("mesh.glb", b"abc", "model/gltf-binary")}}
     folder.finish(item, {"mesh.glb": b"abc"})
@@ -101,8 +101,8 @@ def test_a_product_with_one_other_byte_is_not_verified(tmp_path):
     assert not folder.verified()
 
 
-def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeypatch):
-    """A run that is killed between two products, or denied the second, leaves a tile that is not done."""
+def test_finish_interrupted_leaves_tile_not_done(tmp_path, monkeypatch):
+    """Also if writing a product fails, for example if access is denied."""
     folder = TileProducts(tmp_path / "tile")
     folder.finish({"was": 1}, {"a": b"old", "b": b"old"})
 
@@ -117,7 +117,7 @@ def test_nothing_vouches_for_a_mixture_of_old_and_new_products(tmp_path, monkeyp
     assert sorted(path.name for path in folder.path.iterdir()) == ["a", "b"]
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+def test_write_failed_keeps_existing_file(tmp_path, monkeypatch):
     path = tmp_path / "a" / "b.json"
     write(path, b"old")
     with pytest.raises(TypeError):
@@ -126,7 +126,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     assert [p.name for p in path.parent.iterdir()] == ["b.json"]
 
 
-def test_a_marker_of_another_graph_or_with_a_product_missing_is_not_done(survey, tmp_path):
+def test_done_with_other_graph_or_incomplete_product_is_none(survey, tmp_path):
     graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
     folder = TileProducts.of(tmp_path, graph.tile.id)
     item = {
@@ -144,7 +144,7 @@ def test_a_marker_of_another_graph_or_with_a_product_missing_is_not_done(survey,
     assert folder.done(graph) is None
 
 
-def test_tile_ids_become_safe_folder_names(tmp_path):
+def test_tile_id_becomes_safe_folder_name(tmp_path):
     for odd in ("../up", "a/b", "..", "", "ä b"):
         folder = TileProducts.of(tmp_path, odd).path
         assert folder.parent == tmp_path / "tiles"

@@ -1,4 +1,4 @@
-"""The database answers as a plain dictionary would, whatever becomes of its file."""
+"""The database returns what was recorded, also after damage to its file and on a full disk."""
 
 import errno
 from collections import Counter
@@ -9,7 +9,7 @@ from flexroad.pipeline.store.database import NAME, PAGE, RunDatabase
 from flexroad.pipeline.store.records import Failure, TileRecord
 
 TILES = [f"{i}_{i}" for i in range(2 * PAGE + 7)]
-"""More than two pages."""
+"""Ids of tiles for more than two pages."""
 
 
 def entry(tile: str) -> TileRecord:
@@ -26,34 +26,36 @@ def entry(tile: str) -> TileRecord:
 
 @pytest.fixture
 def full(tmp_path):
-    """A database of every tile but the last, which is pending, written backwards."""
+    """A database with records of all tiles in reverse order, except the last tile, which is pending."""
     with RunDatabase.open(tmp_path / NAME) as database:
-        database.ask((tile, "pending") for tile in TILES)
+        database.set_states((tile, "pending") for tile in TILES)
         for tile in reversed(TILES[:-1]):
             database.record(entry(tile))
     return tmp_path / NAME
 
 
-def test_what_is_recorded_comes_back_in_the_catalogs_order(full):
-    known = {tile: entry(tile) for tile in TILES[:-1]}
-    with RunDatabase.peek(full) as database:
-        assert {tile: database.get(tile) for tile in TILES} == known | {TILES[-1]: None}
-        found = list(database.entries())
-        assert [tile for tile, _, _ in found] == TILES
-        assert [which for _, _, which in found] == [*known.values(), None]
-        assert list(database.rows()) == [row for one in known.values() for row in one.rows]
-        assert list(database.failures()) == [fault for one in known.values() for fault in one.failures]
-        states = Counter(one.state for one in known.values())
+def test_recorded_tiles_are_read_in_catalog_order(full):
+    records = {tile: entry(tile) for tile in TILES[:-1]}
+    with RunDatabase.open_readonly(full) as database:
+        assert {tile: database.get(tile) for tile in TILES} == records | {TILES[-1]: None}
+        entries = list(database.entries())
+        assert [tile for tile, _, _ in entries] == TILES
+        assert [record for _, _, record in entries] == [*records.values(), None]
+        assert list(database.rows()) == [row for record in records.values() for row in record.rows]
+        assert list(database.failures()) == [
+            failure for record in records.values() for failure in record.failures
+        ]
+        states = Counter(record.state for record in records.values())
         assert database.counts() == {**states, "pending": 1}
 
 
-def test_only_what_stands_is_in_the_tables(full):
+def test_tables_contain_only_current_tiles(full):
     with RunDatabase.open(full) as database:
-        vanished = database.ask([(TILES[5], "pending"), (TILES[3], "failed"), (TILES[4], "cached")])
+        vanished = database.set_states([(TILES[5], "pending"), (TILES[3], "failed"), (TILES[4], "cached")])
         assert vanished == len(TILES) - 1 - 3
         assert [row["tile_id"] for row in database.rows()] == [TILES[3], TILES[4]]
         assert [failure.tile_id for failure in database.failures()] == [TILES[3]]
-        assert (database.standing(TILES[4]), database.standing(TILES[0])) == ("cached", None)
+        assert (database.state(TILES[4]), database.state(TILES[0])) == ("cached", None)
         database.record(entry(TILES[5]))
         assert [row["tile_id"] for row in database.rows()] == [TILES[5], TILES[3], TILES[4]]
         assert database.get(TILES[0]) is None
@@ -70,37 +72,37 @@ def test_only_what_stands_is_in_the_tables(full):
     ],
     ids=["empty", "of another kind", "cut off", "overwritten", "of another version"],
 )
-def test_a_damaged_ledger_begins_empty(spoil, full):
+def test_open_damaged_database_starts_empty(spoil, full):
     full.write_bytes(spoil(full.read_bytes()))
     with RunDatabase.open(full) as database:
         assert not database.counts()
         assert database.get(TILES[0]) is None
-        database.ask([(TILES[0], "pending")])
+        database.set_states([(TILES[0], "pending")])
         database.record(entry(TILES[0]))
-    with RunDatabase.peek(full) as database:
+    with RunDatabase.open_readonly(full) as database:
         assert database.get(TILES[0]) == entry(TILES[0])
 
 
-def test_one_reads_while_another_writes(full):
-    with RunDatabase.open(full) as writer, RunDatabase.peek(full) as reader:
+def test_read_while_writing_returns_new_records(full):
+    with RunDatabase.open(full) as writer, RunDatabase.open_readonly(full) as reader:
         rows = reader.rows()
         next(rows)
-        writer.ask((tile, "pending") for tile in TILES)
+        writer.set_states((tile, "pending") for tile in TILES)
         writer.record(entry(TILES[-1]))
         writer.flush()
         assert reader.get(TILES[-1]) == entry(TILES[-1])
         assert reader.counts() == {"pending": len(TILES) - 1, "done": 1}
 
 
-def test_nobody_makes_a_ledger_by_looking(tmp_path):
-    with RunDatabase.peek(tmp_path / NAME) as database:
+def test_open_readonly_missing_database_creates_no_file(tmp_path):
+    with RunDatabase.open_readonly(tmp_path / NAME) as database:
         assert not database.counts()
     assert not list(tmp_path.iterdir())
 
 
-def test_what_a_full_disk_does_not_take_waits(tmp_path):
+def test_records_wait_while_disk_is_full(tmp_path):
     with RunDatabase.open(tmp_path / NAME) as database:
-        database.ask((tile, "pending") for tile in TILES)
+        database.set_states((tile, "pending") for tile in TILES)
         database._connection.execute("PRAGMA max_page_count = 1")
         for tile in TILES:
             database.record(entry(tile))
@@ -109,5 +111,5 @@ def test_what_a_full_disk_does_not_take_waits(tmp_path):
         assert caught.value.errno == errno.ENOSPC
         assert database.get(TILES[0]) == entry(TILES[0])
         database._connection.execute("PRAGMA max_page_count = 100000")
-    with RunDatabase.peek(tmp_path / NAME) as database:
-        assert [one for _, _, one in database.entries()] == [entry(tile) for tile in TILES]
+    with RunDatabase.open_readonly(tmp_path / NAME) as database:
+        assert [record for _, _, record in database.entries()] == [entry(tile) for tile in TILES]
