@@ -125,7 +125,7 @@ def _others(run: Run, without: Sequence[Location]) -> list[Location]:
         raise ConfigError(
             f"the list of runs in {run.store / FOLDER} cannot be read: {error!r}; correct or remove that file"
         ) from error
-    others = (path for path in users if not any(_same(path, known) for known in (run.path, *without)))
+    others = (path for path in users if not any(_same(path, excluded) for excluded in (run.path, *without)))
     return sorted(others, key=str)
 
 

@@ -76,7 +76,7 @@ def test_shared_nodes_are_computed_once(one_tile, tmp_path):
     true = Run.create(tmp_path / "true", brief("ablation_true"), one_tile, store)
     run_tiles(true, SerialExecutor(), watch=results.append)
     again = results[-1]
-    # Raster surfaces are not stored, because `load` reads the rasters; of the meshes, one is exported.
+    # Not stored: raster surfaces, because `load` reads the rasters, and meshes that are not exported.
     rasters = 2
     once_more = {"load": 1, "fit": rasters, "sample": VARIANTS - 1, "evaluate": VARIANTS, "export": 1}
     assert again.computed == once_more

@@ -1,4 +1,4 @@
-"""Bad input, bad disks, bad words: one clear line, and no more lost than the tile it is about."""
+"""Invalid input, disks and arguments: each gives one clear line, and fails no more than its tile."""
 
 import io
 import json
@@ -31,18 +31,19 @@ from tests.make_rasters import write
 def run(flexroad, survey, quick_config, tmp_path):
     """Run the survey, by default with the quick configuration into ``tmp_path/run``."""
 
-    def call(*more, config=quick_config, catalog=survey, out=tmp_path / "run") -> Said:
+    def call(*arguments, config=quick_config, catalog=survey, out=tmp_path / "run") -> Said:
         return flexroad(
-            "run", "--config", config, "--catalog", catalog, "--out", out, "--executor", "serial", *more
+            "run", "--config", config, "--catalog", catalog, "--out", out, "--executor", "serial", *arguments
         )
 
     return call
 
 
 def layer(tile: Tile, name: str) -> Path:
-    found = tile.layer(name)
-    assert found is not None
-    return tile.paths(found)[0]
+    """Return the first file of a layer."""
+    files = tile.layer(name)
+    assert files is not None
+    return tile.paths(files)[0]
 
 
 def values(path: Path) -> np.ndarray:
@@ -50,11 +51,11 @@ def values(path: Path) -> np.ndarray:
         return raster.read(1)
 
 
-def rewrite(tile: Tile, name: str, array, **how) -> None:
+def rewrite(tile: Tile, name: str, array, **options) -> None:
     path = layer(tile, name)
     path.unlink()
-    how = {"west": tile.grid.west, "north": tile.grid.north, "crs": tile.grid.crs} | how
-    write(path, array, how.pop("west"), how.pop("north"), **how)
+    options = {"west": tile.grid.west, "north": tile.grid.north, "crs": tile.grid.crs} | options
+    write(path, array, options.pop("west"), options.pop("north"), **options)
 
 
 # --- one tile's input ---------------------------------------------------------------------------------
@@ -130,7 +131,7 @@ def _no_road(tile: Tile) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    spoil: object
+    damage: object
     name: str
     """The layer whose file is at fault."""
     message: str
@@ -156,20 +157,20 @@ FAULTS = (
 )
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.spoil.__name__.lstrip("_"))
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.damage.__name__.lstrip("_"))
 def test_load_broken_file_fails_only_its_tile(fault, run, flexroad, survey, tmp_path):
     tile = Catalog.read(survey).tiles[1]
-    fault.spoil(tile)
-    only_its_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", str(layer(tile, fault.name)))
+    fault.damage(tile)
+    assert_only_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", str(layer(tile, fault.name)))
 
 
-def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:
-    assert said.code == 1
-    (line,) = said.errors
+def assert_only_tile_failed(result: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:
+    assert result.code == 1
+    (line,) = result.errors
     assert line.startswith(f"failed {tile.id}: {fault.stage}: TaskError: ")
     assert re.search(fault.message, line)
     assert line.endswith(f"  [{file}]" if file else line[-1])
-    assert "3 done (0 cached), 1 failed, 0 pending" in said.out
+    assert "3 done (0 cached), 1 failed, 0 pending" in result.out
 
     rows = read_metrics(out)
     bad = rows[rows.tile_id == tile.id]
@@ -181,31 +182,31 @@ def only_its_tile_failed(said: Said, tile: Tile, fault: Fault, flexroad, out: Pa
     assert (row["tile_id"], row["stage"], row["kind"], row["file"]) == (
         tile.id, fault.stage, "TaskError", file,
     )  # fmt: skip
-    found = json.loads(flexroad("status", out, "--json").out)
-    assert (found["done"], found["failed"]) == (3, 1)
-    assert [failure["message"] for failure in found["failures"]] == [row["message"]]
-    shown = flexroad("status", out)
-    assert shown.code == 0
-    assert line.removeprefix("failed ") in shown.out
+    status = json.loads(flexroad("status", out, "--json").out)
+    assert (status["done"], status["failed"]) == (3, 1)
+    assert [failure["message"] for failure in status["failures"]] == [row["message"]]
+    text = flexroad("status", out)
+    assert text.code == 0
+    assert line.removeprefix("failed ") in text.out
 
 
 @pytest.mark.parametrize("name", ["dsm", "road_mask"])
 def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, flexroad, survey, tmp_path):
-    """A catalog of rasters names for each tile the files around it as well, for a halo."""
-    into = survey.parent / "cut.json"
-    words = ["--road-mask", "road_mask/*.tif", "--tile-size", 60, "-o", into]
-    flexroad("catalog", "rasters", survey.parent, "--dsm", "dsm/*.tif", "--dtm", "dtm/*.tif", *words)
-    first = Catalog.read(into).tiles[0]
+    """A catalog of rasters lists the neighbouring files for each tile, for use with a halo."""
+    catalog = survey.parent / "cut.json"
+    arguments = ["--road-mask", "road_mask/*.tif", "--tile-size", 60, "-o", catalog]
+    flexroad("catalog", "rasters", survey.parent, "--dsm", "dsm/*.tif", "--dtm", "dtm/*.tif", *arguments)
+    first = Catalog.read(catalog).tiles[0]
     assert len(first.layer(name).files) == 4
     path = survey.parent / name / f"{first.id}.tif"
     path.write_bytes(path.read_bytes()[:300])
     fault = Fault(None, name, f"{name} {name}/{first.id}.tif cannot be read: .*; fetch it again")
-    only_its_tile_failed(run(catalog=into), first, fault, flexroad, tmp_path / "run", str(path))
+    assert_only_tile_failed(run(catalog=catalog), first, fault, flexroad, tmp_path / "run", str(path))
     halo = tmp_path / "halo.yaml"
     halo.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
-    said = run(catalog=into, config=halo)
-    assert [line.split(":")[0] for line in said.errors] == [f"failed {first.id}"]
-    other = Catalog.read(into).tiles[3].id
+    result = run(catalog=catalog, config=halo)
+    assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
+    other = Catalog.read(catalog).tiles[3].id
     item = json.loads((tmp_path / "run" / "tiles" / other / "item.json").read_text())
     (note,) = item["properties"]["flexroad:notes"]
     assert note.startswith(f"the tile is whole without it: {name} {name}/{first.id}.tif cannot be read")
@@ -221,10 +222,10 @@ def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, f
 )
 def test_tile_without_layer_fails_alone(name, stage, message, run, flexroad, survey, tmp_path):
     tiles = list(Catalog.read(survey).tiles)
-    tiles[1] = replace(tiles[1], layers=tuple(found for found in tiles[1].layers if found.name != name))
+    tiles[1] = replace(tiles[1], layers=tuple(layer for layer in tiles[1].layers if layer.name != name))
     Catalog(tuple(tiles)).write(survey)
     fault = Fault(None, name, message, stage)
-    only_its_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
+    assert_only_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
 
 
 def test_road_only_in_halo_fails_tile(run, survey, tmp_path):
@@ -234,14 +235,14 @@ def test_road_only_in_halo_fails_tile(run, survey, tmp_path):
     rewrite(tile, "road_mask", mask, west=tile.grid.west - 20, north=tile.grid.north + 20)
     config = tmp_path / "halo.yaml"
     config.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
-    said = run(config=config)
-    assert said.code == 1
-    (line,) = said.errors
+    result = run(config=config)
+    assert result.code == 1
+    (line,) = result.errors
     assert line.startswith(f"failed {tile.id}: segment: TaskError: the road mask has no road cell")
     assert line.endswith(f"[{layer(tile, 'road_mask')}]")
 
 
-# --- odd, but no fault --------------------------------------------------------------------------------
+# --- unusual but valid input --------------------------------------------------------------------------
 
 
 def _flat(tile: Tile) -> None:
@@ -274,7 +275,7 @@ def _specks(tile: Tile) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "note"),
+    ("damage", "note"),
     [
         (_flat, None),
         (_all_road, None),
@@ -284,11 +285,11 @@ def _specks(tile: Tile) -> None:
         (_specks, "dsm: 12 cells outside -500..9000 m taken as nodata"),
     ],
 )
-def test_unusual_input_gives_finite_metrics(spoil, note, run, survey, tmp_path):
+def test_unusual_input_gives_finite_metrics(damage, note, run, survey, tmp_path):
     tile = Catalog.read(survey).tiles[1]
-    spoil(tile)
-    said = run("--tile", tile.id)
-    assert (said.code, said.err) == (0, "")
+    damage(tile)
+    result = run("--tile", tile.id)
+    assert (result.code, result.err) == (0, "")
     rows = read_metrics(tmp_path / "run")
     assert set(rows.status) == {"done"}
     flexroad = rows[rows.variant == "flexroad"].iloc[0]
@@ -303,8 +304,8 @@ def test_other_cell_size_gives_correct_heights(cell, run, flexroad, tmp_path):
     grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
     tilted_ground(tmp_path / "folder", "a", grid)
     catalog = cataloged(tmp_path / "folder")
-    said = run(catalog=catalog)
-    assert (said.code, said.errors) == (0, [])
+    result = run(catalog=catalog)
+    assert (result.code, result.errors) == (0, [])
     rows = read_metrics(tmp_path / "run").set_index("variant")
     assert rows.triangles["rgt"] == 2 * np.ceil(40 - cell) ** 2
     assert (rows.l2_road_m < 0.05).all()
@@ -336,9 +337,9 @@ def cataloged(folder: Path) -> Path:
 def test_tile_of_2_by_2_cells_fails_only_nurbs(run, tmp_path):
     tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
     catalog = cataloged(tmp_path / "tiny")
-    said = run(catalog=catalog, config="paper")
-    assert said.code == 1
-    (line,) = said.errors
+    result = run(catalog=catalog, config="paper")
+    assert result.code == 1
+    (line,) = result.errors
     assert line == (
         "failed tiny: fit: TaskError: 2 x 2 cells are fewer than 35 x 35 control points; "
         "lower fit.control_points or raise fit.spacing_m"
@@ -355,8 +356,8 @@ def test_tile_id_invalid_as_file_name_gets_safe_folder(tile_id, run, flexroad, s
     first, *_ = Catalog.read(survey).tiles
     Catalog((replace(first, id=tile_id),)).write(survey)
     before = {path for path in tmp_path.rglob("*") if "run" not in path.parts}
-    said = run()
-    assert (said.code, said.errors) == (0, [])
+    result = run()
+    assert (result.code, result.errors) == (0, [])
     assert {path for path in tmp_path.rglob("*") if tmp_path / "run" not in (path, *path.parents)} == before
     (folder,) = (tmp_path / "run" / "tiles").iterdir()
     assert len(list(folder.iterdir())) == 7
@@ -368,8 +369,8 @@ def test_tile_id_invalid_as_file_name_gets_safe_folder(tile_id, run, flexroad, s
 
 def test_tile_given_twice_is_processed_once(run, survey, tmp_path):
     tile = Catalog.read(survey).tiles[2].id
-    said = run("--tile", tile, tile, "--tile", tile)
-    assert said.code == 0
+    result = run("--tile", tile, tile, "--tile", tile)
+    assert result.code == 0
     assert len(read_metrics(tmp_path / "run")) == 3
 
 
@@ -408,9 +409,9 @@ DEEP = "{a: " * 2000 + "1" + "}" * 2000
 def test_invalid_configuration_creates_no_run(text, message, run, tmp_path):
     config = tmp_path / "bad.yaml"
     config.write_text(text + "\n")
-    said = run(config=config)
-    assert said.code == 2
-    (line,) = said.errors
+    result = run(config=config)
+    assert result.code == 2
+    (line,) = result.errors
     assert str(config) in line or "papr" in line
     assert re.search(message if "*" in message else re.escape(message), line)
     assert not (tmp_path / "run").exists()
@@ -418,9 +419,9 @@ def test_invalid_configuration_creates_no_run(text, message, run, tmp_path):
 
 def test_empty_configuration_is_default(flexroad, tmp_path):
     (tmp_path / "empty.yaml").write_text("")
-    said = flexroad("config", "show", tmp_path / "empty.yaml")
-    assert (said.code, said.errors) == (0, [])
-    assert "control_points" in said.out
+    result = flexroad("config", "show", tmp_path / "empty.yaml")
+    assert (result.code, result.errors) == (0, [])
+    assert "control_points" in result.out
 
 
 def test_extends_path_is_relative_to_file(flexroad, tmp_path):
@@ -433,12 +434,12 @@ def test_extends_path_is_relative_to_file(flexroad, tmp_path):
 def test_too_many_control_points_fail_each_tile(fit, run, survey, tmp_path):
     config = tmp_path / "huge.yaml"
     config.write_text(f"fit: {fit}\n")
-    said = run(config=config)
-    assert said.code == 1
-    assert [line.split(": ")[0] for line in said.errors] == [
+    result = run(config=config)
+    assert result.code == 1
+    assert [line.split(": ")[0] for line in result.errors] == [
         f"failed {tile.id}" for tile in Catalog.read(survey).tiles
     ]
-    assert all("60 x 60 cells are fewer than" in line for line in said.errors)
+    assert all("60 x 60 cells are fewer than" in line for line in result.errors)
 
 
 def test_second_configuration_replaces_rows_of_first(run, flexroad, quick_config, tmp_path):
@@ -458,7 +459,7 @@ def test_second_configuration_replaces_rows_of_first(run, flexroad, quick_config
 
 @pytest.fixture
 def mount(tmp_path):
-    """Mount a small file system of one's own; unmounted at the end."""
+    """Function that mounts a temporary file system with given options; unmounted after the test."""
     place = tmp_path / "disk"
     place.mkdir()
 
@@ -480,10 +481,10 @@ def mount(tmp_path):
 @pytest.mark.parametrize("size", ["100k", "300k"])
 def test_full_disk_fails_tiles_until_there_is_space(size, mount, run, flexroad, tmp_path):
     out = mount(f"size={size}") / "run"
-    said = run(out=out)
-    assert said.code == 1
-    assert len({line.split(":")[0] for line in said.errors}) == len(said.errors) > 0
-    assert all(f"No space left on device: '{out}/" in line for line in said.errors)
+    result = run(out=out)
+    assert result.code == 1
+    assert len({line.split(":")[0] for line in result.errors}) == len(result.errors) > 0
+    assert all(f"No space left on device: '{out}/" in line for line in result.errors)
     assert not list(out.rglob("*.tmp"))
     subprocess.run(["mount", "-o", "remount,size=20m", out.parent], check=True)
     again = flexroad("rerun", out, "--executor", "serial")
@@ -502,33 +503,33 @@ def test_read_only_disk_allows_only_reading(mount, run, flexroad, survey, tmp_pa
         artefact.unlink()
     subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
     for out in (disk / "run", disk / "other"):
-        said = run(out=out)
-        assert said.code == 2
-        (line,) = said.errors
+        result = run(out=out)
+        assert result.code == 2
+        (line,) = result.errors
         assert f"cannot write the run to {out}" in line
         assert "Read-only file system" in line
     assert "4 done" in flexroad("status", disk / "run").out
     assert tile.id in flexroad("query", disk / "run", "--points", points).out
-    said = flexroad("report", disk / "run")
-    assert said.code == 2
-    assert "Read-only file system" in said.errors[0]
-    said = flexroad("catalog", "synthetic", "-o", disk / "scenes", "--tiles", 1)
-    assert (said.code, len(said.errors)) == (2, 1)
+    result = flexroad("report", disk / "run")
+    assert result.code == 2
+    assert "Read-only file system" in result.errors[0]
+    result = flexroad("catalog", "synthetic", "-o", disk / "scenes", "--tiles", 1)
+    assert (result.code, len(result.errors)) == (2, 1)
 
 
 def test_output_path_that_is_a_file_is_refused(run, flexroad, survey, tmp_path):
     (tmp_path / "file").write_text("mine")
     folder = survey.parent
-    into = ["catalog", "rasters", folder, "--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", 60, "-o"]
-    for said in (
+    rasters = ["catalog", "rasters", folder, "--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", 60, "-o"]
+    for result in (
         run(out=tmp_path / "file"),
         run(out=tmp_path / "file" / "run"),
         run("--store", tmp_path / "file"),
         flexroad("catalog", "synthetic", "-o", tmp_path / "file"),
-        flexroad(*into, tmp_path / "file" / "c.json"),
+        flexroad(*rasters, tmp_path / "file" / "c.json"),
     ):
-        assert said.code == 2
-        (line,) = said.errors
+        assert result.code == 2
+        (line,) = result.errors
         assert str(tmp_path / "file") in line
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -547,35 +548,35 @@ def test_output_path_that_is_a_file_is_refused(run, flexroad, survey, tmp_path):
 def test_unreadable_catalog_is_refused(content, message, run, survey):
     survey.unlink()
     survey.mkdir() if content is None else survey.write_bytes(content)
-    said = run()
-    assert said.code == 2
-    (line,) = said.errors
+    result = run()
+    assert result.code == 2
+    (line,) = result.errors
     assert str(survey) in line
     assert message in line
 
 
 @pytest.mark.parametrize("size", ["0", "-5", "nan", "inf", "33.3"])
 def test_invalid_tile_size_is_refused(size, flexroad, survey, tmp_path):
-    words = ["--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", size, "-o", tmp_path / "c.json"]
-    said = flexroad("catalog", "rasters", survey.parent, *words)
-    assert said.code == 2
-    assert len(said.errors) == 1
+    arguments = ["--dsm", "dsm/*", "--dtm", "dtm/*", "--tile-size", size, "-o", tmp_path / "c.json"]
+    result = flexroad("catalog", "rasters", survey.parent, *arguments)
+    assert result.code == 2
+    assert len(result.errors) == 1
 
 
 def test_catalog_with_moved_files_is_refused(run, flexroad, survey, tmp_path):
     (survey.parent / "dsm").rename(tmp_path / "elsewhere")
-    said = run()
-    assert said.code == 2
+    result = run()
+    assert result.code == 2
     assert re.search(
-        r"each of the 4 tiles lacks a file, for example tile \d+_\d+: .*dsm/\d+_\d+.tif;", said.err
+        r"each of the 4 tiles lacks a file, for example tile \d+_\d+: .*dsm/\d+_\d+.tif;", result.err
     )
     (tmp_path / "elsewhere").rename(survey.parent / "dsm")
-    mended = flexroad("rerun", tmp_path / "run", "--executor", "serial")
-    assert mended.code == 0
-    assert "4 tiles: 4 done" in mended.out
+    repaired = flexroad("rerun", tmp_path / "run", "--executor", "serial")
+    assert repaired.code == 0
+    assert "4 tiles: 4 done" in repaired.out
 
 
-# --- the life of a run --------------------------------------------------------------------------------
+# --- changed and damaged runs -------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -617,9 +618,9 @@ def test_deleted_store_keeps_finished_results(run, flexroad, survey, tmp_path):
 def test_relative_paths_work_from_other_folder(flexroad, survey, quick_config, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = ["--catalog", "survey/catalog.parquet", "--out", "my runs/1", "--store", "shared", "--executor"]
-    said = flexroad("run", "--config", "quick.yaml", *run, "serial")
-    assert said.code == 0
-    assert "next: flexroad report 'my runs/1' --format html" in said.out
+    result = flexroad("run", "--config", "quick.yaml", *run, "serial")
+    assert result.code == 0
+    assert "next: flexroad report 'my runs/1' --format html" in result.out
     (tmp_path / "away").mkdir()
     monkeypatch.chdir(tmp_path / "away")
     again = flexroad("rerun", "../my runs/1", "--from", "sample", "--executor", "serial")
@@ -648,42 +649,42 @@ def test_damaged_run_is_reported_and_repaired(
     out = shutil.copytree(finished, tmp_path / "run")
     for path in list(out.glob(name)):
         path.unlink() if content is None else path.write_text(content)
-    said = flexroad("status", out)
-    assert said.code == status
-    assert message in said.out + said.err
+    result = flexroad("status", out)
+    assert result.code == status
+    assert message in result.out + result.err
     report = flexroad("report", out)
     assert report.code == (2 if name == "metrics.parquet" else status)
-    mended = run(catalog=made_survey / "catalog.parquet")
-    assert mended.code == 0
-    assert "4 tiles: 4 done" in mended.out
+    repaired = run(catalog=made_survey / "catalog.parquet")
+    assert repaired.code == 0
+    assert "4 tiles: 4 done" in repaired.out
     assert flexroad("report", out).code == 0
 
 
 @pytest.mark.slow
 def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
-    words = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
-    words += ["--store", tmp_path / "store"]
-    call = [*PROCESS, "run", *map(str, words), "--out"]
+    arguments = ["--executor", "serial", "--config", quick_config, "--catalog", survey]
+    arguments += ["--store", tmp_path / "store"]
+    call = [*PROCESS, "run", *map(str, arguments), "--out"]
     both = [
         subprocess.Popen(
             [*call, tmp_path / name], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
         )
         for name in "ab"
     ]
-    said = [process.communicate()[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], said
-    # A slow one tells of its progress there, too.
-    assert [error_lines(text) for text in said] == [[], []]
+    stderr = [process.communicate()[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], stderr
+    # The standard error of a slow run also has progress lines.
+    assert [error_lines(text) for text in stderr] == [[], []]
     tables = [read_metrics(tmp_path / name).drop(columns="seconds") for name in "ab"]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
     assert not list(tmp_path.rglob("*.tmp"))
 
 
-# --- slips of the pen ---------------------------------------------------------------------------------
+# --- invalid arguments --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("command", "message"),
     [
         ("stat RUN", "No such command 'stat'"),
         ("status", "Missing argument 'RUN'"),
@@ -703,11 +704,11 @@ def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
         ("catalog rasters SURVEY --dsm dsm/* --dtm dtm/* -o X.txt --tile-size 60", "ends in .parquet, .json"),
     ],
 )
-def test_invalid_arguments_give_one_error(words, message, slips_at, flexroad):
-    said = flexroad(*[slips_at.get(word, word) for word in words.split()])
-    assert said.code == 2
-    assert message in said.err
-    assert len([line for line in said.err.splitlines() if "rror: " in line]) == 1
+def test_invalid_arguments_give_one_error(command, message, argument_paths, flexroad):
+    result = flexroad(*[argument_paths.get(word, word) for word in command.split()])
+    assert result.code == 2
+    assert message in result.err
+    assert len([line for line in result.err.splitlines() if "rror: " in line]) == 1
 
 
 def test_query_points_outside_run_gives_note(run, flexroad, survey, tmp_path):
@@ -715,16 +716,16 @@ def test_query_points_outside_run_gives_note(run, flexroad, survey, tmp_path):
     points = tmp_path / "points.csv"
     points.write_text(f"easting,northing\n{grid.west + 9},{grid.south + 9}\n7.1,50.2\n,\ninf,0\n")
     run()
-    said = flexroad("query", tmp_path / "run", "--points", points)
-    assert said.code == 0
-    assert said.err == "note: 3 points lie on no finished tile; their columns are empty\n"
-    table = pd.read_csv(io.StringIO(said.out))
+    result = flexroad("query", tmp_path / "run", "--points", points)
+    assert result.code == 0
+    assert result.err == "note: 3 points lie on no finished tile; their columns are empty\n"
+    table = pd.read_csv(io.StringIO(result.out))
     assert list(table.height_m.isna()) == [False, True, True, True]
 
 
 @pytest.fixture(scope="module")
 def finished(made_survey, tmp_path_factory) -> Path:
-    """A whole run, not to be touched."""
+    """The folder of a finished run, which tests must not change."""
     out = tmp_path_factory.mktemp("finished") / "run"
     made = Run.create(out, compose(QUICK, "quick"), Catalog.read(made_survey / "catalog.parquet"))
     run_tiles(made, SerialExecutor())
@@ -732,7 +733,8 @@ def finished(made_survey, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def slips_at(made_survey, finished, tmp_path_factory):
+def argument_paths(made_survey, finished, tmp_path_factory):
+    """Paths by their placeholder in the tested commands."""
     folder = tmp_path_factory.mktemp("slips")
     (folder / "p.csv").write_text("x,y\n1,2\n")
     return {

@@ -62,7 +62,7 @@ def test_tables_contain_only_current_tiles(full):
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "damage",
     [
         lambda data: b"",
         lambda data: b"no database",
@@ -72,8 +72,8 @@ def test_tables_contain_only_current_tiles(full):
     ],
     ids=["empty", "of another kind", "cut off", "overwritten", "of another version"],
 )
-def test_open_damaged_database_starts_empty(spoil, full):
-    full.write_bytes(spoil(full.read_bytes()))
+def test_open_damaged_database_starts_empty(damage, full):
+    full.write_bytes(damage(full.read_bytes()))
     with RunDatabase.open(full) as database:
         assert not database.counts()
         assert database.get(TILES[0]) is None
