@@ -20,7 +20,7 @@ import numpy as np
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.tasks import load
 from flexroad.tasks.acquire.points import to_rasters
@@ -94,7 +94,7 @@ def autzen(home: Path, scratch: Path) -> Iterator[Case]:
     made = prepare_points(
         [home / "autzen_north.laz"],
         scratch,
-        Asked(crs="EPSG:2994"),
+        PrepareOptions(crs="EPSG:2994"),
         to_rasters.Options(),
         SerialExecutor(),
         lambda _: None,

@@ -75,8 +75,8 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
 
 
 def _write_scene(job: _Job) -> str:
-    from flexroad.pipeline.prepare.asked import Asked
-    from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+    from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
+    from flexroad.pipeline.prepare.options import PrepareOptions
 
     scene = photogrammetry(job.place, job.seed)
     home = Path(job.folder) / scene.name
@@ -90,8 +90,8 @@ def _write_scene(job: _Job) -> str:
     prepared.write_tile(home / KNOWN, scene.name, truth.grid, known, truth.stratum, MADE, name)
     write(home / "mesh.glb", glb.encode(scene.mesh))
     roads = home / KNOWN / "road_mask" / f"{scene.name}.tif"
-    asked = Asked(roads=roads, date=MADE, dataset=name)
-    prepare_mesh(home / "mesh.glb", home, asked, MeshAsked(), POINTS, SerialExecutor(), lambda _: None)
+    options = PrepareOptions(roads=roads, date=MADE, dataset=name)
+    prepare_mesh(home / "mesh.glb", home, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
     return ""
 
 

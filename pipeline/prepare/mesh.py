@@ -1,4 +1,4 @@
-"""``prepare mesh``: the rasters of a textured mesh, by way of points like those of a laser scanner."""
+"""``flexroad prepare mesh``: rasters of a textured mesh, from points sampled on its surface."""
 
 from __future__ import annotations
 
@@ -13,11 +13,19 @@ from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.prepare.asked import Asked
-from flexroad.pipeline.prepare.blocks import fill, sheet_grid
+from flexroad.pipeline.prepare.blockwise import output_grid, write_blocks
+from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.point_buckets import (
+    PER_METRE,
+    RECORD,
+    BlockIndex,
+    BucketedPoints,
+    PointBuckets,
+    block_edge,
+    disk_errors,
+)
+from flexroad.pipeline.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads
-from flexroad.pipeline.prepare.sheet import GROUND, Published, Sheet
-from flexroad.pipeline.prepare.spool import PER_METRE, RECORD, Blocks, Place, Spooled, edge_for, room
 from flexroad.tasks.acquire.mesh import reference
 from flexroad.tasks.acquire.mesh.georeference import Offset
 from flexroad.tasks.acquire.mesh.read import read_mesh
@@ -25,23 +33,23 @@ from flexroad.tasks.acquire.mesh.sample import TexturedMesh, in_metres, orthopho
 from flexroad.tasks.acquire.points import to_rasters
 
 BAND = 1024
-"""Rows of the orthophoto drawn at a time: memory does not grow with the area."""
+"""Rows of the orthophoto drawn at a time, so that memory does not grow with the area."""
 POINTS = to_rasters.Options(ground="filter")
-"""A mesh has no classes."""
+"""Default options for points of a mesh: they have no classes, so the ground filter is used."""
 
 
 @dataclass(frozen=True)
-class MeshAsked:
-    """The options of ``prepare mesh`` alone."""
+class MeshOptions:
+    """The options that only ``prepare mesh`` has."""
 
     up: Literal["y", "z"] | None = None
     """The file's upward axis; by default y in glTF and z elsewhere."""
     offset: Offset | None = None
-    """Easting, northing and height of the mesh's zero; by default that of the sidecar."""
+    """Easting, northing and height of the mesh's origin; by default read from the sidecar file."""
     density: float = 25.0
-    """Points per m2 of surface."""
+    """Sampled points per m2 of surface."""
     seed: int = 0
-    """Of the points' places."""
+    """Random seed of the sampling."""
     dop: bool = True
     """Whether an orthophoto is drawn."""
     refine: bool = True
@@ -51,122 +59,132 @@ class MeshAsked:
 def prepare_mesh(
     path: Path,
     out: Path,
-    asked: Asked,
-    mesh_asked: MeshAsked,
+    common: PrepareOptions,
+    mesh_options: MeshOptions,
     options: to_rasters.Options,
     executor: Executor,
-    say: Callable[[str], None],
-) -> Published:
-    """Make rasters and catalog of a mesh file.
+    log: Callable[[str], None],
+) -> PreparedDataset:
+    """Make the rasters and the catalog of an area from a mesh file.
 
     Parameters
     ----------
     path : Path
-        OBJ, PLY or glTF; see `tasks.acquire.mesh.read.read_mesh` for colours and place.
+        OBJ, PLY or glTF; see `tasks.acquire.mesh.read.read_mesh` for colours and georeference.
     out : Path
-        Folder to publish in.
-    asked, mesh_asked : Asked, MeshAsked
-        What the user wants.
+        Output folder.
+    common : PrepareOptions
+        Options shared by all commands.
+    mesh_options : MeshOptions
+        Options of meshes.
     options : to_rasters.Options
         How points become rasters.
     executor : Executor
-        Where blocks are worked on.
-    say : callable
-        Told what is going on.
+        Runs the blocks.
+    log : callable
+        Called with lines of progress.
 
     Raises
     ------
     TaskError, CatalogError, ConfigError
-        If the mesh or the roads cannot be used, or the folder not be written; nothing is left behind.
+        If the mesh or the roads cannot be used, or the folder cannot be written; no files are left behind.
     """
-    say(f"reading {path}")
-    mesh = read_mesh(path, mesh_asked.up, asked.crs, mesh_asked.offset, colours=mesh_asked.dop)
-    return publish_mesh(mesh, path.name, out, asked, mesh_asked, options, executor, say)
+    log(f"reading {path}")
+    mesh = read_mesh(path, mesh_options.up, common.crs, mesh_options.offset, colours=mesh_options.dop)
+    return publish_mesh(mesh, path.name, out, common, mesh_options, options, executor, log)
 
 
 def publish_mesh(
     mesh: TexturedMesh,
     name: str,
     out: Path,
-    asked: Asked,
-    mesh_asked: MeshAsked,
+    common: PrepareOptions,
+    mesh_options: MeshOptions,
     options: to_rasters.Options,
     executor: Executor,
-    say: Callable[[str], None],
-) -> Published:
-    """Make rasters and catalog of a mesh in memory, called by its source's name; see `prepare_mesh`."""
-    frame = MetricTransform.of(mesh.crs, mesh.bounds[:2], asked.to_crs, asked.height_unit)
+    log: Callable[[str], None],
+) -> PreparedDataset:
+    """Make the rasters and the catalog of a mesh in memory; ``name`` is its source. See `prepare_mesh`."""
+    frame = MetricTransform.of(mesh.crs, mesh.bounds[:2], common.to_crs, common.height_unit)
     mesh = in_metres(mesh, frame)
-    grid = sheet_grid(mesh.bounds, frame.target, asked.cell_m, asked.step_m)
-    dop_cell = asked.dop_cell_m if mesh_asked.dop else None
-    say(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
-    with Sheet(out, grid, dop_cell, _facts(name, mesh_asked, options)) as sheet:
-        masked = add_roads(sheet, asked)
-        if masked:
-            sheet.facts["REFERENCE"] = (
+    grid = output_grid(mesh.bounds, frame.target, common.cell_m, common.step_m)
+    dop_cell = common.dop_cell_m if mesh_options.dop else None
+    log(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
+    with RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options)) as writer:
+        has_mask = add_roads(writer, common)
+        if has_mask:
+            writer.tags["REFERENCE"] = (
                 f"DSM on the road mask that ECSRC keeps, DTM elsewhere: {reference.CIRCULAR}"
             )
-        fill(sheet, _spooled(sheet, mesh, mesh_asked, options, asked.step_m), options, executor, say)
-        if mesh_asked.refine:
-            say("refining the terrain")
-            dtm, ground = sheet.read("dtm", grid), sheet.read(GROUND, grid)
+        write_blocks(
+            writer, _sample_points(writer, mesh, mesh_options, options, common.step_m), options, executor, log
+        )
+        if mesh_options.refine:
+            log("refining the terrain")
+            dtm, ground = writer.read("dtm", grid), writer.read(GROUND, grid)
             dtm = reference.refine(dtm, ground, grid, options.void_m)
-            sheet.write("dtm", grid, dtm)
-        if mesh_asked.dop:
-            say("drawing the orthophoto")
-            _draw(sheet, mesh)
-        dataset = asked.dataset or name
-        if masked:
-            _refer(sheet)
+            writer.write("dtm", grid, dtm)
+        if mesh_options.dop:
+            log("drawing the orthophoto")
+            _draw_photo(writer, mesh)
+        dataset = common.dataset or name
+        if has_mask:
+            _write_reference(writer)
             dataset = f"{dataset}; {reference.CIRCULAR}"
-        published = sheet.publish(asked.tile_size_m, asked.date, dataset)
-    return published.noting(*mesh.notes, *frame.notes)
+        published = writer.publish(common.tile_size_m, common.date, dataset)
+    return published.with_notes(*mesh.notes, *frame.notes)
 
 
-def _facts(name: str, mesh_asked: MeshAsked, options: to_rasters.Options) -> dict[str, str]:
-    made = to_rasters.facts(options)
-    facts = {
-        "SOURCE": f"{name}; {mesh_asked.density:g} points per m2 of surface, seed {mesh_asked.seed}",
-        "DSM": made["DSM"],
-        "DTM": made["DTM"] + ("; refined by ECSRC" if mesh_asked.refine else ""),
+def _tags(name: str, mesh_options: MeshOptions, options: to_rasters.Options) -> dict[str, str]:
+    by_layer = to_rasters.tags(options)
+    tags = {
+        "SOURCE": f"{name}; {mesh_options.density:g} points per m2 of surface, seed {mesh_options.seed}",
+        "DSM": by_layer["DSM"],
+        "DTM": by_layer["DTM"] + ("; refined by ECSRC" if mesh_options.refine else ""),
     }
-    if mesh_asked.dop:
-        facts["DOP"] = "texture of the highest surface, from straight above"
-    return facts
+    if mesh_options.dop:
+        tags["DOP"] = "texture of the highest surface, from straight above"
+    return tags
 
 
-def _spooled(
-    sheet: Sheet, mesh: TexturedMesh, mesh_asked: MeshAsked, options: to_rasters.Options, step: float
-) -> Spooled:
-    """Put points of the mesh into blocks on disk."""
-    area = sheet.grid.width * sheet.grid.height * sheet.grid.cell**2
-    reach = to_rasters.reach_m(options, sheet.grid.cell)
-    edge = edge_for(mesh_asked.density * mesh.area, area, reach, step)
-    blocks, places = Blocks(sheet.scratch / "points", edge), set[Place]()
-    with room(sheet.out):
-        blocks.folder.mkdir()
-        for part in sample(mesh, mesh_asked.density, mesh_asked.seed):
+def _sample_points(
+    writer: RasterWriter,
+    mesh: TexturedMesh,
+    mesh_options: MeshOptions,
+    options: to_rasters.Options,
+    step: float,
+) -> BucketedPoints:
+    """Sample points on the mesh and sort them into buckets on disk."""
+    area = writer.grid.width * writer.grid.height * writer.grid.cell**2
+    reach = to_rasters.reach_m(options, writer.grid.cell)
+    edge = block_edge(mesh_options.density * mesh.area, area, reach, step)
+    buckets, occupied = PointBuckets(writer.scratch / "points", edge), set[BlockIndex]()
+    with disk_errors(writer.out):
+        buckets.folder.mkdir()
+        for part in sample(mesh, mesh_options.density, mesh_options.seed):
             easting, northing, height = (
                 np.rint(axis * PER_METRE).astype(np.int64)
                 for axis in (part.easting, part.northing, part.height)
             )
             records = np.zeros(len(part), RECORD)
             records["height"] = height
-            places |= blocks.append(easting, northing, records)
-    return Spooled(blocks, frozenset(places), mesh.bounds, (), (), 0)
+            occupied |= buckets.append(easting, northing, records)
+    return BucketedPoints(buckets, frozenset(occupied), mesh.bounds, (), (), 0)
 
 
-def _draw(sheet: Sheet, mesh: TexturedMesh) -> None:
-    whole = sheet.photo_grid
+def _draw_photo(writer: RasterWriter, mesh: TexturedMesh) -> None:
+    whole = writer.photo_grid
     assert whole is not None
     for row in range(0, whole.height, BAND):
         rows = min(BAND, whole.height - row)
         north = whole.north - row * whole.cell
-        sheet.write_photo(orthophoto(mesh, Grid(whole.crs, whole.west, north, whole.cell, whole.width, rows)))
+        writer.write_photo(
+            orthophoto(mesh, Grid(whole.crs, whole.west, north, whole.cell, whole.width, rows))
+        )
 
 
-def _refer(sheet: Sheet) -> None:
-    dsm, dtm, road = (sheet.read(layer, sheet.grid) for layer in ("dsm", "dtm", "road_mask"))
-    heights, kept = reference.reference(dsm, dtm, road, sheet.grid)
-    sheet.write("reference", sheet.grid, heights)
-    sheet.write("reference_road", sheet.grid, kept)
+def _write_reference(writer: RasterWriter) -> None:
+    dsm, dtm, road = (writer.read(layer, writer.grid) for layer in ("dsm", "dtm", "road_mask"))
+    heights, kept = reference.reference(dsm, dtm, road, writer.grid)
+    writer.write("reference", writer.grid, heights)
+    writer.write("reference_road", writer.grid, kept)

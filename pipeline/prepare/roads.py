@@ -1,6 +1,6 @@
-"""Roads that the user has, as a mask: polygons of any vector file, a raster, or a mesh seen from above.
+"""Road masks from the user's own road data: polygons of a vector file, a raster, or a mesh.
 
-Lines have no width of their own: they go into the catalog as they are, for ``segment: vector``.
+Lines have no width, so they make no mask: the file is entered in the catalog, for ``segment: vector``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.headers.vectors import VectorFile, opened
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.prepare.asked import Asked
-from flexroad.pipeline.prepare.sheet import Sheet
+from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 
@@ -30,43 +30,43 @@ AREAS = ("Polygon", "MultiPolygon")
 LINES = ("LineString", "MultiLineString")
 
 
-def add_roads(sheet: Sheet, asked: Asked) -> bool:
-    """Write the road mask of a sheet, if roads were given, and name them in its catalog if they are vectors.
+def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
+    """Write the road mask, if roads were given; a vector file of roads is entered in the catalog, too.
 
     Returns
     -------
     bool
-        Whether there is a road mask now: not without roads, nor from lines.
+        Whether a road mask was written: False without roads, and for lines.
 
     Raises
     ------
     ConfigError
-        If the roads cannot be read, or none lies on the sheet.
+        If the roads cannot be read, or none is on the writer's grid.
     """
-    if asked.roads is None:
+    if common.roads is None:
         return False
-    mask = burn(asked.roads, asked.roads_layer, asked.roads_where, sheet.grid)
+    mask = burn(common.roads, common.roads_layer, common.roads_where, writer.grid)
     if mask is not None:
-        sheet.write("road_mask", sheet.grid, mask)
-    vectors = _vectors(asked.roads)
+        writer.write("road_mask", writer.grid, mask)
+    vectors = _vectors(common.roads)
     if vectors is not None:
-        sheet.attach_roads(vectors, *([] if mask is not None else [_of_lines(asked)]))
+        writer.attach_roads(vectors, *([] if mask is not None else [_lines_note(common)]))
     return mask is not None
 
 
 def _vectors(path: Path) -> VectorFile | None:
-    """Return what a vector file tells, or None if it is none."""
+    """Return the header of a vector file, or None if the file is not a vector file."""
     try:
         return opened(path, None)
     except CatalogError:
         return None
 
 
-def _of_lines(asked: Asked) -> str:
-    told = {"layer": asked.roads_layer, "where": asked.roads_where}
-    chosen = "".join(f", {name}: {json.dumps(text)}" for name, text in told.items() if text)
+def _lines_note(common: PrepareOptions) -> str:
+    selection = {"layer": common.roads_layer, "where": common.roads_where}
+    chosen = "".join(f", {name}: {json.dumps(text)}" for name, text in selection.items() if text)
     return (
-        f"{asked.roads} holds lines, so there is no road mask; run with a configuration that has "
+        f"{common.roads} has lines, so no road mask is made; run with a configuration that has "
         f"segment: {{method: vector{chosen}}}"
     )
 
@@ -79,9 +79,9 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools 
     path : Path
         Polygons in any format GDAL reads; a raster that is not 0 on roads; or a mesh of the roads.
     layer : str, optional
-        Layer of a vector file with several.
+        Layer of a vector file; required if it has several.
     where : str, optional
-        Which features, in SQL: ``class = 'road'``.
+        SQL condition that selects features: ``class = 'road'``.
     grid : Grid
         The cells.
 
@@ -99,14 +99,14 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools 
             return None
         mask = cells(features.geometry.to_numpy(), grid)
     if not mask.any():
-        raise _elsewhere(path, grid)
+        raise _no_overlap(path, grid)
     return mask
 
 
-def _elsewhere(path: Path, grid: Grid) -> ConfigError:
+def _no_overlap(path: Path, grid: Grid) -> ConfigError:
     bounds = ", ".join(f"{edge:.0f}" for edge in grid.bounds)
     return ConfigError(
-        f"no road of {path} lies in the area ({bounds} in {short(grid.crs)}); check the CRS of both"
+        f"no road of {path} is in the area ({bounds} in {short(grid.crs)}); check the CRS of both"
     )
 
 
@@ -144,22 +144,22 @@ def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> A
     """Return the polygons of a vector file in the grid's CRS, or None if it holds lines."""
     vectors = _vectors(path)
     if vectors is not None and vectors.extents is None and layer is None:
-        # OSM's own format, which holds roads mostly as lines, is too much to be read for a look.
+        # OSM's own format has roads as lines, mostly; reading the whole file to check that would be slow.
         return None
     features = _read(path, layer, where)
     if features.crs is None:
-        raise ConfigError(f"{path} carries no CRS; give it one, e.g. ogr2ogr -a_srs {short(grid.crs)}")
+        raise ConfigError(f"{path} has no CRS; assign one, e.g. ogr2ogr -a_srs {short(grid.crs)}")
     features = features[~(features.geometry.isna() | features.geometry.is_empty)].to_crs(grid.crs)
     kinds = sorted(set(features.geom_type) - {*AREAS, *LINES})
     if kinds:
         raise ConfigError(
-            f"{path} holds {kinds[0]}s where polygons or lines of roads are wanted; give their layer with "
-            "--roads-layer, or choose them with --roads-where"
+            f"{path} has {kinds[0]}s, but roads must be polygons or lines; select a layer with "
+            "--roads-layer, or features with --roads-where"
         )
     if not set(features.geom_type) & set(LINES):
         return features
     if not features.intersects(shapely.box(*grid.bounds)).any():
-        raise _elsewhere(path, grid)
+        raise _no_overlap(path, grid)
     return None
 
 
@@ -171,15 +171,15 @@ def _read(path: Path, layer: str | None, where: str | None) -> Any:
     try:
         names = list(list_layers(path)[:, 0])
         if layer is None and len(names) > 1:
-            raise ConfigError(f"{path} has several layers: {', '.join(names)}; name one with --roads-layer")
+            raise ConfigError(f"{path} has several layers: {', '.join(names)}; select one with --roads-layer")
         if layer is not None and layer not in names:
-            raise ConfigError(f"{path} has no layer {layer!r}; there are {', '.join(names)}")
-        found = geopandas.read_file(path, layer=layer or names[0], where=where)
+            raise ConfigError(f"{path} has no layer {layer!r}; its layers: {', '.join(names)}")
+        features = geopandas.read_file(path, layer=layer or names[0], where=where)
     except (DataSourceError, DataLayerError, ValueError) as error:
         raise ConfigError(
-            f"--roads {path} cannot be read as polygons, raster or mesh: {error}; check --roads-where, too"
+            f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"
         ) from error
-    if found.empty:
-        chosen = f" where {where}" if where else ""
-        raise ConfigError(f"{path} has no feature{chosen} in layer {layer or names[0]!r}")
-    return found
+    if features.empty:
+        condition = f" where {where}" if where else ""
+        raise ConfigError(f"{path} has no feature{condition} in layer {layer or names[0]!r}")
+    return features

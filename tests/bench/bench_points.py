@@ -119,13 +119,13 @@ def decode(task: str, files: list[Path], out: Path) -> None:
 
 def prepare(task: str, files: list[Path], out: Path, cell: float = 1) -> None:
     from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-    from flexroad.pipeline.prepare.asked import Asked
+    from flexroad.pipeline.prepare.options import PrepareOptions
     from flexroad.pipeline.prepare.points import prepare_points
     from flexroad.tasks.acquire.points.to_rasters import Options
 
     executor = DaskExecutor() if task == "dask" else SerialExecutor()
-    asked = Asked(crs="EPSG:2994", cell_m=cell, tile_size_m=500)
-    prepare_points(files, out, asked, Options(), executor, lambda _: None)
+    common = PrepareOptions(crs="EPSG:2994", cell_m=cell, tile_size_m=500)
+    prepare_points(files, out, common, Options(), executor, lambda _: None)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@ import rasterio
 
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare.asked import Asked
-from flexroad.pipeline.prepare.photos import PhotosAsked, prepare_photos
+from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.photos import PhotosOptions, prepare_photos
 from flexroad.tasks.acquire.photos import mvs_cpu, sfm
 from flexroad.tasks.acquire.points import to_rasters
 
@@ -22,8 +22,8 @@ def published(real_data, tmp_path_factory):
     return prepare_photos(
         [real_data / "brighton_beach" / "images"],
         tmp_path_factory.mktemp("brighton"),
-        Asked(cell_m=0.5),
-        PhotosAsked(
+        PrepareOptions(cell_m=0.5),
+        PhotosOptions(
             sfm=sfm.Options(image_size=1400, features=4096, threads=2, calibrate="held"),
             stereo=mvs_cpu.Options(size=800, partners=3),
             refine=False,

@@ -100,7 +100,7 @@ def reach_m(options: Options, cell: float) -> float:
     return farthest if options.despike_m is None else farthest + 2 * cell
 
 
-def facts(options: Options) -> dict[str, str]:
+def tags(options: Options) -> dict[str, str]:
     """Return how the rasters are made, by layer, for the tags of their files."""
     spikes = (
         ""

@@ -112,13 +112,19 @@ def test_both_references_are_what_they_are_called(scene):
 @pytest.mark.slow
 def test_a_scene_s_mesh_can_be_prepared_by_hand(scene, tmp_path):
     from flexroad.pipeline.execute import SerialExecutor
-    from flexroad.pipeline.prepare.asked import Asked
-    from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+    from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
+    from flexroad.pipeline.prepare.options import PrepareOptions
 
     circular, _ = scene
     mesh = Path(circular.root) / circular.id / "mesh.glb"
     published = prepare_mesh(
-        mesh, tmp_path / "out", Asked(), MeshAsked(dop=False), POINTS, SerialExecutor(), lambda _: None
+        mesh,
+        tmp_path / "out",
+        PrepareOptions(),
+        MeshOptions(dop=False),
+        POINTS,
+        SerialExecutor(),
+        lambda _: None,
     )
     (tile,) = Catalog.read(published.catalog).tiles
     assert tile.grid == circular.grid

@@ -1,4 +1,4 @@
-"""``flexroad prepare`` as a user has it: its output, its exit code, its folder."""
+"""``flexroad prepare`` on the command line: output, exit code and output folder."""
 
 import signal
 import subprocess
@@ -16,8 +16,8 @@ WEST, SOUTH = 356_000.0, 5_699_000.0
 
 
 def flexroad(*words, expect=0) -> str:
-    said = call(*words).expected(expect)
-    return said.out + said.err
+    result = call(*words).expected(expect)
+    return result.out + result.err
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +43,13 @@ def roads(tmp_path_factory):
     return path
 
 
-def test_points_to_metrics(cloud, roads, tmp_path):
-    """What it prints leads on: the next command runs as printed."""
+def test_prepare_points_prints_next_command_that_runs(cloud, roads, tmp_path):
     out = tmp_path / "street"
-    said = flexroad(
+    output = flexroad(
         "prepare", "points", cloud, "-o", out, "--roads", roads, "--date", "2024-05-01", "--workers", 1
     )
-    (following,) = (line for line in said.splitlines() if line.startswith("next: "))
-    words = following.removeprefix("next: flexroad ").replace("RUN", str(tmp_path / "run")).split()
+    (next_line,) = (line for line in output.splitlines() if line.startswith("next: "))
+    words = next_line.removeprefix("next: flexroad ").replace("RUN", str(tmp_path / "run")).split()
     assert "1 tiles: 1 done" in flexroad(*words, "--executor", "serial")
     (tile,) = Catalog.read(out / "catalog.parquet").tiles
     assert (tile.dataset, f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == (
@@ -60,7 +59,7 @@ def test_points_to_metrics(cloud, roads, tmp_path):
     )
 
 
-def test_options_reach_the_rasters(cloud, tmp_path):
+def test_prepare_points_options_are_applied(cloud, tmp_path):
     import rasterio
 
     flexroad(
@@ -75,7 +74,7 @@ def test_options_reach_the_rasters(cloud, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["points", "nowhere.laz"], "nowhere.laz"),
         (["points", "CLOUD", "--crs", "EPSG:4"], "EPSG:4"),
@@ -87,21 +86,21 @@ def test_options_reach_the_rasters(cloud, tmp_path):
         (["odm", "nowhere"], "nowhere"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_leaves_nothing(cloud, tmp_path, words, says):
+def test_prepare_invalid_input_is_one_line_and_leaves_no_folder(cloud, tmp_path, words, message):
     words = [cloud if word == "CLOUD" else word for word in words]
-    said = flexroad("prepare", *words, "-o", tmp_path / "out", "--workers", 1, expect=2)
-    (error,) = (line for line in said.splitlines() if line.startswith("error: "))
-    assert says in error
+    output = flexroad("prepare", *words, "-o", tmp_path / "out", "--workers", 1, expect=2)
+    (error,) = (line for line in output.splitlines() if line.startswith("error: "))
+    assert message in error
     assert not (tmp_path / "out").exists()
 
 
-def test_a_typo_is_answered_with_the_right_word(cloud, tmp_path):
+def test_prepare_misspelt_option_suggests_the_right_one(cloud, tmp_path):
     assert "--cell" in flexroad("prepare", "points", cloud, "-o", tmp_path, "--cel", 2, expect=2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_it_leaves_nothing(cloud, tmp_path, how):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     out = tmp_path / "out"
     with subprocess.Popen(
         [*PROCESS, "prepare", "points", str(cloud), "-o", str(out), "--cell", "0.05", "--dop-cell", "0.05"],
@@ -110,8 +109,8 @@ def test_interrupted_it_leaves_nothing(cloud, tmp_path, how):
         while not any(out.glob("*/*")):
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.05)
-        process.send_signal(how)
-        said = process.communicate(timeout=60)
-    assert process.returncode == 130, said
-    assert "nothing was written" in said[1]
+        process.send_signal(number)
+        output = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "nothing was written" in output[1]
     assert not out.exists()

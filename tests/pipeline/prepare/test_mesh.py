@@ -1,4 +1,4 @@
-"""A textured mesh becomes rasters that `run` takes; what cannot be used leaves nothing behind."""
+"""A textured mesh is converted to rasters that `run` can read; invalid input leaves no files."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from PIL import Image
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare.asked import Asked
-from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked, prepare_mesh
+from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
+from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.tasks.acquire.mesh.read import read_mesh
 from flexroad.tasks.acquire.mesh.sample import tops
 from flexroad.tasks.errors import TaskError
@@ -17,16 +17,18 @@ from flexroad.tasks.errors import TaskError
 CRS = "EPSG:32617"
 ZERO = (552_208.0, 4_114_742.0, 0.0)
 SIDE, BOX = 60, (20, 30, 26, 34)
-PLACED = MeshAsked(offset=ZERO)
-ASKED = Asked(crs=CRS, dop_cell_m=0.5)
+PLACED = MeshOptions(offset=ZERO)
+OPTIONS = PrepareOptions(crs=CRS, dop_cell_m=0.5)
 
 
 def ground(x, y):
     return 600 + 0.05 * x + 0.02 * y
 
 
-def prepare(path, out, asked=ASKED, mesh_asked=PLACED, executor=None, options=POINTS):
-    return prepare_mesh(path, out, asked, mesh_asked, options, executor or SerialExecutor(), lambda _: None)
+def prepare(path, out, options=OPTIONS, mesh_options=PLACED, executor=None, points=POINTS):
+    return prepare_mesh(
+        path, out, options, mesh_options, points, executor or SerialExecutor(), lambda _: None
+    )
 
 
 def read(path):
@@ -35,7 +37,7 @@ def read(path):
 
 
 def write(folder, quads, name="m.obj"):
-    """Quads of four corners each, over a texture of red, green in the north and blue in the east."""
+    """Write quads of four corners each, with `texture` as their texture."""
     vertices = [corner for quad in quads for corner in quad]
     lines = ["mtllib m.mtl", *(f"v {x} {y} {z}" for x, y, z in vertices)]
     lines += [f"vt {x / SIDE} {y / SIDE}" for x, y, _ in vertices] + ["usemtl m"]
@@ -48,6 +50,7 @@ def write(folder, quads, name="m.obj"):
 
 
 def texture():
+    """Red, with green in the north and blue in the east."""
     image = np.full((SIDE, SIDE, 3), (200, 0, 0), np.uint8)
     image[:20, :, 1] = 150
     image[:, 40:, 2] = 250
@@ -56,7 +59,7 @@ def texture():
 
 @pytest.fixture
 def box(tmp_path):
-    """A box of 3 m on a slope."""
+    """A box, 3 m high, on a slope."""
     west, south, east, north = BOX
     rim = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE)]
     edge = [(west, south), (east, south), (east, north), (west, north)]
@@ -74,7 +77,7 @@ def roads(tmp_path):
     return tmp_path / "roads.obj"
 
 
-def test_rasters_are_those_of_the_mesh(box, tmp_path, executor):
+def test_prepare_mesh_gives_its_heights_and_colours(box, tmp_path, executor):
     published = prepare(box, tmp_path / "out", executor=executor)
     (tile,) = Catalog.read(published.catalog).tiles
     assert tile.grid == Grid(CRS, ZERO[0], ZERO[1] + SIDE, 1.0, SIDE, SIDE)
@@ -84,30 +87,30 @@ def test_rasters_are_those_of_the_mesh(box, tmp_path, executor):
     on_box = (x > BOX[0]) & (x < BOX[2]) & (y > BOX[1]) & (y < BOX[3])
     assert np.abs(dsm[on_box] - 606).max() < 1e-3
     np.testing.assert_allclose(dtm, np.broadcast_to(ground(x, y), dtm.shape), atol=0.06)
-    # The highest of about 25 points lies between the cell's centre and its highest corner; points of a wall
-    # are of the cell inside or outside.
+    # The highest of about 25 points is between the cell's centre and its highest corner. Points of a wall
+    # are in the cell inside or outside.
     beside = (x > BOX[0] - 1) & (x < BOX[2] + 1) & (y > BOX[1] - 1) & (y < BOX[3] + 1)
     rise = (dsm - ground(x, y))[~beside]
     assert rise.min() > 0
     assert rise.max() < 0.035 + 1e-3
     colour = np.moveaxis(read(tmp_path / "out" / "dop.tif"), 0, -1)[::2, ::2]
-    # Next to a change of colour the texture is read between two texels.
+    # Next to a change of colour the texture is interpolated between two texels.
     rows, cols = np.delete(np.arange(SIDE), [19, 20]), np.delete(np.arange(SIDE), [39, 40])
     assert np.array_equal(colour[np.ix_(rows, cols)], texture()[np.ix_(rows, cols)])
 
 
-def test_blocks_change_nothing(box, tmp_path, monkeypatch):
+def test_prepare_mesh_in_many_blocks_gives_the_same_rasters(box, tmp_path, monkeypatch):
     one = prepare(box, tmp_path / "one").catalog.parent
-    monkeypatch.setattr("flexroad.pipeline.prepare.spool.POINTS_PER_BLOCK", 1)
-    monkeypatch.setattr("flexroad.pipeline.prepare.spool.SHORTEST_EDGE_M", 17)
+    monkeypatch.setattr("flexroad.pipeline.prepare.point_buckets.POINTS_PER_BLOCK", 1)
+    monkeypatch.setattr("flexroad.pipeline.prepare.point_buckets.SHORTEST_EDGE_M", 17)
     many = prepare(box, tmp_path / "many").catalog.parent
     for name in ("dsm.tif", "dtm.tif", "dop.tif"):
         np.testing.assert_allclose(read(one / name), read(many / name), atol=1e-4)
 
 
-def test_the_same_seed_is_the_same_raster(box, tmp_path):
+def test_prepare_mesh_with_same_seed_gives_same_raster(box, tmp_path):
     outs = [
-        prepare(box, tmp_path / str(n), mesh_asked=MeshAsked(offset=ZERO, seed=seed)).catalog.parent
+        prepare(box, tmp_path / str(n), mesh_options=MeshOptions(offset=ZERO, seed=seed)).catalog.parent
         for n, seed in enumerate((3, 3, 4))
     ]
     first, again, other = (read(out / "dsm.tif") for out in outs)
@@ -115,8 +118,8 @@ def test_the_same_seed_is_the_same_raster(box, tmp_path):
     assert not np.array_equal(first, other)
 
 
-def test_with_roads_there_is_the_papers_reference_and_it_says_that_it_is_circular(box, roads, tmp_path):
-    published = prepare(box, tmp_path / "out", Asked(crs=CRS, roads=roads))
+def test_prepare_mesh_with_roads_writes_circular_reference(box, roads, tmp_path):
+    published = prepare(box, tmp_path / "out", PrepareOptions(crs=CRS, roads=roads))
     (tile,) = Catalog.read(published.catalog).tiles
     assert tile.dataset == "m.obj; reference by ECSRC itself (circular)"
     dsm, dtm, reference, road = (
@@ -128,19 +131,19 @@ def test_with_roads_there_is_the_papers_reference_and_it_says_that_it_is_circula
     assert np.array_equal(reference, np.where(truth, dsm, dtm))
 
 
-def test_feet_become_metres(box, tmp_path):
-    asked = Asked(crs="EPSG:2264", tile_size_m=250)
-    placed = MeshAsked(offset=(1_500_000.0, 600_000.0, 0.0))
-    published = prepare(box, tmp_path / "out", asked, placed)
+def test_prepare_mesh_in_feet_gives_metres(box, tmp_path):
+    options = PrepareOptions(crs="EPSG:2264", tile_size_m=250)
+    placed = MeshOptions(offset=(1_500_000.0, 600_000.0, 0.0))
+    published = prepare(box, tmp_path / "out", options, placed)
     (tile,) = Catalog.read(published.catalog).tiles
     west = 1_500_000 * 1200 / 3937
     assert (tile.grid.west, tile.grid.east) == (np.floor(west), np.ceil(west + SIDE * 1200 / 3937))
     assert np.nanmax(read(tmp_path / "out" / "dsm.tif")) == pytest.approx(606 * 1200 / 3937, abs=1e-3)
 
 
-def test_no_orthophoto_on_request(box, tmp_path):
+def test_prepare_mesh_without_dop_writes_no_orthophoto(box, tmp_path):
     (tmp_path / "m.png").unlink()
-    published = prepare(box, tmp_path / "out", mesh_asked=MeshAsked(offset=ZERO, dop=False))
+    published = prepare(box, tmp_path / "out", mesh_options=MeshOptions(offset=ZERO, dop=False))
     assert sorted(path.name for path in published.catalog.parent.iterdir()) == [
         "catalog.parquet",
         "dsm.tif",
@@ -148,45 +151,45 @@ def test_no_orthophoto_on_request(box, tmp_path):
     ]
 
 
-@pytest.mark.parametrize("spoil", ["texture", "crs", "roads", "cells"])
-def test_what_cannot_be_used_leaves_nothing(spoil, box, tmp_path):
-    asked = ASKED
-    if spoil == "texture":
+@pytest.mark.parametrize("invalid", ["texture", "crs", "roads", "cells"])
+def test_prepare_mesh_invalid_input_leaves_no_folder(invalid, box, tmp_path):
+    options = OPTIONS
+    if invalid == "texture":
         (tmp_path / "m.png").unlink()
-    elif spoil == "crs":
-        asked = Asked()
-    elif spoil == "roads":
-        asked = Asked(crs=CRS, roads=tmp_path / "gone.gpkg")
+    elif invalid == "crs":
+        options = PrepareOptions()
+    elif invalid == "roads":
+        options = PrepareOptions(crs=CRS, roads=tmp_path / "gone.gpkg")
     else:
-        asked = Asked(crs=CRS, dop_cell_m=0.3)
+        options = PrepareOptions(crs=CRS, dop_cell_m=0.3)
     with pytest.raises((TaskError, ConfigError)):
-        prepare(box, tmp_path / "out", asked)
+        prepare(box, tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.real
-def test_the_divided_road_of_deepscenario(real_data, tmp_path):
-    """The surface against the highest of a fine look from above; the road against the map's."""
+def test_prepare_mesh_deepscenario_matches_mesh_and_map(real_data, tmp_path):
+    """The DSM is compared with the mesh rendered from above at 0.1 m, the road mask with the map."""
     folder = real_data / "deepscenario"
     path = folder / "textured_mesh" / "textured_mesh.obj"
-    asked = Asked(dop_cell_m=0.25, roads=folder / "map" / "map.obj")
-    published = prepare(path, tmp_path, asked, MeshAsked())
+    options = PrepareOptions(dop_cell_m=0.25, roads=folder / "map" / "map.obj")
+    published = prepare(path, tmp_path, options, MeshOptions())
     (tile,) = Catalog.read(published.catalog).tiles
     assert tile.grid.crs == "EPSG:32617"
     fine = Grid.covering(CRS, tile.grid.bounds, 0.1)
-    seen = tops(read_mesh(path), fine).reshape(tile.grid.height, 10, tile.grid.width, 10)
-    whole = np.isfinite(seen).all(axis=(1, 3))
+    rendered = tops(read_mesh(path), fine).reshape(tile.grid.height, 10, tile.grid.width, 10)
+    whole = np.isfinite(rendered).all(axis=(1, 3))
     assert whole.sum() > 1000
-    off = (seen.max(axis=(1, 3)) - read(tmp_path / "dsm.tif"))[whole]
-    assert np.median(np.abs(off)) < 0.02
-    assert np.abs(off).max() < 0.35
+    difference = (rendered.max(axis=(1, 3)) - read(tmp_path / "dsm.tif"))[whole]
+    assert np.median(np.abs(difference)) < 0.02
+    assert np.abs(difference).max() < 0.35
     road, dsm, dtm = (read(tmp_path / f"{name}.tif") for name in ("reference_road", "dsm", "dtm"))
     on_road = (road != 0) & np.isfinite(dtm)
     assert on_road.sum() > 250
     assert np.median((dsm - dtm)[on_road]) < 0.1
     with rasterio.open(tmp_path / "dop.tif") as photo:
-        colour, known = photo.read().astype(int), photo.dataset_mask() > 0
-    # Asphalt is grey, the brush beside it is not: a photo in a wrong place would not know.
+        colour, valid = photo.read().astype(int), photo.dataset_mask() > 0
+    # Asphalt is grey, the vegetation beside it is not: this detects a displaced orthophoto.
     grey = np.ptp(colour, axis=0)
     wide = np.kron(road, np.ones((4, 4))) != 0
-    assert np.median(grey[wide & known]) < np.median(grey[~wide & known]) / 2
+    assert np.median(grey[wide & valid]) < np.median(grey[~wide & valid]) / 2

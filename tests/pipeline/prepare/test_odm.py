@@ -1,4 +1,4 @@
-"""An OpenDroneMap project as it lies: what it has is brought to the cells, what it lacks is made."""
+"""An OpenDroneMap project: its rasters are resampled to the cells, missing ones are made."""
 
 import numpy as np
 import pyproj
@@ -11,9 +11,9 @@ from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare import odm
-from flexroad.pipeline.prepare.asked import Asked
-from flexroad.pipeline.prepare.mesh import POINTS, MeshAsked
+from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions
 from flexroad.pipeline.prepare.odm import prepare_odm
+from flexroad.pipeline.prepare.options import PrepareOptions
 
 CRS = "EPSG:32615"
 WEST, NORTH, SIDE = 576_000.0, 5_188_040.0, 40
@@ -68,7 +68,7 @@ def dtm(folder):
 
 
 def photo(folder):
-    """Red grows to the east, green to the north; the south-west corner is empty and black."""
+    """Red increases to the east, green to the north; the south-west corner is transparent and black."""
     x, y = centres(PIXEL)
     bands = np.zeros((4, *np.broadcast_shapes(x.shape, y.shape)), np.uint8)
     bands[0], bands[1], bands[2], bands[3] = 6 * x, 6 * y, 90, 255
@@ -78,8 +78,8 @@ def photo(folder):
 
 def model(folder):
     """A textured model in the project's local frame."""
-    at = folder / odm.MESHES[0]
-    at.parent.mkdir(parents=True)
+    path = folder / odm.MESHES[0]
+    path.parent.mkdir(parents=True)
     corners = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE)]
     lines = ["mtllib m.mtl", *(f"v {x} {y} {ground(x, y)}" for x, y in corners)]
     lines += [f"vt {x / SIDE} {y / SIDE}" for x, y in corners] + [
@@ -87,9 +87,9 @@ def model(folder):
         "f 1/1 2/2 3/3",
         "f 1/1 3/3 4/4",
     ]
-    at.write_text("\n".join(lines) + "\n")
-    (at.parent / "m.mtl").write_text("newmtl m\nmap_Kd m.png\n")
-    Image.new("RGB", (8, 8), (10, 200, 30)).save(at.parent / "m.png")
+    path.write_text("\n".join(lines) + "\n")
+    (path.parent / "m.mtl").write_text("newmtl m\nmap_Kd m.png\n")
+    Image.new("RGB", (8, 8), (10, 200, 30)).save(path.parent / "m.png")
     coords = folder / "odm_georeferencing" / "coords.txt"
     coords.parent.mkdir()
     coords.write_text(f"WGS84 UTM 15N\n{WEST:.0f} {NORTH - SIDE:.0f}\n12.5 3.25 350.0\n")
@@ -117,9 +117,9 @@ def project(tmp_path, *makers):
     return folder
 
 
-def prepare(folder, out, asked=None):
-    asked = asked or Asked()
-    return prepare_odm(folder, out, asked, MeshAsked(), POINTS, SerialExecutor(), lambda _: None)
+def prepare(folder, out, options=None):
+    options = options or PrepareOptions()
+    return prepare_odm(folder, out, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
 
 
 def read(path):
@@ -127,7 +127,7 @@ def read(path):
         return raster.read().squeeze()
 
 
-def test_rasters_are_taken_as_they_lie(tmp_path):
+def test_prepare_odm_uses_the_rasters_of_the_project(tmp_path):
     published = prepare(project(tmp_path, dsm, dtm, photo), tmp_path / "out")
     (tile,) = Catalog.read(published.catalog).tiles
     assert (tile.grid.west, tile.grid.north, tile.grid.shape) == (WEST, NORTH, (SIDE, SIDE))
@@ -142,15 +142,15 @@ def test_rasters_are_taken_as_they_lie(tmp_path):
     np.testing.assert_allclose(read(tmp_path / "out" / "dsm.tif"), truth, atol=1e-4)
     x, y = centres(1.0)
     np.testing.assert_allclose(read(tmp_path / "out" / "dtm.tif"), ground(x, y) - 0.125, atol=1e-3)
-    with rasterio.open(tmp_path / "out" / "dop.tif") as made:
-        colour, known = made.read(), made.dataset_mask() > 0
+    with rasterio.open(tmp_path / "out" / "dop.tif") as dop:
+        colour, valid = dop.read(), dop.dataset_mask() > 0
     x, y = centres(0.5)
-    assert np.array_equal(known, ~((x < 10) & (y < 10)))
+    assert np.array_equal(valid, ~((x < 10) & (y < 10)))
     for band, truth in ((0, 6 * x), (1, 6 * y), (2, 90)):
-        assert np.abs(colour[band] - np.broadcast_to(truth, known.shape))[known].max() <= 1
+        assert np.abs(colour[band] - np.broadcast_to(truth, valid.shape))[valid].max() <= 1
 
 
-def test_windows_make_no_seams(tmp_path, monkeypatch):
+def test_prepare_odm_in_many_windows_gives_the_same_rasters(tmp_path, monkeypatch):
     folder = project(tmp_path, dsm, photo)
     whole = prepare(folder, tmp_path / "whole").catalog.parent
     monkeypatch.setattr(odm, "BLOCK", 16)
@@ -159,36 +159,36 @@ def test_windows_make_no_seams(tmp_path, monkeypatch):
         np.testing.assert_allclose(read(whole / f"{name}.tif"), read(parts / f"{name}.tif"), atol=1e-4)
 
 
-def test_without_a_terrain_model_the_ground_is_filtered(tmp_path):
+def test_prepare_odm_without_dtm_filters_the_ground(tmp_path):
     folder = project(tmp_path, dsm)
     published = prepare(folder, tmp_path / "out")
     assert set(published.notes) >= {f"{folder} has no {odm.DTM}", f"{folder} has no {odm.PHOTO}"}
     x, y = centres(1.0)
-    off = read(tmp_path / "out" / "dtm.tif") - ground(x, y)
-    # The highest of a cell lies a little above its centre; the box, the spike and the void are gone.
-    assert off.min() > 0
-    assert off.max() < 0.02
+    difference = read(tmp_path / "out" / "dtm.tif") - ground(x, y)
+    # The highest point of a cell is slightly above its centre; box, spike and void are not in the DTM.
+    assert difference.min() > 0
+    assert difference.max() < 0.02
 
 
-def test_another_crs_and_a_coarser_raster(tmp_path):
+def test_prepare_odm_to_other_crs_and_cells_keeps_heights(tmp_path):
     folder = project(tmp_path, dsm, dtm)
-    prepare(folder, tmp_path / "out", Asked(to_crs="EPSG:32614", cell_m=0.5))
+    prepare(folder, tmp_path / "out", PrepareOptions(to_crs="EPSG:32614", cell_m=0.5))
     with rasterio.open(tmp_path / "out" / "dtm.tif") as raster:
         assert raster.crs == rasterio.CRS.from_string("EPSG:32614")
         heights = raster.read(1)
-    known = heights[np.isfinite(heights)]
-    assert known.size > 0.9 * (SIDE / 0.5) ** 2
-    assert known.min() == pytest.approx(ground(0, 0) - 0.125, abs=0.05)
-    assert known.max() == pytest.approx(ground(SIDE, SIDE) - 0.125, abs=0.05)
+    valid = heights[np.isfinite(heights)]
+    assert valid.size > 0.9 * (SIDE / 0.5) ** 2
+    assert valid.min() == pytest.approx(ground(0, 0) - 0.125, abs=0.05)
+    assert valid.max() == pytest.approx(ground(SIDE, SIDE) - 0.125, abs=0.05)
     # Cells finer than the raster's are interpolated, not copied.
-    prepare(folder, tmp_path / "fine", Asked(cell_m=0.0625, dop_cell_m=0.125))
+    prepare(folder, tmp_path / "fine", PrepareOptions(cell_m=0.0625, dop_cell_m=0.125))
     x, y = centres(0.0625)
-    off = read(tmp_path / "fine" / "dtm.tif") - (ground(x, y) - 0.125)
-    assert np.nanmax(np.abs(off[8:-8, 8:-8])) < 1e-3
+    difference = read(tmp_path / "fine" / "dtm.tif") - (ground(x, y) - 0.125)
+    assert np.nanmax(np.abs(difference[8:-8, 8:-8])) < 1e-3
 
 
 @pytest.mark.parametrize("make", [model, cloud])
-def test_without_a_surface_model_there_is_the_mesh_or_the_points(make, tmp_path):
+def test_prepare_odm_without_dsm_uses_mesh_or_points(make, tmp_path):
     prepare(project(tmp_path, make), tmp_path / "out")
     heights = read(tmp_path / "out" / "dsm.tif")
     x, y = centres(1.0)
@@ -197,7 +197,7 @@ def test_without_a_surface_model_there_is_the_mesh_or_the_points(make, tmp_path)
     assert (tmp_path / "out" / "dop.tif").exists()
 
 
-def test_an_empty_project_names_what_was_looked_for(tmp_path):
+def test_prepare_odm_empty_project_names_the_expected_files(tmp_path):
     with pytest.raises(
         ConfigError, match="has none of odm_dem/dsm.tif.*odm_textured_model_geo.obj.*model.laz"
     ):
@@ -225,17 +225,17 @@ def deep_photo(folder):
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("make", "message"),
     [
         (cut_short, "dsm.tif cannot be read"),
         (no_raster, "dsm.tif cannot be read"),
         (no_crs, "dsm.tif carries no CRS; give it with --crs"),
-        (deep_photo, "odm_orthophoto.tif has no three bands of bytes"),
+        (deep_photo, "odm_orthophoto.tif does not have three 8-bit bands"),
     ],
 )
-def test_what_cannot_be_used_leaves_nothing(make, words, tmp_path):
+def test_prepare_odm_invalid_input_leaves_no_folder(make, message, tmp_path):
     folder = project(tmp_path, make)
-    with pytest.raises(CatalogError, match=words) as caught:
+    with pytest.raises(CatalogError, match=message) as caught:
         prepare(folder, tmp_path / "out")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()

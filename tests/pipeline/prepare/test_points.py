@@ -1,4 +1,4 @@
-"""From made clouds of known ground to rasters: however they are cut, ordered and measured."""
+"""Rasters of synthetic clouds have the true heights, whatever the division into files, blocks and units."""
 
 import resource
 from pathlib import Path
@@ -10,8 +10,8 @@ import rasterio
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.prepare import points, spool
-from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare import point_buckets, points
+from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.tasks.acquire.points.to_rasters import Options
 from flexroad.tasks.load import Options as LoadOptions
@@ -19,19 +19,19 @@ from flexroad.tasks.load import load
 from tests.make_clouds import write_cloud
 
 SIZE = np.array([130.0, 90.0])
-"""Of the made ground (m); its south-west corner lies on whole metres."""
+"""Size of the synthetic ground (m); its south-west corner is at whole metres."""
 WITHIN = 0.011
-"""Heights come in centimetres, or hundredths of a foot."""
+"""Tolerance (m): heights are stored in centimetres or hundredths of a foot."""
 DECK_M, HOUSE_M, CAR_M = 6.0, 8.0, 1.5
 
 
 def ground(east, north):
-    """A tilted plane; metres from the corner."""
+    """Height of a tilted plane (m); east and north are metres from the corner."""
     return 50 + 0.08 * east - 0.05 * north
 
 
 def world(unit=1.0, corner=(356010.0, 5699870.0)):
-    """Points of a plane with a house, cars, a bridge and noise: coordinates in `unit`, classes, colours."""
+    """Coordinates in `unit`, classes and colours: a plane with a house, cars, a bridge and noise."""
     rng = np.random.default_rng(1)
     plan = rng.uniform(0.02, SIZE - 0.02, (60_000, 2))
     east, north = plan.T
@@ -40,8 +40,8 @@ def world(unit=1.0, corner=(356010.0, 5699870.0)):
     house = (abs(east - 30) < 12) & (abs(north - 40) < 9)
     deck = abs(north - 70) < 4
     car = (abs(east % 20 - 10) < 1) & (abs(north - 15) < 2)
-    for what, name, over in ((house, 6, HOUSE_M), (deck, 17, DECK_M), (car, 1, CAR_M)):
-        kind[what], height[what] = name, height[what] + over
+    for mask, class_, above in ((house, 6, HOUSE_M), (deck, 17, DECK_M), (car, 1, CAR_M)):
+        kind[mask], height[mask] = class_, height[mask] + above
     noise = rng.choice(len(plan), 40, replace=False)
     kind[noise], height[noise] = rng.choice([7, 18], 40), height[noise] + 90
     colour = np.stack([east, north, kind * 10.0], axis=1).astype(np.uint8)
@@ -49,29 +49,35 @@ def world(unit=1.0, corner=(356010.0, 5699870.0)):
     return np.round(xyz, 2), kind, colour
 
 
-def two_files(folder: Path, *, crs="EPSG:25832", suffix="laz", swap=False, **how) -> list[Path]:
-    """The world in two files that overlap by a strip, in which each has points of its own."""
-    xyz, kind, colour = world(**how)
+def two_files(folder: Path, *, crs="EPSG:25832", suffix="laz", swap=False, **world_options) -> list[Path]:
+    """Write the points of `world` to two files that overlap in a strip, without duplicate points."""
+    xyz, kind, colour = world(**world_options)
     middle = np.median(xyz[:, 0])
-    mine = np.arange(len(xyz)) % 2 == 0
+    even = np.arange(len(xyz)) % 2 == 0
     strip = abs(xyz[:, 0] - middle) < 10
-    left = (xyz[:, 0] < middle - 10) | (strip & mine)
+    left = (xyz[:, 0] < middle - 10) | (strip & even)
     names = ("b", "a") if swap else ("a", "b")
     order = np.random.default_rng(2 + swap).permutation(len(xyz))
     paths = []
-    for name, which in zip(names, (left, ~left), strict=True):
-        here = order[which[order]]
-        shade = colour[here].astype(np.uint16) << 8
-        paths.append(write_cloud(folder / f"{name}.{suffix}", xyz[here], kind[here], crs, shade))
+    for name, members in zip(names, (left, ~left), strict=True):
+        chosen = order[members[order]]
+        shade = colour[chosen].astype(np.uint16) << 8
+        paths.append(write_cloud(folder / f"{name}.{suffix}", xyz[chosen], kind[chosen], crs, shade))
     return paths
 
 
-def prepare(files, out, executor=None, ground="auto", options=None, **asked):
-    said = []
+def prepare(files, out, executor=None, ground="auto", options=None, **common):
+    lines = []
     made = prepare_points(
-        files, out, Asked(**asked), options or Options(), executor or SerialExecutor(), said.append, ground
+        files,
+        out,
+        PrepareOptions(**common),
+        options or Options(),
+        executor or SerialExecutor(),
+        lines.append,
+        ground,
     )
-    return made, said
+    return made, lines
 
 
 def read(folder, layer):
@@ -80,7 +86,7 @@ def read(folder, layer):
 
 
 def highest(xyz, kind, raster):
-    """Highest point per cell, one point after the other."""
+    """Highest point per cell, by a plain loop over the points."""
     top = np.full(raster.shape, np.nan)
     for (x, y, z), k in zip(xyz, kind, strict=True):
         row = int(np.floor(raster.bounds.top - y))
@@ -97,21 +103,21 @@ def highest(xyz, kind, raster):
         (0.3048, "EPSG:2994", "EPSG:2993", (194010.0, 259870.0)),
     ],
 )
-def test_rasters_are_those_of_the_points(tmp_path, unit, crs, metric, corner):
+def test_prepare_points_gives_true_heights(tmp_path, unit, crs, metric, corner):
     files = two_files(tmp_path, crs=crs, unit=unit, corner=corner)
     made, _ = prepare(files, tmp_path / "out", roads=None)
     xyz, kind, _ = world(unit, corner)
     dsm, raster = read(tmp_path / "out", "dsm")
     assert raster.crs == metric
-    # Points of hundredths of a foot may round into the next cell.
+    # Points rounded to hundredths of a foot may move to the next cell.
     slack = 0 if unit == 1 else 1
     left, bottom, right, top = raster.bounds
     assert np.abs([left - corner[0], bottom - corner[1]]).max() <= slack
     assert np.abs([right - corner[0] - SIZE[0], top - corner[1] - SIZE[1]]).max() <= slack
     truth = highest(np.round(xyz * unit, 4), kind, raster)
-    known = np.isfinite(truth)
-    assert known.mean() > 0.95
-    assert np.abs(dsm - truth)[known].max() < 1e-4
+    valid = np.isfinite(truth)
+    assert valid.mean() > 0.95
+    assert np.abs(dsm - truth)[valid].max() < 1e-4
     assert np.isfinite(dsm).all()
 
     dtm, _ = read(tmp_path / "out", "dtm")
@@ -124,13 +130,13 @@ def test_rasters_are_those_of_the_points(tmp_path, unit, crs, metric, corner):
     data = load(tile, LoadOptions())
     deck = np.isfinite(read(tmp_path / "out", "bridges")[0])
     assert deck.any()
-    # A cell's deck is the mean of its points, not the height at its centre.
+    # The deck height of a cell is the mean of its points, not the height at its centre.
     assert np.abs(data.reference - plane - DECK_M)[deck].max() < 0.08 + WITHIN
     assert np.array_equal(data.reference[~deck], data.dtm[~deck])
 
 
-def test_the_photo_has_the_colour_of_the_highest_point(tmp_path):
-    """16-bit colours in the files, bytes in the raster."""
+def test_prepare_points_dop_has_colour_of_highest_point(tmp_path):
+    """Colours have 16 bits in the files and 8 bits in the raster."""
     files = two_files(tmp_path)
     prepare(files, tmp_path / "out", dop_cell_m=0.5)
     photo, raster = read(tmp_path / "out", "dop")
@@ -140,13 +146,13 @@ def test_the_photo_has_the_colour_of_the_highest_point(tmp_path):
     col = np.floor((xyz[:, 0] - raster.bounds.left) / 0.5).astype(int)
     row = np.floor((raster.bounds.top - xyz[:, 1]) / 0.5).astype(int)
     order = np.argsort(xyz[:, 2], kind="stable")
-    want = np.zeros((3, *raster.shape), np.uint8)
+    expected = np.zeros((3, *raster.shape), np.uint8)
     for index in order:
-        want[:, row[index], col[index]] = colour[index]
+        expected[:, row[index], col[index]] = colour[index]
     hit = np.zeros(raster.shape, bool)
     hit[row, col] = True
-    same = (photo.data == want).all(axis=0)[hit]
-    # Equal heights within a pixel leave the choice open.
+    same = (photo.data == expected).all(axis=0)[hit]
+    # Points of equal height in a pixel may give either colour.
     assert same.mean() > 0.999
     assert raster.dtypes[0] == "uint8"
 
@@ -159,58 +165,58 @@ def plain(tmp_path_factory):
     return files, {layer: read(folder / "out", layer)[0] for layer in ("dsm", "dtm", "bridges", "dop")}
 
 
-def check_same(out, want):
+def check_same(out, expected):
     for layer in ("dsm", "bridges", "dop"):
-        assert np.array_equal(read(out, layer)[0], want[layer], equal_nan=layer != "dop"), layer
-    assert np.allclose(read(out, "dtm")[0], want["dtm"], rtol=0, atol=1e-5, equal_nan=True)
+        assert np.array_equal(read(out, layer)[0], expected[layer], equal_nan=layer != "dop"), layer
+    assert np.allclose(read(out, "dtm")[0], expected["dtm"], rtol=0, atol=1e-5, equal_nan=True)
 
 
-def test_chunks_and_blocks_change_nothing(plain, tmp_path, monkeypatch):
-    files, want = plain
-    monkeypatch.setattr(spool, "CHUNK", 997)
-    monkeypatch.setattr(spool, "POINTS_PER_BLOCK", 1)
-    monkeypatch.setattr(spool, "SHORTEST_EDGE_M", 37.0)
-    _, said = prepare(files, tmp_path / "out", ground="filter")
-    (blocks,) = (int(line.split()[0]) for line in said if " blocks of " in line)
+def test_prepare_points_in_many_chunks_and_blocks_gives_the_same_rasters(plain, tmp_path, monkeypatch):
+    files, expected = plain
+    monkeypatch.setattr(point_buckets, "CHUNK", 997)
+    monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
+    monkeypatch.setattr(point_buckets, "SHORTEST_EDGE_M", 37.0)
+    _, lines = prepare(files, tmp_path / "out", ground="filter")
+    (blocks,) = (int(line.split()[0]) for line in lines if " blocks of " in line)
     assert blocks >= 9
-    check_same(tmp_path / "out", want)
+    check_same(tmp_path / "out", expected)
 
 
-def test_files_in_any_order_are_one_cloud(plain, tmp_path):
-    """In another order, too, are the points within."""
+def test_prepare_points_in_other_order_gives_the_same_rasters(plain, tmp_path):
+    """Both the files and the points within them are in another order."""
     two_files(tmp_path / "clouds", swap=True)
     prepare([tmp_path / "clouds"], tmp_path / "out", ground="filter")
     check_same(tmp_path / "out", plain[1])
 
 
-def test_workers_make_the_same(plain, tmp_path, monkeypatch, executor):
-    monkeypatch.setattr(spool, "POINTS_PER_BLOCK", 1)
+def test_prepare_points_with_workers_gives_the_same_rasters(plain, tmp_path, monkeypatch, executor):
+    monkeypatch.setattr(point_buckets, "POINTS_PER_BLOCK", 1)
     prepare(plain[0], tmp_path / "out", executor, ground="filter")
     check_same(tmp_path / "out", plain[1])
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"dsm.tif", "dtm.tif", "bridges.tif", "dop.tif", "catalog.parquet"}
 
 
-def test_classes_find_the_ground_where_they_tell_it(tmp_path):
+def test_prepare_points_ground_auto_uses_classes_only_if_present(tmp_path):
     xyz, kind, _ = world()
     crs = "EPSG:25832"
     flat = {name: write_cloud(tmp_path / f"{name}.laz", xyz, k, crs) for name, k in
-            [("told", kind), ("alike", 1), ("few", np.where(np.arange(len(kind)) % 150, 1, 2))]}  # fmt: skip
+            [("good", kind), ("alike", 1), ("few", np.where(np.arange(len(kind)) % 150, 1, 2))]}  # fmt: skip
 
     def method(*names, ground="auto"):
         made, _ = prepare([flat[name] for name in names], tmp_path / "out", ground=ground)
         with rasterio.open(tmp_path / "out" / "dtm.tif") as dtm:
-            found = dtm.tags()["DTM"]
-        return found, " ".join(made.notes)
+            processing = dtm.tags()["DTM"]
+        return processing, " ".join(made.notes)
 
     by_class, by_slope = " of points of class 2;", " of slope-filtered points "
-    assert by_class in method("told")[0]
-    assert by_slope in method("told", ground="filter")[0]
-    found, notes = method("told", "alike")
-    assert by_slope in found
-    assert "all points of alike.laz are of one class: the slope filter finds the ground" in notes
-    found, notes = method("few")
-    assert by_slope in found
+    assert by_class in method("good")[0]
+    assert by_slope in method("good", ground="filter")[0]
+    processing, notes = method("good", "alike")
+    assert by_slope in processing
+    assert "all points of alike.laz have the same class: ground is identified by the slope filter" in notes
+    processing, notes = method("few")
+    assert by_slope in processing
     assert "less than 1% of the points of few.laz are ground (class 2)" in notes
     assert by_class in method("few", ground="classes")[0]
     assert "no orthophoto: no colours in few.laz" in notes
@@ -218,8 +224,8 @@ def test_classes_find_the_ground_where_they_tell_it(tmp_path):
         method("alike", ground="classes")
 
 
-def test_noise_of_a_dense_cloud_is_allowed_for(tmp_path):
-    """Of a hundred points per m2 nearly every one has another near by that lies lower by three sigma."""
+def test_prepare_points_dense_noisy_cloud_gives_unbiased_ground(tmp_path):
+    """At 100 points per m2 almost every point has a neighbour that is lower by three sigma."""
     rng = np.random.default_rng(3)
     xyz = np.column_stack(
         [rng.uniform(0, 40, (160_000, 2)) + np.array([356e3, 5699e3]), rng.normal(50, 0.05, 160_000)]
@@ -230,11 +236,11 @@ def test_noise_of_a_dense_cloud_is_allowed_for(tmp_path):
     assert abs(np.nanmedian(dtm) - 50) < 0.01
 
 
-def test_heights_that_cannot_be_are_left_out_and_told(tmp_path):
+def test_prepare_points_out_of_range_heights_are_left_out_with_note(tmp_path):
     xyz, kind, _ = world()
     xyz[:3, 2] = -32767
     made, _ = prepare([write_cloud(tmp_path / "a.laz", xyz, kind, "EPSG:25832")], tmp_path / "out")
-    assert "left out 3 points with heights beyond -500..9000 m; is --height-unit right?" in made.notes
+    assert "left out 3 points with heights outside -500..9000 m; check --height-unit" in made.notes
     assert np.nanmin(read(tmp_path / "out", "dtm")[0]) > 40
 
 
@@ -247,7 +253,7 @@ def bad_inputs(folder: Path):
     las = write_cloud(folder / "cut.las", xyz, kind, crs)
     las.write_bytes(las.read_bytes()[:-31])
     empty = write_cloud(folder / "empty.laz", np.zeros((0, 3)), crs=crs)
-    astray = np.vstack([xyz[:10], xyz[0] + np.array([9e6, 9e6, 0])])
+    distant = np.vstack([xyz[:10], xyz[0] + np.array([9e6, 9e6, 0])])
     return {
         "missing": ([folder / "none.laz"], {}, "none.laz does not exist"),
         "empty": ([good, empty], {}, "empty.laz has no points; leave it out"),
@@ -259,45 +265,45 @@ def bad_inputs(folder: Path):
             "mixed CRS: .*feet.laz is in EPSG:2994, .*good.laz in EPSG:25832",
         ),
         "contradicted": ([good], {"crs": "EPSG:2994"}, "good.laz is in .*25832, --crs in EPSG:2994; leave"),
-        "noise": ([write_cloud(folder / "noise.laz", xyz, 7, crs)], {}, "noise.laz has no points but noise"),
-        "astray": ([write_cloud(folder / "far.laz", astray, 2, crs)], {}, "far.laz alone spans 9000.*--cell"),
-        "cells": ([good], {"cell_m": 1.0, "dop_cell_m": 0.3}, "--dop-cell 0.3: one must be a whole number"),
+        "noise": ([write_cloud(folder / "noise.laz", xyz, 7, crs)], {}, "noise.laz has only noise points"),
+        "far": ([write_cloud(folder / "far.laz", distant, 2, crs)], {}, "far.laz alone spans 9000.*--cell"),
+        "cells": ([good], {"cell_m": 1.0, "dop_cell_m": 0.3}, "--dop-cell 0.3: one must be a multiple"),
         "unit": ([good], {"height_unit": "yard"}, "--height-unit yard: there is metre, foot, us-foot"),
         "target": ([good], {"to_crs": "EPSG:4326"}, "--to-crs EPSG:4326 is in degrees"),
     }  # fmt: skip
 
 
-BAD = "missing|empty|cut short|cut las|no crs|mixed|contradicted|noise|astray|cells|unit|target".split("|")
+BAD = "missing|empty|cut short|cut las|no crs|mixed|contradicted|noise|far|cells|unit|target".split("|")
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, name):
-    files, asked, message = bad_inputs(tmp_path / "clouds")[name]
+def test_prepare_points_invalid_input_is_one_line_and_leaves_no_folder(tmp_path, name):
+    files, options, message = bad_inputs(tmp_path / "clouds")[name]
     with pytest.raises((CatalogError, ConfigError), match=message) as error:
-        prepare(files, tmp_path / "out", **asked)
+        prepare(files, tmp_path / "out", **options)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_full_disk_is_one_line_and_spares_what_was_there(tmp_path):
+def test_prepare_points_full_disk_is_one_line_and_keeps_existing_files(tmp_path):
     files = two_files(tmp_path)
     prepare(files, tmp_path / "out")
     before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, unlimited[1]))
     try:
-        with pytest.raises(ConfigError, match="cannot write to .*out: .*; make room and repeat"):
+        with pytest.raises(ConfigError, match="cannot write to .*out: .*; free disk space and repeat"):
             prepare(files, tmp_path / "out")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
-def test_a_failing_block_leaves_nothing(tmp_path, monkeypatch):
+def test_prepare_points_failing_block_leaves_no_folder(tmp_path, monkeypatch):
     def fail(*_):
         raise ConfigError("no more")
 
-    monkeypatch.setattr(points, "fill", fail)
+    monkeypatch.setattr(points, "write_blocks", fail)
     with pytest.raises(ConfigError, match="no more"):
         prepare(two_files(tmp_path), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Roads a user has become a mask, or one line that says why not."""
+"""The user's roads are converted to a mask; invalid roads are an error of one line."""
 
 import geopandas
 import numpy as np
@@ -8,9 +8,9 @@ from shapely import LineString, Point, Polygon, box
 
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.prepare.asked import Asked
+from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, burn
-from flexroad.pipeline.prepare.sheet import Sheet
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
 
@@ -22,7 +22,7 @@ def write(path, shapes, crs="EPSG:25832", layer=None, **columns):
     return path
 
 
-def test_polygons_cover_the_cells_whose_centre_they_hold(tmp_path):
+def test_burn_polygons_cover_cells_with_centre_inside(tmp_path):
     roads = write(tmp_path / "roads.gpkg", [box(400_010.4, 5_700_020, 400_020.6, 5_700_060)])
     mask = burn(roads, None, None, GRID)
     truth = np.zeros(GRID.shape, bool)
@@ -30,7 +30,7 @@ def test_polygons_cover_the_cells_whose_centre_they_hold(tmp_path):
     assert np.array_equal(mask, truth)
 
 
-def test_polygons_in_degrees_lie_where_they_belong(tmp_path):
+def test_burn_polygons_in_degrees_are_reprojected(tmp_path):
     shape = box(400_010.2, 5_700_020.2, 400_020.2, 5_700_060.2)
     degrees = geopandas.GeoSeries([shape], crs="EPSG:25832").to_crs("EPSG:4326")
     roads = write(tmp_path / "roads.geojson", list(degrees), "EPSG:4326")
@@ -39,7 +39,7 @@ def test_polygons_in_degrees_lie_where_they_belong(tmp_path):
     )
 
 
-def test_features_are_chosen_by_layer_and_condition(tmp_path):
+def test_burn_selects_features_by_layer_and_condition(tmp_path):
     path = tmp_path / "map.gpkg"
     shapes = [box(400_000, 5_700_000, 400_010, 5_700_100), box(400_040, 5_700_000, 400_050, 5_700_100)]
     write(path, shapes, layer="areas", kind=["road", "path"])
@@ -49,7 +49,7 @@ def test_features_are_chosen_by_layer_and_condition(tmp_path):
     assert not mask[:, 10:].any()
 
 
-def test_raster_is_taken_by_nearest_neighbour(tmp_path):
+def test_burn_raster_is_resampled_by_nearest_neighbour(tmp_path):
     path = tmp_path / "mask.tif"
     coarse = Grid(GRID.crs, GRID.west - 20, GRID.north + 20, 2.0, 80, 80)
     values = np.arange(coarse.height * coarse.width).reshape(coarse.shape) % 3 == 0
@@ -62,19 +62,19 @@ def test_raster_is_taken_by_nearest_neighbour(tmp_path):
     assert np.array_equal(burn(path, None, None, GRID), values[row, col])
 
 
-def published(folder, roads, **more):
-    """The only tile of a flat area whose roads were given, and what was said of it."""
-    with Sheet(folder, GRID, None, {}) as sheet:
+def published(folder, roads, **options):
+    """The only tile of a flat area with these roads, and the notes."""
+    with RasterWriter(folder, GRID, None, {}) as writer:
         for layer in ("dsm", "dtm"):
-            sheet.write(layer, GRID, np.zeros(GRID.shape))
-        masked = add_roads(sheet, Asked(roads=roads, **more))
-        made = sheet.publish()
-    (tile,) = Catalog.read(made.catalog).tiles
-    assert masked == (tile.layer("road_mask") is not None)
-    return tile, made.notes
+            writer.write(layer, GRID, np.zeros(GRID.shape))
+        has_mask = add_roads(writer, PrepareOptions(roads=roads, **options))
+        dataset = writer.publish()
+    (tile,) = Catalog.read(dataset.catalog).tiles
+    assert has_mask == (tile.layer("road_mask") is not None)
+    return tile, dataset.notes
 
 
-def test_lines_go_into_the_catalog_without_a_mask(tmp_path):
+def test_add_roads_lines_are_in_catalog_without_mask(tmp_path):
     shapes = [LineString([(400_000, 5_700_050), (400_080, 5_700_050)])]
     roads = write(tmp_path / "map.gpkg", shapes, layer="ways", kind=["road"])
     write(roads, [box(400_000, 5_700_000, 400_010, 5_700_100)], layer="areas")
@@ -84,7 +84,7 @@ def test_lines_go_into_the_catalog_without_a_mask(tmp_path):
     assert 'segment: {method: vector, layer: "ways", where: "kind = \'road\'"}' in notes[0]
 
 
-def test_polygons_are_burnt_and_named_rasters_only_burnt(tmp_path):
+def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
     roads = write(tmp_path / "roads.gpkg", [box(400_000, 5_700_000, 400_010, 5_700_100)])
     tile, _ = published(tmp_path / "out", roads)
     assert tile.paths(tile.layer("roads")) == (roads,)
@@ -95,13 +95,13 @@ def test_polygons_are_burnt_and_named_rasters_only_burnt(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 @pytest.mark.parametrize(
-    ("make", "layer", "where", "says"),
+    ("make", "layer", "where", "message"),
     [
         (lambda path: None, None, None, "does not exist"),
         (lambda path: path.write_text("roads"), None, None, "cannot be read"),
-        (lambda path: write(path, [Point(400_010, 5_700_020)]), None, None, "Points where polygons or lines"),
-        (lambda path: write(path, [LineString([(0, 0), (1, 1)])]), None, None, "no road of .* lies in the"),
-        (lambda path: write(path, [box(0, 0, 9, 9)]), None, None, "no road of .* lies in the area"),
+        (lambda path: write(path, [Point(400_010, 5_700_020)]), None, None, "Points, but roads must be"),
+        (lambda path: write(path, [LineString([(0, 0), (1, 1)])]), None, None, "no road of .* is in the"),
+        (lambda path: write(path, [box(0, 0, 9, 9)]), None, None, "no road of .* is in the area"),
         (lambda path: write(path, [box(0, 0, 9, 9)], crs=None), None, None, "no CRS"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), "streets", None, "no layer 'streets'"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "id = 7", "no feature where id = 7"),
@@ -109,10 +109,10 @@ def test_polygons_are_burnt_and_named_rasters_only_burnt(tmp_path):
         (lambda path: write(path, [Polygon()]), None, None, "no road"),
     ],
 )  # fmt: skip
-def test_what_is_no_road_is_one_line(tmp_path, make, layer, where, says):
+def test_burn_invalid_roads_is_one_line(tmp_path, make, layer, where, message):
     path = tmp_path / "roads.gpkg"
     make(path)
-    with pytest.raises(ConfigError, match=says) as caught:
+    with pytest.raises(ConfigError, match=message) as caught:
         burn(path, layer, where, GRID)
     assert "\n" not in str(caught.value)
     assert "roads" in str(caught.value)

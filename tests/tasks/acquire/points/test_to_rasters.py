@@ -5,7 +5,7 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points import ground_filter as slope_filter
-from flexroad.tasks.acquire.points.to_rasters import Options, facts, rasterise, reach_m
+from flexroad.tasks.acquire.points.to_rasters import Options, tags, rasterise, reach_m
 from flexroad.tasks.acquire.types import Points, Rasters
 
 NO_CLASS, GROUND, TREE, HOUSE, DECK = 0, 2, 5, 6, 17
@@ -180,11 +180,11 @@ def test_points_of_one_class(kind):
 
 
 def test_the_facts_state_what_was_done():
-    stated = facts(Options(despike_m=5, ground_classes=(2, 8), fill_m=3))
+    stated = tags(Options(despike_m=5, ground_classes=(2, 8), fill_m=3))
     assert stated["DSM"] == (
         "highest point per cell; single points 5 m above all around dropped; voids up to 3 m filled linearly"
     )
     assert "points of classes 2, 8" in stated["DTM"]
-    filtered = facts(Options(ground="filter", dtm="mean", filter={"radius_m": 20, "slope": 0.3}))
+    filtered = tags(Options(ground="filter", dtm="mean", filter={"radius_m": 20, "slope": 0.3}))
     assert "mean per cell of slope-filtered points (Vosselman 2000: radius 20 m, " in filtered["DTM"]
     assert "dropped" not in filtered["DSM"]

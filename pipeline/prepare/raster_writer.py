@@ -1,7 +1,7 @@
-"""The rasters of one area: written block by block, published at once as COGs with their catalog.
+"""Writer of the rasters of one area: block by block, then published together as COGs with a catalog.
 
-Until then everything lies in a hidden folder inside the output folder, so that an area that fails leaves
-nothing, and one that is made anew replaces the old one by renaming; the catalog comes last.
+Until they are published, all files are in a hidden folder inside the output folder: a failure leaves no
+files behind, and new rasters replace old ones by renaming. The catalog is written last.
 """
 
 from __future__ import annotations
@@ -34,44 +34,46 @@ from flexroad.tasks.types import Orthophoto
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"
 GROUND = "ground"
-"""Cells with points on the ground: for the maker, not published."""
+"""Cells with ground points: an intermediate layer, not published."""
 BLOCK = 256
-"""Side of the files' inner tiles while they are written (cells)."""
+"""Side of the internal tiles of the temporary GeoTIFFs (cells)."""
 CATALOG = "catalog.parquet"
 HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
 MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
 PHOTO_PROFILE = {"dtype": "uint8", "nodata": None, "count": 3, "photometric": "RGB", "interleave": "pixel"}
 MIN_COVER = 0.25
-"""Tiles with heights in less than this share of their cells are left out: `load` would refuse them."""
+"""Tiles with heights in less than this share of their cells are left out: `load` would reject them."""
 
 
 @dataclass(frozen=True)
-class Published:
-    """What was made."""
+class PreparedDataset:
+    """The result of a ``prepare`` command: rasters and their catalog."""
 
     catalog: Path
+    """The catalog file, ``.parquet``."""
     tiles: int
+    """Number of tiles in the catalog."""
     notes: tuple[str, ...] = ()
     """What was left out or assumed, one line each."""
 
-    def noting(self, *notes: str) -> Published:
-        """Return the same with more notes in front."""
+    def with_notes(self, *notes: str) -> PreparedDataset:
+        """Return a copy with more notes in front."""
         return replace(self, notes=(*notes, *self.notes))
 
 
-class Sheet:
-    """The rasters of one area, in the making; a context manager.
+class RasterWriter:
+    """Writer of the rasters of one area; a context manager that removes its temporary files.
 
     Parameters
     ----------
     out : Path
-        Folder to publish in; made if it is missing.
+        Output folder; created if it does not exist.
     grid : Grid
         All cells of the area.
     dop_cell : float, optional
-        Pixel of the orthophoto (m), None if there is none to be.
-    facts : Mapping[str, str]
-        Tags of every file: what it was made from, and how.
+        Pixel of the orthophoto (m), None if there is no orthophoto.
+    tags : Mapping[str, str]
+        TIFF tags of every file: its source and its processing.
 
     Raises
     ------
@@ -79,20 +81,20 @@ class Sheet:
         If the folder cannot be written.
     """
 
-    def __init__(self, out: Path, grid: Grid, dop_cell: float | None, facts: Mapping[str, str]) -> None:
+    def __init__(self, out: Path, grid: Grid, dop_cell: float | None, tags: Mapping[str, str]) -> None:
         self.out = out
         self.grid = grid
         self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
-        self.facts = dict(facts)
+        self.tags = dict(tags)
         self._new = not out.exists()
         self._open: dict[str, Any] = {}
         self._roads: list[VectorFile] = []
         self._notes: list[str] = []
         self.scratch = out / f".prepare-{os.getpid()}"
-        """Folder for temporary files of whoever makes the rasters; it goes with the sheet."""
+        """Folder for temporary files, also of the caller; removed when the context ends."""
         try:
             out.mkdir(parents=True, exist_ok=True)
-            _sweep(out)
+            _remove_stale(out)
             self.scratch.mkdir()
         except OSError as error:
             raise ConfigError(f"cannot write to {out}: {error}") from error
@@ -111,21 +113,21 @@ class Sheet:
             with contextlib.suppress(OSError):
                 self.out.rmdir()
 
-    def write(self, layer: str, where: Grid, values: NDArray[Any]) -> None:
-        """Write a window of a layer: heights (m, NaN where unknown) or a mask, ``(H, W)``.
+    def write(self, layer: str, part: Grid, values: NDArray[Any]) -> None:
+        """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
 
         Raises
         ------
         ConfigError
             If the disk is full.
         CatalogError
-            If ``where`` is no window of the sheet.
+            If ``part`` is not a window of the writer's grid.
         """
         heights = layer in HEIGHTS
         with self._writing(layer):
             raster = self._raster(layer, self.grid, HEIGHT_PROFILE if heights else MASK_PROFILE)
             cells = values.astype(np.float32 if heights else np.uint8)
-            raster.write(cells, 1, window=_window(self.grid, where))
+            raster.write(cells, 1, window=_window(self.grid, part))
 
     def write_photo(self, photo: Orthophoto) -> None:
         """Write a window of the orthophoto; pixels without a colour are masked.
@@ -133,12 +135,12 @@ class Sheet:
         Raises
         ------
         ConfigError
-            If the disk is full, or the sheet has no orthophoto.
+            If the disk is full, or the writer was created without an orthophoto.
         CatalogError
-            If the photo's grid is no window of the sheet's pixels.
+            If the orthophoto's grid is not a window of the writer's pixels.
         """
         if self.photo_grid is None:
-            raise ConfigError(f"no orthophoto was asked for in {self.out}")
+            raise ConfigError(f"no orthophoto was requested in {self.out}")
         with self._writing(PHOTO), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
             raster = self._raster(PHOTO, self.photo_grid, PHOTO_PROFILE)
             window = _window(self.photo_grid, photo.grid)
@@ -146,34 +148,36 @@ class Sheet:
             raster.write_mask(photo.known, window=window)
 
     def attach_roads(self, file: VectorFile, *notes: str) -> None:
-        """Name a vector file as the roads of the tiles it reaches; it stays where it is."""
+        """Add a vector file to the catalog as the roads of the tiles it overlaps; the file is not copied."""
         self._roads.append(file)
         self._notes += notes
 
-    def read(self, layer: str, where: Grid) -> NDArray[Any]:
-        """Return a window of a layer as written so far, ``(H, W)``: float64 heights or a bool mask."""
-        values: NDArray[Any] = self._open[layer].read(1, window=_window(self.grid, where))
+    def read(self, layer: str, part: Grid) -> NDArray[Any]:
+        """Return a window of a layer as written up to now, ``(H, W)``: float64 heights or a bool mask."""
+        values: NDArray[Any] = self._open[layer].read(1, window=_window(self.grid, part))
         return values.astype(np.float64) if layer in HEIGHTS else values.astype(bool)
 
-    def publish(self, tile_size_m: float = 250, date: datetime | None = None, dataset: str = "") -> Published:
-        """Turn what was written into COGs and a catalog, in place of what was there before.
+    def publish(
+        self, tile_size_m: float = 250, date: datetime | None = None, dataset: str = ""
+    ) -> PreparedDataset:
+        """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
         Parameters
         ----------
         tile_size_m : float
-            Side of a tile (m). An area that fits into one is one tile of its own; a larger one is cut on
+            Side of a tile (m). An area no larger than this is a single tile; a larger one is divided at
             multiples of it.
         date : datetime, optional
-            When the data was taken.
+            Acquisition date.
         dataset : str
-            What reports call the data.
+            Name of the data in reports.
 
         Raises
         ------
         ConfigError
             If the disk is full, or no tile has enough heights.
         CatalogError
-            If the roads reach no tile.
+            If the roads overlap no tile.
         """
         names = [layer for layer in LAYERS if layer in self._open]
         for layer in names:
@@ -184,40 +188,40 @@ class Sheet:
         tiles = with_roads(tiles, self._roads, None)
         self._replace(names)
         Catalog(tiles).write(self.out / CATALOG)
-        return Published(self.out / CATALOG, len(tiles), (*self._notes, *notes, *assumed(tiles)))
+        return PreparedDataset(self.out / CATALOG, len(tiles), (*self._notes, *notes, *assumed(tiles)))
 
     def _replace(self, names: list[str]) -> None:
-        # A catalog stands for finished rasters: the old one goes first, the new one comes last.
-        for old in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
-            (self.out / old).unlink(missing_ok=True)
+        # A catalog must only exist beside complete rasters: removed first, written last.
+        for name in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
+            (self.out / name).unlink(missing_ok=True)
         for layer in names:
             (self.scratch / f"{layer}.tif").replace(self.out / f"{layer}.tif")
 
     def _tiles(
         self, names: list[str], size_m: float, date: datetime | None, dataset: str
     ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
-        """Return the tiles with heights enough, and notes on the others."""
+        """Return the tiles with enough heights, and notes on the others."""
         if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
             tiles: tuple[Tile, ...] = (self._one_tile(names, date, dataset),)
             notes: tuple[str, ...] = ()
         else:
             root = self.scratch.resolve()
-            found = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
-            indexed = cut(root, found, tile_size_m=size_m, date=date, dataset=dataset, min_cover=0)
+            layers = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
+            indexed = cut(root, layers, tile_size_m=size_m, date=date, dataset=dataset, min_cover=0)
             tiles = tuple(replace(tile, root=str(self.out.resolve())) for tile in indexed.tiles)
-            # Whether a date is assumed is told once, of the tiles that stay.
+            # `publish` adds the note on assumed dates once, for the tiles that are kept.
             notes = tuple(note for note in indexed.notes if "--date" not in note)
         with rasterio.open(self.scratch / "dsm.tif") as dsm:
-            enough = [_share(dsm, self.grid, tile.grid) >= MIN_COVER for tile in tiles]
+            enough = [_valid_share(dsm, self.grid, tile.grid) >= MIN_COVER for tile in tiles]
         kept = tuple(compress(tiles, enough))
-        thin = [tile.id for tile, stays in zip(tiles, enough, strict=True) if not stays]
+        sparse = [tile.id for tile, is_kept in zip(tiles, enough, strict=True) if not is_kept]
         if not kept:
             raise ConfigError(
                 f"no tile of {self.out} would have heights in {MIN_COVER:.0%} of its cells; "
-                "take larger cells (--cell) or smaller tiles (--tile-size)"
+                "use larger cells (--cell) or smaller tiles (--tile-size)"
             )
-        left_out = f"left out {some(thin)}: heights in less than {MIN_COVER:.0%} of the cells"
-        return kept, (*notes, left_out) if thin else notes
+        left_out = f"left out {some(sparse)}: heights in less than {MIN_COVER:.0%} of the cells"
+        return kept, (*notes, left_out) if sparse else notes
 
     def _one_tile(self, names: list[str], date: datetime | None, dataset: str) -> Tile:
         return Tile(
@@ -246,7 +250,7 @@ class Sheet:
                 BIGTIFF="IF_SAFER",
                 **profile,
             )
-            raster.update_tags(**self.facts, LAYER=layer)
+            raster.update_tags(**self.tags, LAYER=layer)
             self._open[layer] = raster
         return self._open[layer]
 
@@ -255,10 +259,10 @@ class Sheet:
         try:
             yield
         except (OSError, RasterioError, CRSError) as error:
-            # GDAL's own reason is the cause of rasterio's.
+            # rasterio's error is raised from GDAL's, which has the reason.
             reason = error.__cause__ or error
             raise ConfigError(
-                f"cannot write {self.out / layer}.tif: {reason}; make room and repeat"
+                f"cannot write {self.out / layer}.tif: {reason}; free disk space and repeat"
             ) from error
 
 
@@ -282,19 +286,19 @@ def _window(whole: Grid, part: Grid) -> Window:
     return Window.from_slices(rows, cols)
 
 
-def _share(dsm: Any, whole: Grid, tile: Grid) -> float:
-    """Return the share of a tile's cells that have a height; the tile may reach beyond the raster."""
+def _valid_share(dsm: Any, whole: Grid, tile: Grid) -> float:
+    """Return the share of a tile's cells that have a height; the tile may extend beyond the raster."""
     row, col = round((whole.north - tile.north) / whole.cell), round((tile.west - whole.west) / whole.cell)
     window = Window(col, row, tile.width, tile.height).intersection(Window(0, 0, whole.width, whole.height))
     return float(np.isfinite(dsm.read(1, window=window)).sum()) / (tile.width * tile.height)
 
 
-def _sweep(out: Path) -> None:
-    """Remove what makers that were killed left behind."""
-    for left in out.glob(".prepare-*"):
+def _remove_stale(out: Path) -> None:
+    """Remove the temporary folders of processes that no longer exist."""
+    for folder in out.glob(".prepare-*"):
         try:
-            os.kill(int(left.name.rpartition("-")[2]), 0)
+            os.kill(int(folder.name.rpartition("-")[2]), 0)
         except (ProcessLookupError, ValueError):
-            shutil.rmtree(left, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
         except PermissionError:
             continue

@@ -1,0 +1,132 @@
+"""Rasters from points in buckets on disk, made block by block and in parallel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from flexroad.catalog import Grid
+from flexroad.catalog.grid import Bounds
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.point_buckets import BlockIndex, BucketedPoints, PointBuckets, disk_errors
+from flexroad.pipeline.prepare.raster_writer import GROUND, RasterWriter
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m
+from flexroad.tasks.types import Orthophoto
+
+
+@dataclass(frozen=True)
+class BlockJob:
+    """The input of one worker call: a block of ground whose rasters are made."""
+
+    buckets: PointBuckets
+    grid: Grid
+    """Cells of the block."""
+    options: Options
+    dop_cell: float | None
+    """Pixel of the orthophoto (m); None if there is none."""
+    target: Path
+    """Output file with the rasters, ``.npz``."""
+
+
+def output_grid(bounds: Bounds, crs: str, cell: float, step: float) -> Grid:
+    """Return the smallest grid on multiples of ``step`` (m) that covers the bounds."""
+    west, south, east, north = (side / step for side in bounds)
+    west, south = math.floor(west) * step, math.floor(south) * step
+    east, north = math.ceil(east) * step, math.ceil(north) * step
+    return Grid.covering(crs, (west, south, max(east, west + step), max(north, south + step)), cell)
+
+
+def write_blocks(
+    writer: RasterWriter,
+    bucketed: BucketedPoints,
+    options: Options,
+    executor: Executor,
+    log: Callable[[str], None],
+) -> None:
+    """Make the rasters of all blocks and write them; a progress bar is shown on stderr.
+
+    Parameters
+    ----------
+    writer : RasterWriter
+        Writer of the output rasters. Its grid is aligned to the block edges to whole cells.
+    bucketed : BucketedPoints
+        The points on disk.
+    options : Options
+        How points become rasters.
+    executor : Executor
+        Runs one worker call per block.
+    log : Callable[[str], None]
+        Called with a line of progress: the number of blocks.
+
+    Raises
+    ------
+    ConfigError
+        If the disk is full, or a worker dies.
+    """
+    jobs = list(_jobs(writer, bucketed, options))
+    log(f"{len(jobs)} block{'s' * (len(jobs) != 1)} of {bucketed.buckets.edge:g} m")
+    finished = executor.map(_rasterise_block, jobs, _fail)
+    for job in track(finished, "making rasters", len(jobs), console=Console(stderr=True)):
+        _write_block(writer, job)
+
+
+def _jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[BlockJob]:
+    """Yield the blocks whose rasters can depend on points."""
+    buckets, reach = bucketed.buckets, reach_m(options, writer.grid.cell)
+    # Points sampled from a mesh have no colours: the orthophoto is drawn from its texture.
+    dop_cell = writer.photo_grid.cell if writer.photo_grid and any(bucketed.has_colours) else None
+    for index in buckets.overlapping(writer.grid):
+        grid = _block_grid(writer.grid, buckets.edge, index)
+        if grid and not bucketed.occupied.isdisjoint(buckets.overlapping(grid, reach)):
+            yield BlockJob(buckets, grid, options, dop_cell, writer.scratch / f"{index[0]}_{index[1]}.npz")
+
+
+def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
+    """Return the cells of a block that are part of the whole grid, or None if there are none."""
+    left, right = (round((index[0] * edge + d - whole.west) / whole.cell) for d in (0, edge))
+    top, bottom = (round((whole.north - index[1] * edge - d) / whole.cell) for d in (edge, 0))
+    left, right = max(left, 0), min(right, whole.width)
+    top, bottom = max(top, 0), min(bottom, whole.height)
+    if left >= right or top >= bottom:
+        return None
+    west, north = whole.west + left * whole.cell, whole.north - top * whole.cell
+    return Grid(whole.crs, west, north, whole.cell, right - left, bottom - top)
+
+
+def _rasterise_block(job: BlockJob) -> BlockJob:
+    reach = reach_m(job.options, job.grid.cell)
+    points = job.buckets.read(job.grid, reach, with_colours=job.dop_cell is not None)
+    rasters = rasterise(points, job.grid, job.options, job.dop_cell)
+    layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
+    if rasters.bridges is not None:
+        layers["bridges"] = rasters.bridges
+    arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
+    arrays[GROUND] = rasters.ground
+    photo = {"colour": rasters.photo.colour, "known": rasters.photo.known} if rasters.photo else {}
+    with disk_errors(job.target.parent.parent):
+        np.savez(job.target, allow_pickle=False, **arrays, **photo)
+    return job
+
+
+def _fail(job: BlockJob, reason: str) -> BlockJob:
+    raise ConfigError(f"block {job.grid.west:.0f}_{job.grid.south:.0f}: {reason}; use fewer workers")
+
+
+def _write_block(writer: RasterWriter, job: BlockJob) -> None:
+    with np.load(job.target) as rasters:
+        for layer in ("dsm", "dtm", "bridges", GROUND):
+            if layer in rasters:
+                writer.write(layer, job.grid, rasters[layer])
+        if "colour" in rasters and job.dop_cell:
+            pixels = Grid.covering(job.grid.crs, job.grid.bounds, job.dop_cell)
+            writer.write_photo(Orthophoto(pixels, rasters["colour"], rasters["known"]))
+    job.target.unlink()

@@ -1,0 +1,304 @@
+"""Points of many files, sorted into buckets on disk: one file per square block of ground.
+
+Each input file is decoded once, and each block can be read separately. Coordinates are stored as integers
+in tenths of a millimetre, so that they do not depend on the division into blocks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog import Bounds, CatalogError, Grid
+from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks
+from flexroad.catalog.to_metres import MetricTransform
+from flexroad.pipeline.errors import ConfigError
+from flexroad.tasks.acquire.types import Points
+
+PER_METRE = 10_000
+"""Units of the stored coordinates: tenths of a millimetre."""
+RECORD = np.dtype(
+    [("east", "<i4"), ("north", "<i4"), ("height", "<i4"), ("kind", "u1"), ("colour", "u1", (3,))]
+)
+"""One point; ``east`` and ``north`` are relative to the block's south-west corner."""
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights outside this range are nodata, as everywhere in FlexRoad."""
+POINTS_PER_BLOCK = 2_000_000
+"""Target number of points that a worker holds in memory, including the rim around its block."""
+SHORTEST_EDGE_M, LONGEST_EDGE_M = 50.0, 500.0
+"""Limits of the edge of a block (m)."""
+BYTE = 255
+
+Integers = NDArray[np.int64]
+BlockIndex = tuple[int, int]
+"""Column and row of a block: easting and northing of its south-west corner, in multiples of the edge."""
+
+
+def block_edge_of(clouds: Sequence[Cloud], frame: MetricTransform, reach_m: float, step: float) -> float:
+    """Return the edge of a block (m) for the points and the extent of the files; see `block_edge`."""
+    points, area = sum(cloud.points for cloud in clouds), 0.0
+    for cloud in clouds:
+        west, south, east, north = cloud.bounds
+        x, y, _ = frame.metres(np.array([west, east]), np.array([south, north]), np.zeros(2))
+        area += max(float(abs((x[1] - x[0]) * (y[1] - y[0]))), 1.0)
+    return block_edge(points, area, reach_m, step)
+
+
+def block_edge(points: float, area: float, reach_m: float, step: float) -> float:
+    """Return the edge of a block (m), a multiple of ``step``, for ``points`` points on ``area`` m2.
+
+    A block then has about `POINTS_PER_BLOCK` points, including those of its rim.
+    """
+    fitting = math.sqrt(POINTS_PER_BLOCK * area / points) - 2 * reach_m
+    edge = LONGEST_EDGE_M if points <= POINTS_PER_BLOCK else np.clip(fitting, SHORTEST_EDGE_M, LONGEST_EDGE_M)
+    return max(1, math.floor(edge / step)) * step
+
+
+@dataclass(frozen=True)
+class PointBuckets:
+    """A folder with one file of points per block; a border belongs to the block to its east or south."""
+
+    folder: Path
+    edge: float
+    """Edge of a block (m)."""
+
+    def path(self, index: BlockIndex) -> Path:
+        """Return the file of a block; it does not exist if the block has no points."""
+        return self.folder / f"{index[0]}_{index[1]}.points"
+
+    def corner(self, index: BlockIndex) -> tuple[int, int]:
+        """Return easting and northing of a block's south-west corner, in stored units."""
+        return round(index[0] * self.edge * PER_METRE), round(index[1] * self.edge * PER_METRE)
+
+    def append(self, east: Integers, north: Integers, records: NDArray[np.void]) -> set[BlockIndex]:
+        """Add points, ``(n,)``, with coordinates in stored units; return the blocks that received any."""
+        edge = self.edge * PER_METRE
+        col = np.floor(east / edge).astype(np.int64)
+        row = np.ceil(north / edge).astype(np.int64) - 1
+        width = int(np.ptp(col)) + 1
+        block = (row - row.min()) * width + (col - col.min())
+        # NumPy sorts integers of one or two bytes by radix, which is faster.
+        order = np.argsort(block.astype(np.min_scalar_type(int(block.max()))), kind="stable")
+        ends = np.flatnonzero(np.diff(block[order])) + 1
+        occupied = set()
+        for members in np.split(order, ends):
+            index = int(col[members[0]]), int(row[members[0]])
+            corner = self.corner(index)
+            part = records[members]
+            part["east"], part["north"] = east[members] - corner[0], north[members] - corner[1]
+            with self.path(index).open("ab") as file:
+                file.write(part.tobytes())
+            occupied.add(index)
+        return occupied
+
+    def overlapping(self, grid: Grid, reach_m: float = 0) -> list[BlockIndex]:
+        """Return the blocks that overlap a grid and a rim around it, with or without points."""
+        west, south, east, north = (round(side * PER_METRE) for side in grid.buffered(reach_m).bounds)
+        edge = self.edge * PER_METRE
+        columns = range(math.floor(west / edge), math.floor(east / edge) + 1)
+        rows = range(math.ceil(south / edge) - 1, math.ceil(north / edge))
+        return list(itertools.product(columns, rows))
+
+    def read(self, grid: Grid, reach_m: float, with_colours: bool) -> Points:
+        """Return the points on a grid and a rim around it, in an order that depends only on the points."""
+        west, south, east, north = (round(side * PER_METRE) for side in grid.buffered(reach_m).bounds)
+        easts, norths, rest = [], [], []
+        for index in self.overlapping(grid, reach_m):
+            if not self.path(index).exists():
+                continue
+            records, corner = np.fromfile(self.path(index), RECORD), self.corner(index)
+            x, y = records["east"].astype(np.int64) + corner[0], records["north"].astype(np.int64) + corner[1]
+            inside = (x >= west) & (x <= east) & (y >= south) & (y <= north)
+            easts.append(x[inside])
+            norths.append(y[inside])
+            rest.append(records[inside])
+        if not rest:
+            return _points(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, RECORD), with_colours)
+        x, y, records = np.concatenate(easts), np.concatenate(norths), np.concatenate(rest)
+        order = _order(x - west, y - south, records)
+        return _points(x[order], y[order], records[order], with_colours)
+
+
+def _order(east: Integers, north: Integers, records: NDArray[np.void]) -> NDArray[np.intp]:
+    """Return the order by northing, easting and, for equal plan coordinates, by height, class and colour."""
+    plan = (north << 32) | east
+    order = np.argsort(plan)
+    ties = np.flatnonzero(np.diff(plan[order]) == 0)
+    ties = np.union1d(ties, ties + 1)
+    tied = order[ties]
+    keys = [records["colour"][tied, band] for band in range(3)]
+    order[ties] = tied[np.lexsort((*keys, records["kind"][tied], records["height"][tied], plan[tied]))]
+    return order
+
+
+def _points(east: Integers, north: Integers, records: NDArray[np.void], with_colours: bool) -> Points:
+    # Division, not multiplication by 1e-4: whole centimetres are restored exactly.
+    return Points(
+        east / PER_METRE,
+        north / PER_METRE,
+        records["height"] / PER_METRE,
+        records["kind"],
+        records["colour"] if with_colours else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class BucketedPoints:
+    """The points in the buckets, and statistics of the input files."""
+
+    buckets: PointBuckets
+    occupied: frozenset[BlockIndex]
+    """PointBuckets with points."""
+    bounds: Bounds
+    """Bounds of all points: west, south, east, north (m)."""
+    kinds: tuple[Integers, ...]
+    """Number of points of each class, ``(256,)``, per file; without noise."""
+    has_colours: tuple[bool, ...]
+    """Whether the points have colours, per file."""
+    out_of_range: int
+    """Number of points left out because their height is outside `LOWEST_M`..`HIGHEST_M`."""
+
+    @property
+    def points(self) -> int:
+        """Number of points in all buckets."""
+        return int(sum(kinds.sum() for kinds in self.kinds))
+
+
+def bucket_points(
+    clouds: Sequence[Cloud], frame: MetricTransform, folder: Path, edge: float, log: Callable[[str], None]
+) -> BucketedPoints:
+    """Move the points of all files to metres and sort them into buckets, except noise and withheld points.
+
+    Parameters
+    ----------
+    clouds : Sequence[Cloud]
+        The input files.
+    frame : MetricTransform
+        Transforms their coordinates to metres.
+    folder : Path
+        Folder of the buckets; they take 16 bytes per point.
+    edge : float
+        Edge of a block (m).
+    log : Callable[[str], None]
+        Called with one line of progress per file.
+
+    Raises
+    ------
+    CatalogError
+        If a file cannot be read, or no point is left.
+    ConfigError
+        If the disk is full.
+    """
+    buckets, occupied, out_of_range = PointBuckets(folder, edge), set[BlockIndex](), 0
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    kinds, has_colours = [], []
+    for number, cloud in enumerate(clouds, 1):
+        log(f"reading {cloud.path} ({number} of {len(clouds)}, {cloud.points:,} points)")
+        counts, colours = np.zeros(256, np.int64), _ByteColours()
+        for chunk in chunks(cloud.path, CHUNK):
+            plan, records = _records(chunk, frame, colours)
+            out_of_range += len(chunk.z) - len(records)
+            if not len(records):
+                continue
+            counts += np.bincount(records["kind"], minlength=256)
+            low, high = np.minimum(low, plan.min(axis=1)), np.maximum(high, plan.max(axis=1))
+            with disk_errors(folder.parent):
+                occupied |= buckets.append(plan[0], plan[1], records)
+        kinds.append(counts)
+        has_colours.append(colours.present)
+    if not occupied:
+        raise CatalogError(f"{clouds[0].path} has only noise points; leave it out")
+    west, south, east, north = (float(side) / PER_METRE for side in (*low, *high))
+    return BucketedPoints(
+        buckets,
+        frozenset(occupied),
+        (west, south, east, north),
+        tuple(kinds),
+        tuple(has_colours),
+        out_of_range,
+    )
+
+
+class _ByteColours:
+    """Converts the colours of one file to bytes; 8 or 16 bits is decided by the first chunk with a colour."""
+
+    def __init__(self) -> None:
+        self._shift: int | None = None
+
+    @property
+    def present(self) -> bool:
+        """Whether any colour so far was not black."""
+        return self._shift is not None
+
+    def bytes(self, colour: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        if self._shift is None and colour.any():
+            self._shift = 8 if colour.max() > BYTE else 0
+        scaled: NDArray[np.uint16] = np.minimum(colour >> (self._shift or 0), BYTE)
+        return scaled.astype(np.uint8)
+
+
+def _records(
+    chunk: Chunk, frame: MetricTransform, colours: _ByteColours
+) -> tuple[Integers, NDArray[np.void]]:
+    """Return eastings and northings in stored units, ``(2, n)``, and records with all other fields set."""
+    easting, northing, height = frame.metres(chunk.x, chunk.y, chunk.z)
+    valid = (height >= LOWEST_M) & (height <= HIGHEST_M)
+    records = np.zeros(int(valid.sum()), RECORD)
+    records["height"] = np.rint(height[valid] * PER_METRE)
+    records["kind"] = chunk.kind[valid]
+    if chunk.colour is not None:
+        records["colour"] = colours.bytes(chunk.colour[valid])
+    plan = np.stack([easting[valid], northing[valid]])
+    return np.rint(plan * PER_METRE).astype(np.int64), records
+
+
+@contextlib.contextmanager
+def disk_errors(out: Path) -> Iterator[None]:
+    """Context manager that turns an `OSError` of the disk into a `ConfigError` of one line.
+
+    Raises
+    ------
+    ConfigError
+        If the disk is full or the folder cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(
+            f"cannot write to {out}: {error.strerror or error}; free disk space and repeat"
+        ) from error
+
+
+@contextlib.contextmanager
+def scratch_folder(out: Path) -> Iterator[Path]:
+    """Context manager that makes a hidden temporary folder inside ``out`` and removes it at the end.
+
+    ``out`` is created if it does not exist, and removed again if nothing was written to it.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    """
+    # Same prefix as the folders of `RasterWriter`, which removes those of killed processes.
+    folder, new = out / f".prepare-points-{os.getpid()}", not out.exists()
+    shutil.rmtree(folder, ignore_errors=True)
+    with disk_errors(out):
+        folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if new:
+            # Fails, as intended, if the folder has published rasters.
+            with contextlib.suppress(OSError):
+                out.rmdir()
