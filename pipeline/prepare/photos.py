@@ -23,7 +23,7 @@ from flexroad.pipeline.prepare.point_buckets import disk_errors, scratch_folder
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset
 from flexroad.tasks import TaskError
 from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
-from flexroad.tasks.acquire.photos.exif import Placed, place, read_control, read_shot
+from flexroad.tasks.acquire.photos.exif import PlacedPhotos, place_photos, read_control, read_shot
 from flexroad.tasks.acquire.photos.mvs_cpu import Cloud
 from flexroad.tasks.acquire.photos.poisson import poisson
 from flexroad.tasks.acquire.photos.sfm import Reconstruction, View
@@ -106,7 +106,7 @@ def prepare_photos(
         If pycolmap is missing, a photograph has no position, or they do not match; no files are left behind.
     """
     sfm.colmap()
-    placed = place([read_shot(path) for path in _files(images)], common.to_crs)
+    placed = place_photos([read_shot(path) for path in _files(images)], common.to_crs)
     control = photos_options.control and read_control(
         photos_options.control, placed, photos_options.control_crs
     )
@@ -160,11 +160,11 @@ def _files(images: Iterable[Path]) -> list[Path]:
     return list(files)
 
 
-def _cameras(placed: Placed) -> str:
+def _cameras(placed: PlacedPhotos) -> str:
     return ", ".join(sorted({shot.camera or "unknown camera" for shot in placed.shots}))
 
 
-def _date(placed: Placed) -> datetime | None:
+def _date(placed: PlacedPhotos) -> datetime | None:
     taken = [shot.taken.timestamp() for shot in placed.shots if shot.taken]
     return datetime.fromtimestamp(statistics.median_low(taken), UTC) if taken else None
 
@@ -192,7 +192,7 @@ def _round_up(metres: float) -> float:
     return round(next(step for step in (1, 2, 5, 10) if step * power >= metres * (1 - 1e-9)) * power, 9)
 
 
-def _notes(result: Reconstruction, placed: Placed, has_control: bool) -> tuple[str, ...]:
+def _notes(result: Reconstruction, placed: PlacedPhotos, has_control: bool) -> tuple[str, ...]:
     (plan, height), accuracy = result.gnss_m, placed.accuracy.max(axis=0)
     notes = [
         f"{len(result.views)} of {len(placed.shots)} photographs placed, mean reprojection error "
@@ -254,7 +254,7 @@ def _jobs(
     for number, view in enumerate(result.views):
         others = tuple(result.views[other] for other in mvs_cpu.partners(result, number, options))
         if len(others) >= 2:
-            sparse = result.points[view.seen]
+            sparse = result.points[view.visible]
             yield DepthJob(view, others, sparse, options, spacing, folder / f"{number}.npz")
 
 

@@ -112,10 +112,10 @@ def _no_overlap(path: Path, grid: Grid) -> ConfigError:
 
 def _mesh(path: Path, grid: Grid) -> Bools:
     from flexroad.tasks.acquire.mesh.read import read_mesh
-    from flexroad.tasks.acquire.mesh.sample import cover, in_metres
+    from flexroad.tasks.acquire.mesh.sample import covered_cells, in_metres
 
     mesh = read_mesh(path, colours=False)
-    return cover(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
+    return covered_cells(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
 
 
 def _raster(path: Path, grid: Grid) -> Bools | None:

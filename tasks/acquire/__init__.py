@@ -1,1 +1,1 @@
-"""Before there are rasters: the paper's step A, from points, meshes and photographs to DSM, DTM and DOP."""
+"""Data acquisition, the paper's step A: DSM, DTM and DOP from points, meshes and photographs."""

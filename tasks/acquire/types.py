@@ -1,4 +1,4 @@
-"""What travels between the makers of rasters: points in metres, and the rasters of a piece of ground."""
+"""Data types of the acquisition: points in metres, and the rasters made from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """A point cloud, in the metric CRS of the rasters it is to become."""
+    """A point cloud in the metric CRS of the rasters."""
 
     easting: Floats
     """``(n,)``, m."""
@@ -22,7 +22,7 @@ class Points:
     height: Floats
     """``(n,)``, m."""
     kind: NDArray[np.uint8]
-    """Class by ASPRS, ``(n,)``: 2 is ground, 17 a bridge deck; 0 and 1 say nothing."""
+    """Class by ASPRS, ``(n,)``: 2 is ground, 17 a bridge deck, 0 and 1 are unclassified."""
     colour: NDArray[np.uint8] | None = None
     """Red, green, blue, ``(n, 3)``, or None if the source has no colours."""
 
@@ -30,25 +30,25 @@ class Points:
         """Return the number of points."""
         return len(self.height)
 
-    def __getitem__(self, which: slice | Bools | NDArray[np.intp]) -> Points:
-        """Return some of the points: by a slice, a mask or indices."""
-        colour = None if self.colour is None else self.colour[which]
-        return Points(self.easting[which], self.northing[which], self.height[which], self.kind[which], colour)
+    def __getitem__(self, key: slice | Bools | NDArray[np.intp]) -> Points:
+        """Return a subset of the points, by a slice, a mask or indices."""
+        colour = None if self.colour is None else self.colour[key]
+        return Points(self.easting[key], self.northing[key], self.height[key], self.kind[key], colour)
 
 
 @dataclass(frozen=True, eq=False)
 class Rasters:
-    """What a piece of ground came to be."""
+    """The rasters of an area."""
 
     grid: Grid
     """The cells of the heights."""
     dsm: Floats
-    """Highest point per cell, ``(H, W)``, m; NaN where unknown."""
+    """Highest point per cell, ``(H, W)``, m; NaN where there is none."""
     dtm: Floats
-    """Bare ground, ``(H, W)``, m; NaN where unknown."""
+    """Bare ground, ``(H, W)``, m; NaN where there is none."""
     ground: Bools
-    """Cells with points on the ground, ``(H, W)``; the DTM is inferred in the others."""
+    """Cells with ground points, ``(H, W)``; in the others the DTM is interpolated."""
     bridges: Floats | None = None
-    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there is none."""
+    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere; None if there are none."""
     photo: Orthophoto | None = None
-    """None if the points have no colours."""
+    """The orthophoto; None if the points have no colours."""

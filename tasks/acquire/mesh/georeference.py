@@ -1,4 +1,4 @@
-"""Where in the world a mesh lies: the CRS and the offset that its own coordinates lack."""
+"""Georeference of a mesh: the CRS and the offset of its local coordinates."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 Offset = tuple[float, float, float]
-"""Easting, northing and height of the mesh's zero, in units of its CRS."""
+"""Easting, northing and height of the mesh's origin, in units of its CRS."""
 
-LOCAL = 10_000.0
-"""Coordinates below this in both directions are no place in any usual CRS, but relative to something."""
-FOLDERS = 3
-"""A mesh's own folder and so many less one above it are searched for a sidecar."""
+LOCAL_BELOW = 10_000.0
+"""If all plan coordinates are smaller than this, they are taken as local, not as coordinates of a CRS."""
+SEARCHED_FOLDERS = 3
+"""Number of folders searched for a sidecar file: the mesh's own and those above it."""
 
 
 @dataclass(frozen=True)
-class Placement:
-    """What is known of where a mesh lies."""
+class Georeference:
+    """CRS and offset of a mesh, each None if not given."""
 
     crs: str | None = None
     offset: Offset | None = None
 
-    def over(self, other: Placement) -> Placement:
-        """Return what this one says and, where it is silent, the other."""
-        return Placement(
+    def with_fallback(self, other: Georeference) -> Georeference:
+        """Return a copy with missing values taken from another one."""
+        return Georeference(
             other.crs if self.crs is None else self.crs, other.offset if self.offset is None else self.offset
         )
 
     def apply(self, path: Path, vertices: Floats) -> tuple[str, Floats]:
-        """Return the CRS and the vertices in it, ``(V, 3)``.
+        """Return the CRS and the vertices with the offset added, ``(V, 3)``.
 
         Raises
         ------
         TaskError
-            If the CRS is not known or is none, or the vertices are local and no offset is known.
+            If the CRS is missing or invalid, or the vertices are local and there is no offset.
         """
-        local = self.offset is None and bool(np.nanmax(np.abs(vertices[:, :2])) < LOCAL)
+        local = self.offset is None and bool(np.nanmax(np.abs(vertices[:, :2])) < LOCAL_BELOW)
         if self.crs is None or local:
-            lacks = "in which CRS it is" if not local else "where it lies"
+            missing = "georeference" if local else "CRS"
             raise TaskError(
-                f"{path} does not say {lacks}, and neither data_meta.json, coords.txt nor .prj beside it or "
-                "up to two folders above does; give --crs EPSG:... and --offset EASTING,NORTHING,HEIGHT",
+                f"{path} has no {missing}, and no data_meta.json, coords.txt or .prj in its folder or up to "
+                "two folders above has one; give --crs EPSG:... and --offset EASTING NORTHING HEIGHT",
                 file=str(path),
             )
         try:
@@ -58,36 +58,36 @@ class Placement:
             raise TaskError(f"{path}: {error}", file=str(path)) from error
 
 
-def beside(path: Path) -> Placement:
-    """Read the nearest sidecar of a mesh, in its folder or up to two above; empty if there is none.
+def read_sidecar(path: Path) -> Georeference:
+    """Read the nearest sidecar file of a mesh, in its folder or up to two above; empty if there is none.
 
-    Known are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``coords.txt``, also in
-    ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan; heights are true), and a ``.prj``
-    (the CRS alone).
+    Supported are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``coords.txt``, also in
+    ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan, none in height), and ``.prj``
+    (only the CRS).
 
     Raises
     ------
     TaskError
-        If a sidecar is not what its name says; the line names it.
+        If a sidecar file cannot be parsed.
     """
-    found = Placement()
-    for folder in path.resolve().parents[:FOLDERS]:
+    result = Georeference()
+    for folder in path.resolve().parents[:SEARCHED_FOLDERS]:
         for name, read in (
             ("data_meta.json", _deepscenario),
             ("coords.txt", _odm),
             ("odm_georeferencing/coords.txt", _odm),
         ):
             if (folder / name).is_file():
-                return found.over(read(folder / name))
-        found = found.over(_prj(folder, path.stem))
-    return found
+                return result.with_fallback(read(folder / name))
+        result = result.with_fallback(_prj(folder, path.stem))
+    return result
 
 
-def _deepscenario(path: Path) -> Placement:
+def _deepscenario(path: Path) -> Georeference:
     try:
         reference = json.loads(path.read_text(encoding="utf-8"))["reference_utm"]
         (zone, half), (east, north, up) = reference["zone"], map(float, reference["offset"])
-        return Placement(_utm(int(zone), str(half)), (east, north, up))
+        return Georeference(_utm(int(zone), str(half)), (east, north, up))
     except (KeyError, TypeError, ValueError) as error:
         raise TaskError(
             f'{path} has no reference_utm with a zone like [17, "N"] and an offset of three numbers: '
@@ -96,7 +96,7 @@ def _deepscenario(path: Path) -> Placement:
         ) from error
 
 
-def _odm(path: Path) -> Placement:
+def _odm(path: Path) -> Georeference:
     head, _, rest = path.read_text(encoding="utf-8", errors="replace").strip().partition("\n")
     zone = re.fullmatch(r"WGS84 UTM (\d{1,2})\s?([NS])", head.strip(), re.IGNORECASE)
     try:
@@ -106,15 +106,15 @@ def _odm(path: Path) -> Placement:
             f"{path} has no CRS in its first line and an offset in its second; give --crs and --offset",
             file=str(path),
         ) from error
-    return Placement(_utm(int(zone[1]), zone[2]) if zone else head.strip(), (east, north, 0.0))
+    return Georeference(_utm(int(zone[1]), zone[2]) if zone else head.strip(), (east, north, 0.0))
 
 
-def _prj(folder: Path, stem: str) -> Placement:
+def _prj(folder: Path, stem: str) -> Georeference:
     own = folder / f"{stem}.prj"
     files = [own] if own.is_file() else sorted(folder.glob("*.prj"))
     if len(files) != 1:
-        return Placement()
-    return Placement(files[0].read_text(encoding="utf-8", errors="replace").strip())
+        return Georeference()
+    return Georeference(files[0].read_text(encoding="utf-8", errors="replace").strip())
 
 
 def _utm(zone: int, half: str) -> str:

@@ -1,7 +1,7 @@
-"""A textured mesh as points and as an orthophoto: what a laser scanner and a camera above it would see.
+"""Points and an orthophoto from a textured mesh: random samples of its surface, and its view from above.
 
-Which side a face turns up, and whether edges are shared by two faces or by ten, changes neither: a mesh
-that is inside out or not manifold is as good as another here.
+Neither depends on the orientation of faces or on the number of faces at an edge: the mesh may be inside out
+or not manifold.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 CHUNK = 500_000
-"""Points, or rays of the orthophoto, coloured at a time: memory does not grow with the area."""
+"""Points, or rays of the orthophoto, processed at a time, so that memory does not grow with the area."""
 MOST_RAYS = 4
-"""The finest sub-pixels of the orthophoto: so many across a pixel."""
+"""Largest number of rays across a pixel of the orthophoto."""
 TOLERANCE_M = 1e-6
-"""A ray this far outside a triangle still hits it: none passes between two neighbours."""
+"""A ray this far outside a triangle still hits it, so that no ray passes between two neighbours."""
 
 Faces = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """Triangles in the world, with the colours they carry."""
+    """Georeferenced triangles with their colours."""
 
     crs: str
     """CRS of the vertices."""
@@ -40,15 +40,15 @@ class TexturedMesh:
     faces: Faces
     """``(F, 3)``, indices of vertices."""
     texture: NDArray[np.int32]
-    """``(F,)``, the face's index in `textures`; -1 where it has none."""
+    """``(F,)``, index of the face's texture in `textures`; -1 if it has none."""
     textures: tuple[NDArray[np.uint8], ...] = ()
     """Red, green, blue, ``(h, w, 3)`` each."""
     uv: NDArray[np.float32] | None = None
-    """Where a face's corners lie in its texture, ``(F, 3, 2)``: 0 to 1 from the left and from below."""
+    """Texture coordinates of the corners of faces, ``(F, 3, 2)``: 0 to 1 from the left and from below."""
     colours: NDArray[np.uint8] | None = None
     """Red, green, blue of the corners of faces without a texture, ``(F, 3, 3)``."""
     notes: tuple[str, ...] = ()
-    """What is odd about the mesh without doing harm, one line each."""
+    """Harmless defects of the mesh, one line each."""
 
     @property
     def coloured(self) -> bool:
@@ -64,14 +64,14 @@ class TexturedMesh:
 
     @property
     def normals(self) -> Floats:
-        """Normals of the faces, twice their area long, ``(F, 3)``."""
+        """Normals of the faces, ``(F, 3)``; their length is twice the area of the face."""
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         normals: Floats = np.cross(b - a, c - a)
         return normals
 
     @property
     def area(self) -> float:
-        """Area of the surface."""
+        """Area of the surface, in squared units of the CRS."""
         return float(np.linalg.norm(self.normals, axis=1).sum() / 2)
 
 
@@ -81,17 +81,17 @@ def in_metres(mesh: TexturedMesh, frame: MetricTransform) -> TexturedMesh:
     Raises
     ------
     CatalogError
-        If the mesh lies where that CRS has no coordinates.
+        If the mesh is outside the area of that CRS.
     """
     return replace(mesh, crs=frame.target, vertices=np.column_stack(frame.metres(*mesh.vertices.T)))
 
 
 def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
-    """Yield points that lie evenly on the mesh's surface, chunk by chunk.
+    """Yield points evenly distributed on the mesh's surface, chunk by chunk.
 
-    The surface is cut into equal shares, each with one point at random in it. Shares follow one another
-    along the faces, so that every piece of surface gets points by its area, like with independent points,
-    but with fewer clumps and gaps. Equal input gives equal points.
+    Stratified sampling: the surface is divided, along the sequence of faces, into parts of equal area with
+    one random point each. The density is that of independent points, with fewer clusters and gaps. Equal
+    input gives equal points.
 
     Parameters
     ----------
@@ -100,21 +100,21 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
     density : float
         Points per m2 of surface.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
 
     Yields
     ------
     Points
-        At most `CHUNK`, with colours if all faces have some.
+        At most `CHUNK` points, with colours if all faces have a colour.
     """
     rng = np.random.default_rng(seed)
-    reached = np.cumsum(np.linalg.norm(mesh.normals, axis=1) / 2)
-    total = max(1, round(reached[-1] * density))
+    cumulative = np.cumsum(np.linalg.norm(mesh.normals, axis=1) / 2)
+    total = max(1, round(cumulative[-1] * density))
     for first in range(0, total, CHUNK):
         draw = rng.random((min(CHUNK, total - first), 3))
-        place = (first + np.arange(len(draw)) + draw[:, 0]) * (reached[-1] / total)
-        face = np.minimum(np.searchsorted(reached, place, side="right"), len(reached) - 1)
-        # The root spreads points evenly over a triangle, which is wide at one end.
+        position = (first + np.arange(len(draw)) + draw[:, 0]) * (cumulative[-1] / total)
+        face = np.minimum(np.searchsorted(cumulative, position, side="right"), len(cumulative) - 1)
+        # The square root gives a uniform distribution over the triangle.
         along, across = np.sqrt(draw[:, 1]), draw[:, 2]
         weights = np.stack([1 - along, along * (1 - across), along * across], axis=1)
         east, north, up = np.einsum("nk,nkd->dn", weights, mesh.vertices[mesh.faces[face]])
@@ -123,100 +123,101 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
 
 
 def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
-    """Draw the mesh as seen from straight above: the colour of the highest surface under each ray.
+    """Draw the mesh from above: each vertical ray has the colour of the highest surface it hits.
 
-    Where the texture is finer than the pixels, several rays a pixel, `MOST_RAYS` across at most, are
-    averaged; none of them sees what lies below another surface.
+    If the texture is finer than the pixels, several rays per pixel are averaged, at most `MOST_RAYS` across.
 
     Parameters
     ----------
     mesh : TexturedMesh
-        All faces with a colour, in a CRS in metres.
+        Must be in a CRS in metres, and all faces must have a colour.
     grid : Grid
         The pixels.
 
     Returns
     -------
-    Photo
-        Pixels are known where at least one of their rays hits the mesh.
+    Orthophoto
+        Pixels are valid where at least one of their rays hits the mesh.
     """
     rays = _rays(mesh, grid.cell)
     colour = np.zeros((3, *grid.shape), np.uint8)
-    known = np.zeros(grid.shape, bool)
+    valid = np.zeros(grid.shape, bool)
     rows = max(1, CHUNK // (rays**2 * grid.width))
     for first in range(0, grid.height, rows):
         band = slice(first, min(first + rows, grid.height))
-        colour[:, band], known[band] = _band(mesh, grid, band, rays)
-    return Orthophoto(grid, colour, known)
+        colour[:, band], valid[band] = _draw_rows(mesh, grid, band, rays)
+    return Orthophoto(grid, colour, valid)
 
 
-def tops(mesh: TexturedMesh, grid: Grid) -> Floats:
-    """Return the height of the highest surface over each cell's centre, ``(H, W)``; NaN where none is."""
-    return _look_down(mesh, grid)[0]
+def surface_heights(mesh: TexturedMesh, grid: Grid) -> Floats:
+    """Return the height of the highest surface at each cell's centre, ``(H, W)``; NaN where there is none."""
+    return _project_down(mesh, grid)[0]
 
 
-def cover(mesh: TexturedMesh, grid: Grid) -> Bools:
-    """Return the cells whose centre lies below or above a face, ``(H, W)``."""
-    return _look_down(mesh, grid)[1] >= 0
+def covered_cells(mesh: TexturedMesh, grid: Grid) -> Bools:
+    """Return the cells whose centre is inside a face in plan, ``(H, W)``."""
+    return _project_down(mesh, grid)[1] >= 0
 
 
-def _band(mesh: TexturedMesh, grid: Grid, rows: slice, rays: int) -> tuple[NDArray[np.uint8], Bools]:
-    """Draw some rows of a photo."""
+def _draw_rows(mesh: TexturedMesh, grid: Grid, rows: slice, rays: int) -> tuple[NDArray[np.uint8], Bools]:
+    """Return colours, ``(3, h, W)``, and validity, ``(h, W)``, of some rows of an orthophoto."""
     height = rows.stop - rows.start
     north = grid.north - rows.start * grid.cell
     fine = Grid(grid.crs, grid.west, north, grid.cell / rays, grid.width * rays, height * rays)
-    _, owner = _look_down(mesh, fine)
-    row, col = np.nonzero(owner >= 0)
-    face = owner[row, col]
+    _, face_index = _project_down(mesh, fine)
+    row, col = np.nonzero(face_index >= 0)
+    face = face_index[row, col]
     colour = np.zeros((*fine.shape, 3), np.float32)
     weights = np.empty((len(face), 3))
     _weights(mesh.vertices, mesh.faces[face], fine.eastings[col], fine.northings[row], weights)
     colour[row, col] = _colour(mesh, face, weights)
     pixels = height, rays, grid.width, rays
-    hits = (owner >= 0).reshape(pixels).sum(axis=(1, 3))
+    hits = (face_index >= 0).reshape(pixels).sum(axis=(1, 3))
     mean = colour.reshape(*pixels, 3).sum(axis=(1, 3)) / np.maximum(hits, 1)[..., None]
     return np.moveaxis(mean.round().astype(np.uint8), -1, 0), hits > 0
 
 
 def _rays(mesh: TexturedMesh, pixel: float) -> int:
-    """Return how many rays across a pixel the textures are worth: the pixel in texels of the median face."""
+    """Return the number of rays across a pixel: the size of the pixel in texels of the median face."""
     if mesh.uv is None:
         return 1
     texels = np.array([t.shape[0] * t.shape[1] for t in mesh.textures] or [0])[mesh.texture]
     (u, v), (s, t) = np.moveaxis(mesh.uv[:, 1:] - mesh.uv[:, :1], 0, -1)
-    seen = (mesh.texture >= 0) & (np.abs(u * t - v * s) > 0)
-    if not seen.any():
+    textured = (mesh.texture >= 0) & (np.abs(u * t - v * s) > 0)
+    if not textured.any():
         return 1
-    size = np.sqrt(np.linalg.norm(mesh.normals, axis=1)[seen] / (np.abs(u * t - v * s) * texels)[seen])
+    size = np.sqrt(
+        np.linalg.norm(mesh.normals, axis=1)[textured] / (np.abs(u * t - v * s) * texels)[textured]
+    )
     return int(np.clip(math.ceil(pixel / max(float(np.median(size)), 1e-9) - 0.01), 1, MOST_RAYS))
 
 
 @compiled()
 def _weights(vertices: Floats, corners: Faces, east: Floats, north: Floats, weights: Floats) -> None:
-    """Find how much each corner of a face, ``(n, 3)``, counts at a place in plan."""
+    """Compute barycentric weights of the corners of faces, ``(n, 3)``, at positions in plan."""
     for n in range(corners.shape[0]):
         a, b, c = vertices[corners[n, 0]], vertices[corners[n, 1]], vertices[corners[n, 2]]
         ax, ay, bx, by = a[0] - east[n], a[1] - north[n], b[0] - east[n], b[1] - north[n]
         cx, cy = c[0] - east[n], c[1] - north[n]
         of_a, of_b, of_c = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
         side = 1.0 if of_a + of_b + of_c > 0 else -1.0
-        # A ray just outside has a weight just below zero.
+        # A ray slightly outside has a weight slightly below zero.
         of_a, of_b, of_c = max(side * of_a, 0.0), max(side * of_b, 0.0), max(side * of_c, 0.0)
         whole = of_a + of_b + of_c
         weights[n, 0], weights[n, 1], weights[n, 2] = of_a / whole, of_b / whole, of_c / whole
 
 
 def _colour(mesh: TexturedMesh, face: Faces | NDArray[np.intp], weights: Floats) -> NDArray[np.float32]:
-    """Return the colour at places on faces, ``(n, 3)``, 0 to 255."""
+    """Return the colours at points on faces, ``(n, 3)``, 0 to 255, by barycentric ``weights``, ``(n, 3)``."""
     colour = np.zeros((len(face), 3), np.float32)
     if mesh.colours is not None:
         colour[:] = np.einsum("nk,nkd->nd", weights, mesh.colours[face])
     if mesh.uv is None:
         return colour
-    which = mesh.texture[face]
+    texture_index = mesh.texture[face]
     for index, texture in enumerate(mesh.textures):
-        here = np.flatnonzero(which == index)
-        _texels(texture, mesh.uv, face, weights, here, colour)
+        selected = np.flatnonzero(texture_index == index)
+        _texels(texture, mesh.uv, face, weights, selected, colour)
     return colour
 
 
@@ -226,12 +227,12 @@ def _texels(
     uv: NDArray[np.float32],
     face: Faces | NDArray[np.intp],
     weights: Floats,
-    here: NDArray[np.int64],
+    selected: NDArray[np.int64],
     colour: NDArray[np.float32],
 ) -> None:
-    """Read a texture at some of the places, between texels (bilinear); outside 0 to 1 it repeats."""
+    """Sample a texture bilinearly at the selected points; coordinates outside 0 to 1 repeat it."""
     height, width = texture.shape[:2]
-    for n in here:
+    for n in selected:
         u = v = 0.0
         for corner in range(3):
             u += weights[n, corner] * uv[face[n], corner, 0]
@@ -252,9 +253,9 @@ def _texels(
             colour[n, band] = above * (1 - south) + below * south
 
 
-def _look_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
-    """Return height and face of the highest surface over each centre, ``(H, W)``; NaN and -1 if none is."""
-    # By column and row counted in metres from the north-western cell's centre: small numbers.
+def _project_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
+    """Return height and face of the highest surface at each centre, ``(H, W)``; NaN and -1 without one."""
+    # Column and row in metres from the centre of the north-western cell: small numbers.
     points = np.column_stack(
         [
             mesh.vertices[:, 0] - (grid.west + grid.cell / 2),
@@ -262,14 +263,14 @@ def _look_down(mesh: TexturedMesh, grid: Grid) -> tuple[Floats, Faces]:
             mesh.vertices[:, 2],
         ]
     )
-    heights, owner = np.full(grid.shape, np.nan), np.full(grid.shape, -1, np.int32)
-    _raster(points, np.ascontiguousarray(mesh.faces, np.int32), grid.cell, heights, owner)
-    return heights, owner
+    heights, face_index = np.full(grid.shape, np.nan), np.full(grid.shape, -1, np.int32)
+    _raster(points, np.ascontiguousarray(mesh.faces, np.int32), grid.cell, heights, face_index)
+    return heights, face_index
 
 
 @compiled()
-def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, owner: Faces) -> None:
-    """Keep, per centre, the highest of the faces over it; of equal ones the first."""
+def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, face_index: Faces) -> None:
+    """Set height and face of the highest surface at each centre; of equal heights the first face counts."""
     rows, cols = heights.shape
     for f in range(faces.shape[0]):
         ax, ay, az = points[faces[f, 0]]
@@ -283,11 +284,11 @@ def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, owner: F
         longest = max(
             math.hypot(cx - bx, cy - by), math.hypot(cx - ax, cy - ay), math.hypot(bx - ax, by - ay)
         )
-        # A wall is a line from above: what stands on its edges is hit by its neighbours.
+        # A vertical face is a line in plan: rays at its edges hit the neighbouring faces.
         if abs(area) <= TOLERANCE_M * longest:
             continue
         side = 1.0 if area > 0 else -1.0
-        # How far the doubled areas opposite to the corners may be negative: tolerance times edge.
+        # Lower limit of the doubled sub-triangle areas: tolerance times edge length.
         slack = -TOLERANCE_M * longest
         first_col = max(0, math.ceil((min(ax, bx, cx) - TOLERANCE_M) / cell))
         last_col = min(cols - 1, math.floor((max(ax, bx, cx) + TOLERANCE_M) / cell))
@@ -302,7 +303,7 @@ def _raster(points: Floats, faces: Faces, cell: float, heights: Floats, owner: F
                 if of_a < slack or of_b < slack or of_c < slack:
                     continue
                 height = (of_a * az + of_b * bz + of_c * cz) / abs(area)
-                # Just outside a steep face its plane runs away.
+                # Slightly outside a steep face, its plane is far above or below the face.
                 height = min(max(height, lowest), highest)
-                if owner[r, c] < 0 or height > heights[r, c]:
-                    heights[r, c], owner[r, c] = height, f
+                if face_index[r, c] < 0 or height > heights[r, c]:
+                    heights[r, c], face_index[r, c] = height, f

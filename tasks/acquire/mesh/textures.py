@@ -1,6 +1,6 @@
-"""The textures a mesh file names, and the plain colours of materials that have none.
+"""Textures of a mesh file, and the plain colours of materials without a texture.
 
-Readers of meshes pass over a texture they cannot find or decode; here it is an error that names the file.
+Mesh libraries ignore a texture that is missing or cannot be decoded; here it is an error that names the file.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from flexroad.tasks.errors import TaskError
 
 
-class Images:
-    """The textures of one file, decoded once each."""
+class Textures:
+    """The textures of one mesh file; each is decoded once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files = _texture_files(path)
-        self._held: dict[Any, NDArray[np.uint8]] = {}
+        self._decoded: dict[Any, NDArray[np.uint8]] = {}
 
-    def of(self, visual: Any) -> NDArray[np.uint8] | None:
-        """Return the texture of a material, if it has one."""
+    def texture(self, visual: Any) -> NDArray[np.uint8] | None:
+        """Return the texture of a material, ``(h, w, 3)``, or None if it has none."""
         material = getattr(visual, "material", None)
         file = self.files.get(getattr(material, "name", "") or "") or self.files.get("")
         if file is None and self.path.suffix.lower() in (".glb", ".gltf"):
@@ -31,17 +31,17 @@ class Images:
         if file is None:
             return None
         key = file if isinstance(file, Path) else id(file)
-        if key not in self._held:
-            self._held[key] = _decoded(self.path, file)
-        return self._held[key]
+        if key not in self._decoded:
+            self._decoded[key] = _decode(self.path, file)
+        return self._decoded[key]
 
-    def plain(self, visual: Any) -> NDArray[np.uint8] | None:
-        """Return the one colour of a material without a texture, ``(3,)``."""
+    def plain_colour(self, visual: Any) -> NDArray[np.uint8] | None:
+        """Return the colour of a material without a texture, ``(3,)``, or None if it has none."""
         material: Any = getattr(visual, "material", None)
         if "kd" in getattr(material, "kwargs", {}):
             return np.asarray(material.diffuse[:3], np.uint8)
         factor = getattr(material, "baseColorFactor", None)
-        # Texture coordinates without a texture tell of one that got lost.
+        # Texture coordinates without a texture mean that the texture is missing.
         if factor is None or getattr(visual, "uv", None) is not None:
             return None
         linear = np.asarray(factor[:3], np.float64) / 255
@@ -50,7 +50,7 @@ class Images:
 
 
 def _texture_files(path: Path) -> dict[str, Path]:
-    """Return the texture file of each material; the one of a PLY has no name."""
+    """Return the texture file by material; for PLY the material's name is empty."""
     suffix = path.suffix.lower()
     if suffix == ".obj":
         return _of_mtl(path)
@@ -73,8 +73,8 @@ def _of_mtl(path: Path) -> dict[str, Path]:
     mtl = path.parent / library
     if not mtl.is_file():
         raise TaskError(
-            f"{path} takes its materials from {library}, which is not beside it; put it there, or leave the "
-            "orthophoto out: --no-dop",
+            f"{path} needs the material file {library}, which is not beside it; put it there, or make no "
+            "orthophoto: --no-dop",
             file=str(path),
         )
     files, material = {}, ""
@@ -87,26 +87,25 @@ def _of_mtl(path: Path) -> dict[str, Path]:
     return files
 
 
-def _decoded(path: Path, source: Any) -> NDArray[np.uint8]:
-    """Return a texture as ``(h, w, 3)``, from a file or from an image that is open already."""
+def _decode(path: Path, source: Any) -> NDArray[np.uint8]:
+    """Return a texture as ``(h, w, 3)``, from a file or an open image."""
     from PIL import Image
 
-    name = source if isinstance(source, Path) else "inside"
+    name = f"{source} of {path}" if isinstance(source, Path) else f"in {path}"
     if isinstance(source, Path) and not source.is_file():
         raise TaskError(
-            f"{path} wants the texture {source}, which is not there; put it there, or leave the orthophoto "
-            "out: --no-dop",
+            f"{path} needs the texture {source}, which does not exist; put it there, or make no orthophoto: "
+            "--no-dop",
             file=str(path),
         )
-    # An atlas of 16,384 x 16,384 texels is no attack.
+    # Texture atlases of 16,384 x 16,384 texels exceed the default limit of Pillow.
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         image = Image.open(source) if isinstance(source, Path) else source
         return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise TaskError(
-            f"the texture {name} of {path} cannot be read: {error}; export it again, or leave the orthophoto "
-            "out: --no-dop",
+            f"the texture {name} cannot be read: {error}; export it again, or make no orthophoto: --no-dop",
             file=str(path),
         ) from error
     finally:

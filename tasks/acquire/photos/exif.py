@@ -1,7 +1,8 @@
-"""Where photographs were taken: GNSS tags of the files, ground control points, and their metric frame.
+"""Camera positions from GNSS tags of photographs, and ground control points, in a metric CRS.
 
-Heights stay what the camera says. Cheap receivers are metres off in height, and many drones add a constant
-of their own; no file tells it, so nothing is corrected in silence: `Placed.heights` says what they are.
+Heights are used as written by the camera. Simple receivers have errors of metres in height, and many drones
+add an offset that is not in the file. Heights are therefore not corrected; `PlacedPhotos.heights` is their
+datum.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 GNSS_M = (3.0, 5.0)
-"""Accuracy in plan and height of a receiver without corrections, where the file says none (m)."""
+"""Accuracy in plan and height of a receiver without corrections, if the file has none (m)."""
 RTK_M = {50: (0.03, 0.06), 34: (0.5, 1.0)}
-"""The same by DJI's RtkFlag: 50 is a fixed solution, 34 a floating one."""
+"""The same by DJI's RtkFlag: 50 is a fixed solution, 34 a float solution."""
 FAR_M = 1000.0
-"""A larger gap between neighbours makes two places."""
+"""Photographs farther than this from all others belong to another place (m)."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
+"""Diagonal of 35 mm film."""
 WIDEST = 3 / 2
-"""Sensors are no wider than this; a wider picture is a crop of its rows."""
+"""Largest aspect ratio of a sensor; a wider photograph is cropped in height."""
 SEA_LEVEL, ELLIPSOID = "above mean sea level", "above the WGS 84 ellipsoid"
 ALTITUDE_REF = {0: (1, SEA_LEVEL), 1: (-1, SEA_LEVEL), 2: (1, ELLIPSOID), 3: (-1, ELLIPSOID)}
 """EXIF's GPSAltitudeRef: sign and datum."""
@@ -39,7 +41,7 @@ ALTITUDE_REF = {0: (1, SEA_LEVEL), 1: (-1, SEA_LEVEL), 2: (1, ELLIPSOID), 3: (-1
 
 @dataclass(frozen=True)
 class Shot:
-    """What one photograph's file tells."""
+    """Metadata of one photograph."""
 
     path: Path
     width: int
@@ -49,16 +51,17 @@ class Shot:
     latitude: float
     """Degrees north."""
     altitude: float
-    """As the camera says (m)."""
+    """As written by the camera (m)."""
     accuracy: tuple[float, float]
     """Standard deviation in plan and height (m)."""
     heights: str
-    """What the altitude is counted from, by the file."""
+    """Datum of the altitude, in words."""
     camera: str
     """Make and model; photographs of one camera and focal length are calibrated together."""
     focal_px: float | None
-    """Focal length by the file (pixels), None if it tells none."""
+    """Focal length (pixels); None if the file has none."""
     taken: datetime | None
+    """Time of exposure; None if the file has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +72,7 @@ class Control:
     points: Floats
     """Easting, northing, height, ``(n, 3)``, m."""
     marks: tuple[Mapping[Path, tuple[float, float]], ...]
-    """Per point the pixel it is seen at: column and row from the upper left corner of each photograph."""
+    """Per point its pixel in each photograph: column and row from the upper left corner."""
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -77,7 +80,7 @@ class Control:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedPhotos:
     """Photographs in one metric frame."""
 
     crs: str
@@ -87,7 +90,7 @@ class Placed:
     accuracy: Floats
     """Standard deviations of the positions, ``(n, 3)``, m."""
     heights: str
-    """What heights are counted from, in words."""
+    """Datum of the heights, in words."""
 
 
 def read_shot(path: Path) -> Shot:
@@ -98,13 +101,13 @@ def read_shot(path: Path) -> Shot:
     Raises
     ------
     TaskError
-        If the file is no image or has no GNSS position.
+        If the file is not an image or has no GNSS position.
     """
     try:
         with Image.open(path) as image:
             exif, (width, height) = image.getexif(), image.size
             xmp = _xmp(image.info.get("xmp", b""))
-            # A file that was cut off shows only when its pixels are read.
+            # A truncated file is only detected when its pixels are read.
             image.draft("L", (width // 8, height // 8))
             image.load()
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
@@ -139,72 +142,72 @@ def read_shot(path: Path) -> Shot:
     )
 
 
-def place(shots: Sequence[Shot], to_crs: str | None = None) -> Placed:
-    """Move the cameras' positions into one metric frame: the UTM zone of the place, or ``to_crs``.
+def place_photos(shots: Sequence[Shot], to_crs: str | None = None) -> PlacedPhotos:
+    """Transform the camera positions to one metric CRS: the UTM zone of the place, or ``to_crs``.
 
     Raises
     ------
     TaskError
-        If there are fewer than 3 photographs, or they come from different places.
+        If there are fewer than 3 photographs, or they are from different places.
     CatalogError
-        If ``to_crs`` is no CRS.
+        If ``to_crs`` is not a CRS.
     """
     if len(shots) < 3:
-        raise TaskError(f"{len(shots)} photographs are too few: it takes 3 that overlap")
+        raise TaskError(f"{len(shots)} photographs are too few; at least 3 that overlap are needed")
     longitude, latitude = (np.array([getattr(s, a) for s in shots]) for a in ("longitude", "latitude"))
     crs = in_plan(to_crs or utm_of((longitude.min(), latitude.min(), longitude.max(), latitude.max())))
     if plan_unit(crs)[1] != 1 or plan_unit(crs)[0] == "degree":
-        raise TaskError(f"{crs} counts in {plan_unit(crs)[0]}; give a CRS in metres: --to-crs EPSG:25832")
-    moved = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
-    positions = np.column_stack([*moved, [shot.altitude for shot in shots]])
-    _one_place(shots, positions)
+        raise TaskError(f"{crs} is in {plan_unit(crs)[0]}; give a CRS in metres: --to-crs EPSG:25832")
+    plan = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+    positions = np.column_stack([*plan, [shot.altitude for shot in shots]])
+    _check_one_place(shots, positions)
     accuracy = np.array([(shot.accuracy[0], *shot.accuracy) for shot in shots])
     heights = " or ".join(sorted({shot.heights for shot in shots}))
-    return Placed(crs, tuple(shots), positions, accuracy, heights)
+    return PlacedPhotos(crs, tuple(shots), positions, accuracy, heights)
 
 
-def read_control(path: Path, placed: Placed, crs: str | None = None) -> Control:
-    """Read ground control points from CSV: image, x_px, y_px, easting, northing, height and perhaps name.
+def read_control(path: Path, placed: PlacedPhotos, crs: str | None = None) -> Control:
+    """Read ground control points from CSV: image, x_px, y_px, easting, northing, height, optionally name.
 
     Parameters
     ----------
     path : Path
-        The table: one row for each point and photograph. Rows with the same name (without names, the same
-        coordinates) are one point. Pixels count from the upper left corner, heights in metres.
-    placed : Placed
-        The photographs; rows name them by file name.
+        The table: one row per point and photograph. Rows with the same name (without names, the same
+        coordinates) are one point. Pixels are counted from the upper left corner; heights are in metres.
+    placed : PlacedPhotos
+        The photographs; rows refer to them by file name.
     crs : str, optional
-        CRS of easting and northing; that of the photographs by default.
+        CRS of easting and northing; by default that of the photographs.
 
     Raises
     ------
     TaskError
-        If a column is missing, a value is no number or a photograph is unknown.
+        If a column is missing, a value is not a number, or a photograph is not among those given.
     """
-    known = {shot.path.name: shot.path for shot in placed.shots}
-    found: dict[str, tuple[list[float], dict[Path, tuple[float, float]]]] = {}
+    paths = {shot.path.name: shot.path for shot in placed.shots}
+    by_name: dict[str, tuple[list[float], dict[Path, tuple[float, float]]]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             for row in csv.DictReader(file):
-                where = [float(row[axis]) for axis in ("easting", "northing", "height")]
-                _, marks = found.setdefault(row.get("name") or str(where), (where, {}))
-                marks[known[Path(row["image"]).name]] = float(row["x_px"]), float(row["y_px"])
+                position = [float(row[axis]) for axis in ("easting", "northing", "height")]
+                _, marks = by_name.setdefault(row.get("name") or str(position), (position, {}))
+                marks[paths[Path(row["image"]).name]] = float(row["x_px"]), float(row["y_px"])
     except OSError as error:
         raise TaskError(f"{path} cannot be read: {error.strerror}", file=str(path)) from error
     except (KeyError, TypeError, ValueError) as error:
         raise TaskError(
-            f"{path}, row {sum(len(marks) for _, marks in found.values()) + 1}: {error} is no column, "
-            "number or photograph known here; columns are image,x_px,y_px,easting,northing,height[,name]",
+            f"{path}, row {sum(len(marks) for _, marks in by_name.values()) + 1}: {error} is not a "
+            "column, number or photograph; columns are image,x_px,y_px,easting,northing,height[,name]",
             file=str(path),
         ) from error
-    points = np.array([where for where, _ in found.values()]).reshape(-1, 3)
-    turn = Transformer.from_crs(in_plan(crs or placed.crs), placed.crs, always_xy=True)
-    points[:, 0], points[:, 1] = turn.transform(points[:, 0], points[:, 1])
-    return Control(tuple(found), points, tuple(marks for _, marks in found.values()))
+    points = np.array([position for position, _ in by_name.values()]).reshape(-1, 3)
+    transformer = Transformer.from_crs(in_plan(crs or placed.crs), placed.crs, always_xy=True)
+    points[:, 0], points[:, 1] = transformer.transform(points[:, 0], points[:, 1])
+    return Control(tuple(by_name), points, tuple(marks for _, marks in by_name.values()))
 
 
 def _xmp(packet: bytes | str) -> dict[str, str]:
-    """Return DJI's tags, which are written as attributes or as elements."""
+    """Return DJI's tags, which may be attributes or elements."""
     text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
     return dict(re.findall(r'drone-dji:(\w+)\s*(?:="|>)\s*([^"<]*)', text))
 
@@ -216,7 +219,7 @@ def _from_xmp(xmp: Mapping[str, str]) -> tuple[float, float, float, str] | None:
         return None
     ellipsoid = xmp.get("AltitudeType") == "RtkAlt"
     heights = ELLIPSOID if ellipsoid else f"{SEA_LEVEL} as the drone takes it"
-    return _checked(float(longitude), float(xmp["GpsLatitude"]), float(xmp["AbsoluteAltitude"]), heights)
+    return _validated(float(longitude), float(xmp["GpsLatitude"]), float(xmp["AbsoluteAltitude"]), heights)
 
 
 def _from_exif(gps: Mapping[int, Any]) -> tuple[float, float, float, str]:
@@ -228,16 +231,16 @@ def _from_exif(gps: Mapping[int, Any]) -> tuple[float, float, float, str]:
         latitude = -latitude
     ref = gps.get(tag.GPSAltitudeRef, 0)
     sign, heights = ALTITUDE_REF[ref[0] if isinstance(ref, bytes) else int(ref)]
-    return _checked(longitude, latitude, sign * float(gps[tag.GPSAltitude]), heights)
+    return _validated(longitude, latitude, sign * float(gps[tag.GPSAltitude]), heights)
 
 
-def _checked(
+def _validated(
     longitude: float, latitude: float, altitude: float, heights: str
 ) -> tuple[float, float, float, str]:
-    # Receivers without a fix write zeros; NaN fails the comparison, too.
-    somewhere = (longitude, latitude) != (0, 0)
-    if not (somewhere and abs(longitude) <= 180 and abs(latitude) <= 90 and math.isfinite(altitude)):
-        raise ValueError(f"{longitude}, {latitude}, {altitude} is no position")
+    # Receivers without a fix write zeros; NaN fails the comparisons below, too.
+    has_fix = (longitude, latitude) != (0, 0)
+    if not (has_fix and abs(longitude) <= 180 and abs(latitude) <= 90 and math.isfinite(altitude)):
+        raise ValueError(f"{longitude}, {latitude}, {altitude} is not a position")
     return longitude, latitude, altitude, heights
 
 
@@ -247,21 +250,21 @@ def _degrees(parts: Sequence[Any]) -> float:
 
 
 def _accuracy(xmp: Mapping[str, str], gps: Mapping[int, Any]) -> tuple[float, float]:
-    """Return standard deviations in plan and height (m): the file's own, else by the kind of receiver."""
+    """Return standard deviations in plan and height (m): from the file, else by the type of receiver."""
     if all(f"RtkStd{axis}" in xmp for axis in ("Lon", "Lat", "Hgt")):
         east, north, up = (float(xmp[f"RtkStd{axis}"]) for axis in ("Lon", "Lat", "Hgt"))
         # A drone without a solution writes zeros.
         if min(east, north, up) > 0:
             return max(east, north), up
-    plain = RTK_M.get(int(xmp.get("RtkFlag", "0") or 0), GNSS_M)
-    told = float(gps.get(ExifTags.GPS.GPSHPositioningError, math.nan))
-    return (told, told * plain[1] / plain[0]) if told > 0 else plain
+    typical = RTK_M.get(int(xmp.get("RtkFlag", "0") or 0), GNSS_M)
+    written = float(gps.get(ExifTags.GPS.GPSHPositioningError, math.nan))
+    return (written, written * typical[1] / typical[0]) if written > 0 else typical
 
 
 def _focal(xmp: Mapping[str, str], film_mm: Any, width: int, height: int) -> float | None:
-    """Return the focal length (pixels): the maker's calibration, else from the 35 mm equivalent.
+    """Return the focal length (pixels): the manufacturer's calibration, else from the 35 mm equivalent.
 
-    The equivalent compares diagonals of whole sensors (CIPA DCG-001); of a wide picture the rows are cropped.
+    The equivalent compares diagonals of whole sensors (CIPA DCG-001); wide photographs are cropped in height.
     """
     if float(xmp.get("CalibratedFocalLength") or 0) > 0:
         return float(xmp["CalibratedFocalLength"])
@@ -278,14 +281,14 @@ def _date(text: Any) -> datetime | None:
         return None
 
 
-def _one_place(shots: Sequence[Shot], positions: Floats) -> None:
+def _check_one_place(shots: Sequence[Shot], positions: Floats) -> None:
     from scipy.cluster.hierarchy import fcluster, linkage
 
-    group = fcluster(linkage(positions[:, :2], "single"), FAR_M, "distance")
-    if group.max() == 1:
+    groups = fcluster(linkage(positions[:, :2], "single"), FAR_M, "distance")
+    if groups.max() == 1:
         return
-    first = [shots[int(np.argmax(group == k))].path.name for k in range(1, group.max() + 1)]
+    first = [shots[int(np.argmax(groups == k))].path.name for k in range(1, groups.max() + 1)]
     raise TaskError(
-        f"the photographs come from {group.max()} places more than {FAR_M:g} m apart "
-        f"({', '.join(first[:4])}); prepare each place by itself"
+        f"the photographs are from {groups.max()} places more than {FAR_M:g} m apart "
+        f"({', '.join(first[:4])}); prepare each place separately"
     )

@@ -1,6 +1,6 @@
 """Dense stereo on a GPU: COLMAP's PatchMatch and fusion (Schönberger et al., 2016).
 
-Needs a pycolmap that was built with CUDA; the wheels on PyPI are not.
+Needs a pycolmap built with CUDA; the wheels on PyPI are built without it.
 """
 
 from __future__ import annotations
@@ -18,44 +18,46 @@ from flexroad.tasks.errors import TaskError
 
 
 class Options(base.Options):
-    """How photographs are matched on a GPU."""
+    """Options of dense stereo on a GPU."""
 
     size: int = Field(2000, ge=100, description="photographs are reduced to this width or height (px)")
 
 
 def available() -> bool:
-    """Return whether pycolmap is here and was built with CUDA."""
+    """Return whether pycolmap was built with CUDA; raises TaskError if it is not installed."""
     return bool(colmap().has_cuda)
 
 
-def patchmatch(found: Reconstruction, work: Path, options: Options) -> Cloud:
+def patchmatch(reconstruction: Reconstruction, work: Path, options: Options) -> Cloud:
     """Return the fused cloud of all photographs, relative to the reconstruction's origin.
 
     Parameters
     ----------
-    found : Reconstruction
-        Its model and its photographs are read from their files.
+    reconstruction : Reconstruction
+        Its model and photographs are read from their files.
     work : Path
-        Folder for undistorted photographs and depth maps: some 20 bytes per pixel of each photograph.
+        Folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
     options : Options
-        Size.
+        Size of the photographs.
 
     Raises
     ------
     TaskError
-        If pycolmap is missing, or no point is left.
+        If pycolmap is missing, or the cloud is empty.
     """
     pycolmap = colmap()
     workspace, fused = work / "stereo", work / "fused.ply"
     undistorting = pycolmap.UndistortCameraOptions(max_image_size=options.size)
-    pycolmap.undistort_images(workspace, found.model, found.root, undistort_options=undistorting)
+    pycolmap.undistort_images(
+        workspace, reconstruction.model, reconstruction.root, undistort_options=undistorting
+    )
     pycolmap.patch_match_stereo(workspace, options=pycolmap.PatchMatchOptions(max_image_size=options.size))
     pycolmap.stereo_fusion(fused, workspace, output_type="PLY")
     return read_ply(fused)
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read the points that COLMAP's fusion writes.
+    """Read the points from the PLY file of COLMAP's fusion.
 
     Raises
     ------
@@ -65,7 +67,7 @@ def read_ply(path: Path) -> Cloud:
     _, _, body = path.read_bytes().partition(b"end_header\n")
     records = np.frombuffer(body, RECORD)
     if not len(records):
-        raise TaskError("dense stereo found no point; take photographs that overlap by 60 % and more")
+        raise TaskError("dense stereo gave no points; use photographs that overlap by 60 % or more")
     points, normals, colours = (
         np.column_stack([records[name] for name in names])
         for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))

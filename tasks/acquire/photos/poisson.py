@@ -1,6 +1,6 @@
-"""Oriented points -> mesh: Poisson surface reconstruction (Kazhdan & Hoppe, 2013), by COLMAP's binding.
+"""Poisson surface reconstruction (Kazhdan & Hoppe, 2013) of oriented points, by pycolmap.
 
-The surface it finds is closed; where no points are near, it is made up and cut away.
+The reconstructed surface is closed; parts far from all points are invented, and are removed.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 CELLS = 2.0
-"""Width of the octree's finest cells, in distances between points: with fewer points noise takes shape."""
+"""Width of the octree's finest cells, in distances between points; smaller cells would fit the noise."""
 FAR = 5.0
-"""Vertices farther than this from every point, in distances between points, are made up."""
+"""Vertices farther than this from all points, in distances between points, are removed."""
 DEEPEST = 13
-"""Levels of the octree that memory bears."""
+"""Largest depth of the octree, to limit the memory."""
 RECORD = np.dtype(
     [(axis, "<f4") for axis in ("x", "y", "z", "nx", "ny", "nz")]
     + [(band, "u1") for band in ("red", "green", "blue")]
 )
-HEAD = """ply
+HEADER = """ply
 format binary_little_endian 1.0
 element vertex {}
 {}
@@ -38,7 +38,7 @@ end_header
 def poisson(
     cloud: Cloud, spacing_m: float, crs: str, origin: Floats, work: Path, threads: int | None = None
 ) -> TexturedMesh:
-    """Return the surface of a cloud with colours at its vertices.
+    """Return the surface of a cloud as a mesh with vertex colours.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ def poisson(
     spacing_m : float
         Distance between neighbouring points (m).
     crs, origin : str, Floats
-        Where the cloud's zero lies: easting, northing, height, ``(3,)``, m.
+        CRS, and the position of the cloud's origin in it: easting, northing, height, ``(3,)``, m.
     work : Path
-        Folder for the two files COLMAP wants.
+        Folder for two temporary PLY files.
     threads : int, optional
-        All cores by default.
+        Number of threads; by default one per core.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def poisson(
     distance, _ = cKDTree(cloud.points).query(vertices, distance_upper_bound=FAR * spacing_m)
     faces = faces[np.isfinite(distance)[faces].all(axis=1)]
     if not len(faces):
-        raise TaskError(f"{len(cloud)} points make no surface; take photographs that overlap more")
+        raise TaskError(f"{len(cloud)} points give no surface; use photographs that overlap more")
     return TexturedMesh(
         crs=crs,
         vertices=vertices + origin,
@@ -95,4 +95,4 @@ def write_ply(path: Path, cloud: Cloud) -> None:
             records[name] = column
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = "\n".join(f"property {kinds[RECORD[name].str]} {name}" for name in RECORD.names or ())
-    path.write_bytes(HEAD.format(len(cloud), lines).encode() + records.tobytes())
+    path.write_bytes(HEADER.format(len(cloud), lines).encode() + records.tobytes())

@@ -1,13 +1,13 @@
-"""Structure from motion, georeferenced by the cameras' GNSS: photographs -> poses and sparse points.
+"""Structure from motion: camera poses and sparse points from photographs with GNSS positions.
 
-The paper's stage A leaves this to photogrammetry; here it is COLMAP (Schönberger & Frahm, 2016) by its
-Python binding: SIFT, matching among GNSS neighbours, incremental mapping with the positions as priors in the
-bundle adjustment.
-All of it lives in a local frame, whole metres off the metric CRS, so that float32 files lose nothing.
+The paper's stage A leaves this to photogrammetry. Here it is COLMAP (Schönberger & Frahm, 2016) by its Python
+binding: SIFT, matching among GNSS neighbours, and incremental mapping with the positions as priors in the
+bundle adjustment. Coordinates are relative to an origin in whole metres, so that float32 files lose no
+precision.
 
-Photographs that look straight down on flat ground tell nothing of the focal length: a longer one with the
-ground further below explains them as well, and stretches every height by the same factor. So the files' focal
-length is held unless freeing it makes the photographs fit clearly better.
+Vertical photographs of flat ground do not determine the focal length: a longer one with the ground farther
+below fits them equally well, and scales all heights by the same factor. The focal length of the files is
+therefore held fixed unless a free one fits clearly better.
 """
 
 from __future__ import annotations
@@ -25,43 +25,45 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks import options as base
-from flexroad.tasks.acquire.photos.exif import Control, Placed, Shot
+from flexroad.tasks.acquire.photos.exif import Control, PlacedPhotos, Shot
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 EXHAUSTIVE = 12
-"""Up to so many photographs every pair is matched."""
+"""Up to this number of photographs, all pairs are matched."""
 CLEARLY_BETTER = 0.95
-"""A freed focal length is taken if the reprojection error falls below this share of that with the held one.
-Less is what a rolling shutter or a simple lens model can feign."""
+"""A free focal length is used if its reprojection error is below this share of that with the fixed one.
+A rolling shutter or a simple lens model can cause smaller improvements."""
 INSTALL = "pip install 'flexroad[photogrammetry]'"
 
 
 class Options(base.Options):
-    """How photographs are matched and adjusted."""
+    """Options of feature matching and bundle adjustment."""
 
     image_size: int = Field(
-        2400, ge=320, description="features are sought in photographs of at most this width or height (px)"
+        2400, ge=320, description="photographs are reduced to this width or height for feature detection (px)"
     )
-    features: int = Field(8192, ge=500, description="most features of one photograph")
-    neighbours: int = Field(12, ge=2, description="each photograph is matched with so many nearest ones")
+    features: int = Field(8192, ge=500, description="largest number of features per photograph")
+    neighbours: int = Field(
+        12, ge=2, description="each photograph is matched with this number of nearest ones"
+    )
     calibrate: Literal["auto", "held", "free"] = Field(
         "auto",
-        description="focal length: held as the files say, free, or free only where that fits clearly better",
+        description="focal length: held at that of the files, free, or auto: free if this fits much better",
     )
-    seed: int = Field(1, ge=0, description="of all random choices")
-    threads: int | None = Field(None, ge=1, description="null: all cores")
+    seed: int = Field(1, ge=0, description="random seed")
+    threads: int | None = Field(None, ge=1, description="number of threads; null: one per core")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A lens and sensor, in COLMAP's words."""
+    """A lens and sensor, as a COLMAP camera model."""
 
     model: str
     width: int
     height: int
     params: tuple[float, ...]
-    """Focal length, principal point, distortion; pixel centres lie at .5."""
+    """Focal length, principal point, distortion (pixels); pixel centres are at .5."""
 
     @property
     def focal_px(self) -> float:
@@ -71,42 +73,42 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photograph whose pose is known."""
+    """A photograph with its pose."""
 
     path: Path
     camera: Camera
     rotation: Floats
-    """World to camera, ``(3, 3)``; the camera looks along its z, rows grow along its y."""
+    """World to camera, ``(3, 3)``; the viewing direction is z, rows increase along y."""
     centre: Floats
-    """Where it was taken, ``(3,)``, m from the origin."""
-    seen: NDArray[np.intp]
-    """Indices of the sparse points it shows."""
+    """Projection centre, ``(3,)``, m from the origin."""
+    visible: NDArray[np.intp]
+    """Indices of the sparse points visible in it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Poses and sparse points."""
+    """Camera poses and sparse points."""
 
     crs: str
     origin: Floats
-    """Whole-metre easting, northing, height everything is relative to, ``(3,)``."""
+    """Easting, northing, height that all coordinates are relative to, in whole metres, ``(3,)``."""
     views: tuple[View, ...]
     missing: tuple[Path, ...]
     """Photographs that could not be placed."""
     points: Floats
     """Sparse points, ``(n, 3)``, m from the origin."""
     reprojection_px: float
-    """Mean distance of the features from their points' images, in pixels of the whole photographs."""
+    """Mean distance of features from the projections of their points, in pixels of the full photographs."""
     residuals: Floats
     """Adjusted minus measured camera positions, ``(len(views), 3)``, m."""
     control_m: Floats | None
-    """Adjusted minus given ground control points, ``(n, 3)``, m; None if GNSS alone made the georeference."""
+    """Adjusted minus given ground control points, ``(n, 3)``, m; None if only GNSS was used."""
     focal_held: bool
-    """Whether the focal length is the files' own."""
+    """Whether the focal length was held at that of the files."""
     model: Path
     """Folder of the model in COLMAP's format, in the local frame."""
     root: Path
-    """Folder the model's names of photographs are relative to."""
+    """Folder that the photographs' names in the model are relative to."""
 
     @property
     def gnss_m(self) -> tuple[float, float]:
@@ -116,43 +118,43 @@ class Reconstruction:
 
 
 def colmap() -> ModuleType:
-    """Return pycolmap, an optional extra, made quiet.
+    """Import pycolmap, an optional dependency, and silence its log.
 
     Raises
     ------
     TaskError
-        If it is not installed; the line says how to.
+        If it is not installed; the message has the command to install it.
     """
     try:
         import pycolmap
     except ImportError as error:
         raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
-    # Its progress is hundreds of lines, and what it calls errors are raised here in words of our own.
+    # It logs hundreds of lines of progress; its errors are raised here as TaskError.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap  # type: ignore[no-any-return]
 
 
 def reconstruct(
-    placed: Placed, work: Path, options: Options, control: Control | None = None
+    placed: PlacedPhotos, work: Path, options: Options, control: Control | None = None
 ) -> Reconstruction:
-    """Place photographs in space by what they show and where they were taken.
+    """Reconstruct the poses of photographs and sparse points from their features and GNSS positions.
 
     Parameters
     ----------
-    placed : Placed
+    placed : PlacedPhotos
         The photographs and their GNSS positions.
     work : Path
         Empty folder for the database and the model.
     options : Options
-        Sizes, numbers and the seed. The same seed and number of threads give the same result up to rounding.
+        Options. The same seed and number of threads give the same result up to rounding.
     control : Control, optional
-        Ground control points. With 3 or more of them seen in 2 placed photographs each, they alone make the
-        georeference; GNSS then only guides the matching.
+        Ground control points. If 3 or more are marked in at least 2 placed photographs each, they alone
+        determine the georeference; GNSS is then only used for matching.
 
     Raises
     ------
     TaskError
-        If pycolmap is missing, no photographs match, or fewer than 3 or than half of them can be placed.
+        If pycolmap is missing, no photographs match, or fewer than 3 or less than half of them can be placed.
     """
     pycolmap = colmap()
     pycolmap.set_random_seed(options.seed)
@@ -163,9 +165,9 @@ def reconstruct(
     _features(pycolmap, database, root, shots, options)
     _priors(pycolmap, database, dict(zip(shots, placed.positions - origin, strict=True)), placed)
     _match(pycolmap, database, len(shots), options)
-    told = all(shot.focal_px for shot in placed.shots)
-    model, held = _map(pycolmap, database, root, work, options, told)
-    _enough(model, shots, options)
+    has_focal = all(shot.focal_px for shot in placed.shots)
+    model, held = _map(pycolmap, database, root, work, options, has_focal)
+    _check_placed(model, shots, options)
     controlled = None if control is None else _control(pycolmap, model, shots, control, origin)
     folder = work / "model"
     folder.mkdir()
@@ -197,13 +199,13 @@ def _features(
         )
 
 
-def _priors(pycolmap: ModuleType, database: Path, local: Mapping[str, Floats], placed: Placed) -> None:
+def _priors(pycolmap: ModuleType, database: Path, local: Mapping[str, Floats], placed: PlacedPhotos) -> None:
     accuracy = dict(zip(local, placed.accuracy, strict=True))
-    with pycolmap.Database.open(database) as opened:
-        # Those of EXIF, in degrees, that the extraction wrote.
-        opened.clear_pose_priors()
-        for image in opened.read_all_images():
-            opened.write_pose_prior(
+    with pycolmap.Database.open(database) as db:
+        # Remove the priors in degrees that the feature extraction wrote from EXIF.
+        db.clear_pose_priors()
+        for image in db.read_all_images():
+            db.write_pose_prior(
                 pycolmap.PosePrior(
                     corr_data_id=image.data_id,
                     position=local[image.name].reshape(3, 1),
@@ -221,37 +223,38 @@ def _match(pycolmap: ModuleType, database: Path, count: int, options: Options) -
     if count <= EXHAUSTIVE:
         pycolmap.match_exhaustive(database, **common)
     else:
-        # The number of neighbours is the limit, not a distance: flying heights differ.
+        # Neighbours are limited by number, not by distance, as flying heights differ.
         pairing = pycolmap.SpatialPairingOptions(
             max_num_neighbors=options.neighbours, max_distance=1e6, ignore_z=True
         )
         pycolmap.match_spatial(database, pairing_options=pairing, **common)
-    with pycolmap.Database.open(database) as opened:
-        if not opened.num_inlier_matches():
+    with pycolmap.Database.open(database) as db:
+        if not db.num_inlier_matches():
             raise TaskError(
-                f"none of the {count} photographs match each other; do they show one place? {_more(options)}"
+                f"none of the {count} photographs match each other; check that they show the same place; "
+                f"{_advice(options)}"
             )
 
 
 def _map(
-    pycolmap: ModuleType, database: Path, root: Path, work: Path, options: Options, told: bool
+    pycolmap: ModuleType, database: Path, root: Path, work: Path, options: Options, has_focal: bool
 ) -> tuple[Any, bool]:
-    """Return the largest model and whether the focal length was held in it."""
-    held = told and options.calibrate != "free"
+    """Return the model with most photographs, and whether the focal length was held fixed."""
+    held = has_focal and options.calibrate != "free"
     models = {}
     for hold in [True] * held + [False] * (not held or options.calibrate == "auto"):
         folder = work / f"mapped-{'held' if hold else 'free'}"
         folder.mkdir()
-        found = pycolmap.incremental_mapping(database, root, folder, _mapping(pycolmap, options, hold))
-        if found:
-            models[hold] = max(found.values(), key=lambda model: model.num_reg_images())
+        candidates = pycolmap.incremental_mapping(database, root, folder, _mapping(pycolmap, options, hold))
+        if candidates:
+            models[hold] = max(candidates.values(), key=lambda model: model.num_reg_images())
     if not models:
-        raise TaskError(f"the photographs match too little to place any of them: {_more(options)}")
+        raise TaskError(f"the photographs match too little to place any of them; {_advice(options)}")
     if len(models) == 1:
         return next((model, hold) for hold, model in models.items())
     free = models[False].num_reg_images(), -models[False].compute_mean_reprojection_error()
-    rigid = models[True].num_reg_images(), -models[True].compute_mean_reprojection_error() * CLEARLY_BETTER
-    return (models[False], False) if free > rigid else (models[True], True)
+    fixed = models[True].num_reg_images(), -models[True].compute_mean_reprojection_error() * CLEARLY_BETTER
+    return (models[False], False) if free > fixed else (models[True], True)
 
 
 def _mapping(pycolmap: ModuleType, options: Options, hold: bool) -> Any:
@@ -269,56 +272,56 @@ def _mapping(pycolmap: ModuleType, options: Options, hold: bool) -> Any:
     return mapping
 
 
-def _more(options: Options) -> str:
+def _advice(options: Options) -> str:
     return (
-        "take photographs that overlap by 60 % and more, "
-        f"or look for features in larger ones: --image-size {2 * options.image_size}"
+        "use photographs that overlap by 60 % or more, "
+        f"or a larger image size for features: --image-size {2 * options.image_size}"
     )
 
 
-def _enough(model: Any, shots: Mapping[str, Shot], options: Options) -> None:
+def _check_placed(model: Any, shots: Mapping[str, Shot], options: Options) -> None:
     placed = {image.name for image in model.images.values() if image.has_pose}
-    lacking = [shot.path.name for name, shot in shots.items() if name not in placed]
+    missing = [shot.path.name for name, shot in shots.items() if name not in placed]
     if len(placed) >= max(3, len(shots) / 2):
         return
-    names = ", ".join(lacking[:5]) + (" and others" if len(lacking) > 5 else "")
+    names = ", ".join(missing[:5]) + (" and others" if len(missing) > 5 else "")
     raise TaskError(
-        f"{len(placed)} of {len(shots)} photographs could be placed, not {names}: {_more(options)}"
+        f"{len(placed)} of {len(shots)} photographs could be placed, not {names}; {_advice(options)}"
     )
 
 
 def _control(
     pycolmap: ModuleType, model: Any, shots: Mapping[str, Shot], control: Control, origin: Floats
 ) -> Floats | None:
-    """Move the model onto the control points, adjust it with them held, return what is left, ``(n, 3)``.
+    """Transform the model to the control points, adjust it with these fixed; return residuals, ``(n, 3)``, m.
 
-    None, and the model unchanged, if fewer than 3 points are seen twice.
+    Returns None, and leaves the model unchanged, if fewer than 3 points are marked in 2 placed photographs.
     """
-    of_path = {shots[image.name].path: image for image in model.images.values() if image.has_pose}
-    used, marks = [], []
-    for point, seen in zip(control.points - origin, control.marks, strict=True):
-        rays = [(of_path[path], np.array(pixel)) for path, pixel in seen.items() if path in of_path]
+    image_of = {shots[image.name].path: image for image in model.images.values() if image.has_pose}
+    used, observations = [], []
+    for point, pixels in zip(control.points - origin, control.marks, strict=True):
+        rays = [(image_of[path], np.array(pixel)) for path, pixel in pixels.items() if path in image_of]
         if len(rays) >= 2:
             used.append(point)
-            marks.append(rays)
+            observations.append(rays)
     given = np.array(used).reshape(-1, 3)
     if len(given) < 3:
         return None
-    found = np.array([_intersect(rays) for rays in marks])
-    model.transform(pycolmap.estimate_sim3d(found, given))
+    estimated = np.array([_intersect(rays) for rays in observations])
+    model.transform(pycolmap.estimate_sim3d(estimated, given))
     config = pycolmap.BundleAdjustmentConfig()
-    for image in of_path.values():
+    for image in image_of.values():
         config.add_image(image.image_id)
-    for point, rays in zip(given, marks, strict=True):
-        config.add_constant_point(_add(pycolmap, model, point, rays))
+    for point, rays in zip(given, observations, strict=True):
+        config.add_constant_point(_add_point(pycolmap, model, point, rays))
     pycolmap.create_default_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(print_summary=False), config, model
     ).solve()
-    left: Floats = np.array([_intersect(rays) for rays in marks]) - given
-    return left
+    residuals: Floats = np.array([_intersect(rays) for rays in observations]) - given
+    return residuals
 
 
-def _add(pycolmap: ModuleType, model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
+def _add_point(pycolmap: ModuleType, model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
     track = pycolmap.Track()
     for image, pixel in rays:
         image.points2D.append(pycolmap.Point2D(pixel))
@@ -327,7 +330,7 @@ def _add(pycolmap: ModuleType, model: Any, point: Floats, rays: Sequence[tuple[A
 
 
 def _intersect(rays: Sequence[tuple[Any, Floats]]) -> Floats:
-    """Return the point nearest to the rays through a pixel of each image, ``(3,)``: least squares."""
+    """Return the least-squares intersection of the rays through a pixel of each image, ``(3,)``, m."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for image, pixel in rays:
         direction = image.cam_from_world().rotation.matrix().T @ np.append(
@@ -342,22 +345,22 @@ def _intersect(rays: Sequence[tuple[Any, Floats]]) -> Floats:
 def _result(
     model: Any,
     folders: tuple[Path, Path],
-    placed: Placed,
+    placed: PlacedPhotos,
     shots: Mapping[str, Shot],
     origin: Floats,
     control_m: Floats | None,
     held: bool,
 ) -> Reconstruction:
-    number = {point: n for n, point in enumerate(sorted(model.points3D))}
+    index = {point: n for n, point in enumerate(sorted(model.points3D))}
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
-    views = tuple(_view(image, shots[image.name].path, number) for image in images)
+    views = tuple(_view(image, shots[image.name].path, index) for image in images)
     measured = {shot.path: position for shot, position in zip(placed.shots, placed.positions, strict=True)}
     return Reconstruction(
         crs=placed.crs,
         origin=origin,
         views=views,
         missing=tuple(shot.path for shot in placed.shots if shot.path not in {view.path for view in views}),
-        points=np.array([model.points3D[point].xyz for point in number]),
+        points=np.array([model.points3D[point].xyz for point in index]),
         reprojection_px=model.compute_mean_reprojection_error(),
         residuals=np.array([view.centre + origin - measured[view.path] for view in views]),
         control_m=control_m,
@@ -367,13 +370,13 @@ def _result(
     )
 
 
-def _view(image: Any, path: Path, number: Mapping[int, int]) -> View:
+def _view(image: Any, path: Path, index: Mapping[int, int]) -> View:
     camera = image.camera
-    seen = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
+    visible = {index[p.point3D_id] for p in image.points2D if p.has_point3D()}
     return View(
         path=path,
         camera=Camera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist())),
         rotation=image.cam_from_world().rotation.matrix(),
         centre=image.projection_center(),
-        seen=np.array(sorted(seen), np.intp),
+        visible=np.array(sorted(visible), np.intp),
     )

@@ -1,4 +1,4 @@
-"""Which cell each point falls into, and the means of what fell into a cell."""
+"""The cell of each point, and means per cell."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 Cells = NDArray[np.int64]
-"""Index of each point's cell in row-major order, ``(n,)``; -1 is outside the grid."""
+"""Row-major index of the cell of each point, ``(n,)``; -1 outside the grid."""
 
 NUDGE = 1e-6
 """Part of a cell that is more than the rounding error of its edge's coordinates."""
@@ -21,8 +21,8 @@ NUDGE = 1e-6
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
     """Return the cell of each point, ``(n,)``, row-major; -1 outside the grid.
 
-    A point on the line between two cells belongs to the eastern or southern one, whatever the rounding:
-    grids on one lattice agree about it.
+    A point on the border of two cells belongs to the eastern or southern one. Rounding does not change that,
+    so all grids of the same lattice give the same result.
     """
     cells: Cells = _bins(
         np.asarray(easting), np.asarray(northing), grid.west, grid.north, grid.cell, grid.height, grid.width
@@ -44,14 +44,14 @@ def _bins(
 
 
 def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats, ...]:
-    """Return the mean of each kind of value per cell, each ``(H, W)``; NaN in cells without points.
+    """Return the mean of each array of values per cell, each ``(H, W)``; NaN in cells without points.
 
-    Sums run in the order of the points: another order changes the last digits only.
+    Values are summed in the order of the points: another order changes only the last digits.
 
     Parameters
     ----------
     cells : Cells
-        The points' cells, ``(n,)``; points outside are left out.
+        The cells of the points, ``(n,)``; points outside the grid are left out.
     shape : tuple of int
         Rows and columns.
     *values : Floats

@@ -1,4 +1,4 @@
-"""Bare ground from ground points: a TIN of one node per cell, or the cells' means."""
+"""DTM from ground points: a TIN with one node per cell, or the mean per cell."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from flexroad.tasks.acquire.points.binning import Cells, means
 from flexroad.tasks.acquire.points.tin import tin
 from flexroad.tasks.types import Floats
 
-SPARSEST = 2 * math.sqrt(2)
-"""Nodes of a gapless raster leave circles of up to so many cells empty, wherever they lie in their cells."""
+EMPTY_CIRCLE_CELLS = 2 * math.sqrt(2)
+"""Largest diameter (cells) of an empty circle between nodes at any position in cells that all have one."""
 
 
 def triangulated(
     cells: Cells, easting: Floats, northing: Floats, height: Floats, grid: Grid, void_m: float
 ) -> Floats:
-    """Return the ground at the cell centres, linear between the cells' centroids, ``(H, W)``, m.
+    """Return the ground height at the cell centres, linear between the centroids of cells, ``(H, W)``, m.
 
-    A centroid is the mean of its points in plan and height: exact on planes, however the points lie in
-    their cell, and without the low bias of lowest points. A cell with ground whose centre is outside all
-    triangles, as at the border of the survey, takes its points' mean height.
+    A centroid is the mean of the points of a cell in plan and height: it is exact on planes and not biased,
+    as the lowest point would be. A cell with ground points whose centre is outside all triangles, as at the
+    border of the survey, has the mean height of its points.
 
     Parameters
     ----------
@@ -34,10 +34,10 @@ def triangulated(
     grid : Grid
         The cells.
     void_m : float
-        The ground stays void where a disc of this diameter, and a little wider, has no node (m).
+        The DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
     """
     east, north, mean = means(cells, grid.shape, easting - grid.west, northing - grid.north, height)
-    ground = tin(east, north, mean, grid, void_m + SPARSEST * grid.cell)
+    ground = tin(east, north, mean, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell)
     return np.where(np.isnan(ground), mean, ground)
 
 
@@ -48,5 +48,5 @@ def averaged(cells: Cells, height: Floats, grid: Grid, void_m: float) -> Floats:
 
 
 def reach_m(void_m: float, cell: float) -> float:
-    """Return how far from a cell ground points can change the triangulated ground there (m)."""
-    return math.ceil(void_m / cell + SPARSEST) * cell
+    """Return the largest distance from a cell at which points can change its triangulated height (m)."""
+    return math.ceil(void_m / cell + EMPTY_CIRCLE_CELLS) * cell

@@ -1,4 +1,4 @@
-"""The orthophoto of coloured points: the colour of the highest point per pixel."""
+"""Orthophoto from coloured points: the colour of the highest point per pixel."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Orthophoto
 
 Codes = NDArray[np.int32]
-"""A colour as one number, red above green above blue; -1 is unknown."""
+"""Colours as 24-bit numbers (red, green, blue from the highest byte); -1 if there is none."""
 
 
 def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
-    """Return the colour of the highest point in each pixel; voids take that of the nearest known pixel.
+    """Return the colour of the highest point in each pixel; voids have that of the nearest valid pixel.
 
-    Of points at the same height the one of the greatest red, then green, then blue counts; of pixels at
-    the same distance the northernmost, then the westernmost.
+    Of points at the same height, the one with the greatest red, then green, then blue is used; of pixels at
+    the same distance, the northernmost, then the westernmost.
 
     Parameters
     ----------
     points : Points
-        With colours, and with a rim of ``fill_m`` around the grid.
+        Must have colours, and include a rim of ``fill_m`` around the grid.
     grid : Grid
         The pixels.
     fill_m : float
-        Pixels whose centre is farther than this from that of a known one stay unknown (m).
+        Pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
     """
     assert points.colour is not None
     rim = grid.buffered(fill_m)
     red, green, blue = points.colour.T.astype(np.int32)
-    found = _top_codes(
+    top = _top_codes(
         bins(points.easting, points.northing, rim), points.height, red << 16 | green << 8 | blue, rim.shape
     )
-    codes = _nearest(found, _steps(fill_m / grid.cell))[rim.window(grid)]
+    codes = _nearest(top, _offsets(fill_m / grid.cell))[rim.window(grid)]
     colour = np.stack([codes >> 16 & 255, codes >> 8 & 255, codes & 255]).astype(np.uint8)
-    known = codes >= 0
-    return Orthophoto(grid, np.where(known, colour, np.uint8(0)), known)
+    valid = codes >= 0
+    return Orthophoto(grid, np.where(valid, colour, np.uint8(0)), valid)
 
 
 @compiled()
@@ -53,8 +53,8 @@ def _top_codes(cells: Cells, height: Floats, codes: Codes, shape: tuple[int, int
     return best.reshape(shape)
 
 
-def _steps(radius: float) -> NDArray[np.int64]:
-    """Return the (row, col) steps of up to ``radius`` pixels, the nearest first, ``(n, 2)``."""
+def _offsets(radius: float) -> NDArray[np.int64]:
+    """Return the (row, col) offsets within ``radius`` pixels, the nearest first, ``(n, 2)``."""
     reach = int(radius + 1e-9)
     row, col = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     square = row**2 + col**2
@@ -63,13 +63,13 @@ def _steps(radius: float) -> NDArray[np.int64]:
 
 
 @compiled()
-def _nearest(codes: Codes, steps: NDArray[np.int64]) -> Codes:
+def _nearest(codes: Codes, offsets: NDArray[np.int64]) -> Codes:
     rows, cols = codes.shape
     filled = codes.copy()
     for r in range(rows):
         for c in range(cols):
-            for k in range(steps.shape[0]):
-                row, col = r + steps[k, 0], c + steps[k, 1]
+            for k in range(offsets.shape[0]):
+                row, col = r + offsets[k, 0], c + offsets[k, 1]
                 if 0 <= row < rows and 0 <= col < cols and codes[row, col] >= 0:
                     filled[r, c] = codes[row, col]
                     break

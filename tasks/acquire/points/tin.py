@@ -1,8 +1,8 @@
-"""Heights between nodes: linear over Delaunay triangles, void where no triangle is small enough.
+"""Linear interpolation over Delaunay triangles of limited size.
 
-A triangle counts if its circumcircle, which is empty of nodes, is at most so wide. The circles that hold a
-place reach no farther than their width: what a cell gets depends on the nodes within that distance alone,
-and land may be cut into blocks at will. At the border of the survey the same rule leaves its bays open.
+A triangle is used if the diameter of its circumcircle, which has no other node inside, is at most a given
+width. The height of a cell therefore depends only on nodes within that distance, and does not change if the
+area is divided into blocks. At the border of the survey, the same rule leaves bays open.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Floats, Mesh
 
 JITTER = 1e-6
-"""Part of a cell by which nodes are moved to choose between triangulations that are equally good."""
+"""Scale of the displacement of nodes (cells), which makes the triangulation of cocircular nodes unique."""
 SNAP_M = 1e-12
-"""Nodes closer than this would be taken for one."""
-WIDER = 1 + 1e-9
-"""A circle exactly as wide as the limit counts, whatever the rounding."""
-COUNTED_FROM = 0.6180339887
-"""Part of a cell added to an edge before its whole cells are counted: no lattice is likely to turn there."""
+"""Nodes closer than this would be merged (m)."""
+LIMIT_FACTOR = 1 + 1e-9
+"""Factor of the limit, so that a circle exactly as wide as the limit is used in spite of rounding."""
+COUNT_OFFSET = 0.6180339887
+"""Offset (cells) added before rounding down to whole cells, so that rounding errors do not matter."""
 
 
 def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float) -> Floats:
-    """Return the height over the triangles of the nodes at the cell centres, ``(H, W)``, m.
+    """Return heights at the cell centres, interpolated over the triangles of the nodes, ``(H, W)``, m.
 
     Parameters
     ----------
     east, north : Floats
-        Place of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
+        Position of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
     height : Floats
-        Height of a cell's node, ``(H, W)``, m; NaN where the cell has none.
+        Height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
     grid : Grid
         The cells.
     widest_m : float
@@ -42,27 +42,27 @@ def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float
     Returns
     -------
     Floats
-        NaN where no triangle lies above or below.
+        NaN where there is no triangle.
     """
     row, col = np.nonzero(np.isfinite(height))
     nodes = np.column_stack([east[row, col], north[row, col], height[row, col]])
     faces = _delaunay(nodes[:, :2] + JITTER * grid.cell * _noise(grid, row, col))
-    faces = _ordered(faces[_widths(nodes[:, :2], faces) <= widest_m * WIDER], len(nodes))
+    faces = _ordered(faces[_widths(nodes[:, :2], faces) <= widest_m * LIMIT_FACTOR], len(nodes))
     corner = grid.west, grid.north, 0.0
     return drape(Mesh(grid.crs, corner, nodes, faces, np.zeros(len(faces), bool)), grid)
 
 
 def _noise(grid: Grid, row: NDArray[np.intp], col: NDArray[np.intp]) -> Floats:
-    """Return two numbers per cell between -0.5 and 0.5 by the cell's place on the whole lattice, ``(n, 2)``.
+    """Return two pseudo-random numbers from -0.5 to 0.5 per cell, ``(n, 2)``: a hash of its position.
 
-    Nodes on a lattice are full of cocircular fours; which of the two diagonals is drawn must not hang on
-    the order of insertion, which changes with the block. Mixing as in SplitMix64 (Steele et al., 2014).
+    Any four nodes of a lattice square are cocircular; which of its diagonals is used must not depend on the
+    order of insertion, which differs between blocks. The hash is that of SplitMix64 (Steele et al., 2014).
     """
-    east = col + int(np.floor(grid.west / grid.cell + COUNTED_FROM))
-    south = row - int(np.floor(grid.north / grid.cell + COUNTED_FROM))
+    east = col + int(np.floor(grid.west / grid.cell + COUNT_OFFSET))
+    south = row - int(np.floor(grid.north / grid.cell + COUNT_OFFSET))
     bits = east.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    for mixed_in, factor in ((south, 0xBF58476D1CE4E5B9), (0, 0x94D049BB133111EB)):
-        bits = (bits ^ (bits >> np.uint64(30))) + np.asarray(mixed_in).astype(np.uint64)
+    for value, factor in ((south, 0xBF58476D1CE4E5B9), (0, 0x94D049BB133111EB)):
+        bits = (bits ^ (bits >> np.uint64(30))) + np.asarray(value).astype(np.uint64)
         bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(factor)
     bits ^= bits >> np.uint64(31)
     halves = np.stack([bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)], axis=1)
@@ -78,14 +78,14 @@ def _delaunay(plan: Floats) -> NDArray[np.int32]:
     triangulation.insert(np.column_stack([plan, np.zeros(len(plan))]), insertionstrategy="BBox")
     # Vertex 0 of startinpy is at infinity; the points follow in their order.
     faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32).reshape(-1, 3) - 1
-    # It can only be dropped in the thread that made it, and a sampling profiler (Dask's is one) may keep
-    # this frame and all it holds alive in another.
+    # The object may only be deleted in the thread that created it, but a sampling profiler such as Dask's may
+    # keep this frame alive in another thread.
     del triangulation
     return faces
 
 
 def _widths(plan: Floats, faces: NDArray[np.int32]) -> Floats:
-    """Return the diameters of the circumcircles, ``(F,)``; infinite for three nodes in a line."""
+    """Return the diameters of the circumcircles, ``(F,)``; infinite for three collinear nodes."""
     a, b, c = (plan[faces[:, k]] for k in range(3))
     sides = np.prod([np.hypot(*(p - q).T) for p, q in ((a, b), (b, c), (c, a))], axis=0)
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
@@ -95,8 +95,8 @@ def _widths(plan: Floats, faces: NDArray[np.int32]) -> Floats:
 
 
 def _ordered(faces: NDArray[np.int32], nodes: int) -> NDArray[np.int32]:
-    """Return the faces in the order of their nodes: a centre on an edge meets the same one in any block."""
+    """Return the faces in the order of their nodes, so that all blocks use the same face for a centre."""
     first = faces.argmin(axis=1)
-    turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    # No two faces leave one node for the same next one.
-    return turned[np.argsort(turned[:, 0] * np.int64(nodes) + turned[:, 1])]
+    rotated = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+    # No two faces have the same first two nodes.
+    return rotated[np.argsort(rotated[:, 0] * np.int64(nodes) + rotated[:, 1])]

@@ -1,7 +1,7 @@
-"""Rasters from a point cloud: surface, ground, bridge decks and orthophoto of a piece of ground.
+"""Rasters from a point cloud: DSM, DTM, bridge decks and orthophoto of a block of ground.
 
-A cell's values depend on the points within `reach_m` of the piece alone, not on how land is cut into pieces,
-nor on the order of the points; heights agree to 1e-8 m, as sums and large coordinates are rounded.
+Values depend only on the points within `reach_m` of the block, not on the division into blocks or on the
+order of the points; heights agree to 1e-8 m, the rounding error of sums and large coordinates.
 """
 
 from __future__ import annotations
@@ -26,21 +26,24 @@ class Options(base.Options):
     """How points become rasters."""
 
     despike_m: float | None = Field(
-        None, gt=0, description="drop single points so far above all others around them (m); null keeps all"
+        None,
+        gt=0,
+        description="drop single points that are this much above all others around (m); null keeps all",
     )
     fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
     ground: Literal["classes", "filter"] = Field(
         "classes",
-        description="classes: ground is what the points' classes say; filter: what the slope filter finds",
+        description="classes: ground points have a ground class; filter: the slope filter identifies them",
     )
     ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
     bridge_classes: tuple[int, ...] = Field((17,), description="classes of bridge decks; never ground")
     dtm: Literal["tin", "mean"] = Field(
-        "tin", description="tin: linear between the ground of the cells; mean: mean ground height per cell"
+        "tin",
+        description="tin: linear between the cells' ground centroids; mean: mean ground height per cell",
     )
-    void_m: float = Field(50.0, ge=0, le=500, description="DTM voids up to this width are bridged (m)")
+    void_m: float = Field(50.0, ge=0, le=500, description="DTM voids up to this width are filled (m)")
     dop_fill_m: float = Field(
-        2.0, ge=0, le=20, description="pixels up to so far from one with a colour get it (m)"
+        2.0, ge=0, le=20, description="pixels without colour take the nearest within this distance (m)"
     )
     filter: slope_filter.Options = Field(
         slope_filter.Options(), description="the slope filter, used with ground: filter"
@@ -48,23 +51,23 @@ class Options(base.Options):
 
 
 def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Rasters:
-    """Make the rasters of a piece of ground.
+    """Make the rasters of a block of ground.
 
     Parameters
     ----------
     points : Points
-        In the grid's CRS (m), with a rim of `reach_m` around the grid; those farther away change nothing.
+        In the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
     grid : Grid
         The cells.
     options : Options
-        Voids, classes, methods.
+        Voids, classes and methods.
     dop_cell : float, optional
         Pixel of the orthophoto (m); None makes no orthophoto.
 
     Returns
     -------
     Rasters
-        All NaN where there are no points, or no ground among them; a photo if points have colours.
+        NaN without points, and the DTM without ground points; no orthophoto if the points have no colours.
     """
     rim = grid.buffered(reach_m(options, grid.cell))
     inner = rim.window(grid)
@@ -79,14 +82,14 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
         grid,
         dsm=dsm[inner],
         dtm=_dtm(points[ground], rim, options)[inner],
-        ground=_holding(cells[ground], rim.shape)[inner],
+        ground=_occupied(cells[ground], rim.shape)[inner],
         bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
         photo=_photo(points, grid, options, dop_cell),
     )
 
 
 def reach_m(options: Options, cell: float) -> float:
-    """Return how far outside a grid of such cells points can change a value inside (m)."""
+    """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
     if options.dtm == "tin":
         ground = dtm.reach_m(options.void_m, cell)
     else:
@@ -96,12 +99,12 @@ def reach_m(options: Options, cell: float) -> float:
         if options.filter.low_m is not None:
             ground += options.filter.low_radius_m
     farthest = max(ground, fill_voids.reach_m(options.fill_m, cell), options.dop_fill_m)
-    # Whether a point is a spike is known from its own and the next cells.
+    # Whether a point is a spike depends on its own and the neighbouring cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
 
 
 def tags(options: Options) -> dict[str, str]:
-    """Return how the rasters are made, by layer, for the tags of their files."""
+    """Return the processing of each layer, for the TIFF tags of the rasters."""
     spikes = (
         ""
         if options.despike_m is None
@@ -140,11 +143,11 @@ def _is_ground(points: Points, options: Options) -> Bools:
     return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
 
 
-def _holding(cells: Cells, shape: tuple[int, int]) -> Bools:
-    """Return the cells that hold a point, ``(H, W)``."""
-    holding = np.zeros(shape, bool)
-    holding.flat[cells[cells >= 0]] = True
-    return holding
+def _occupied(cells: Cells, shape: tuple[int, int]) -> Bools:
+    """Return the cells that have a point, ``(H, W)``."""
+    occupied = np.zeros(shape, bool)
+    occupied.flat[cells[cells >= 0]] = True
+    return occupied
 
 
 def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:

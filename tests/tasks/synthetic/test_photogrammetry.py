@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.mesh.sample import orthophoto as seen_from_above
-from flexroad.tasks.acquire.mesh.sample import tops
+from flexroad.tasks.acquire.mesh.sample import surface_heights
 from flexroad.tasks.synthetic import Kind
 from flexroad.tasks.synthetic.dsc3d import SITES, SIZE_M, survey
 from flexroad.tasks.synthetic.orthophoto import orthophoto
@@ -28,7 +28,7 @@ def scene(place):
 @pytest.fixture(scope="module")
 def height(scene):
     """Height of the mesh at the nodes it was made from; NaN in open holes."""
-    return tops(scene.mesh, scene.surface.grid)
+    return surface_heights(scene.mesh, scene.surface.grid)
 
 
 def test_the_sites_span_what_the_paper_tells():

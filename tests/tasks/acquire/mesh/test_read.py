@@ -1,4 +1,4 @@
-"""Meshes come out of their files as they went in, or one line says why not."""
+"""Meshes are read without loss; invalid files are an error of one line."""
 
 import json
 
@@ -30,7 +30,7 @@ def texture():
     return np.random.default_rng(1).integers(0, 256, (12, 16, 3), dtype=np.uint8)
 
 
-def made(texture):
+def textured(texture):
     visual = trimesh.visual.TextureVisuals(uv=UV, image=Image.fromarray(texture))
     return trimesh.Trimesh(CORNERS, FACES, visual=visual, process=False)
 
@@ -43,7 +43,7 @@ def write_obj(folder, texture, faces="usemtl m\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n",
 
 
 def write_ply(folder, texture, kind="double"):
-    """Texture coordinates by corner, as photogrammetry programs write them."""
+    """Write texture coordinates per corner, as photogrammetry software does."""
     Image.fromarray(texture).save(folder / "m.png")
     lines = ["ply", "format ascii 1.0", "comment TextureFile m.png", "element vertex 4"]
     lines += [f"property {kind} {axis}" for axis in "xyz"]
@@ -60,28 +60,28 @@ def write_ply(folder, texture, kind="double"):
 
 
 def write_glb(folder, texture):
-    turned = made(texture)
-    turned.vertices = CORNERS[:, [0, 2, 1]] * (1, 1, -1)
-    (folder / "m.glb").write_bytes(trimesh.Scene(turned).export(file_type="glb"))
+    mesh = textured(texture)
+    mesh.vertices = CORNERS[:, [0, 2, 1]] * (1, 1, -1)
+    (folder / "m.glb").write_bytes(trimesh.Scene(mesh).export(file_type="glb"))
     return folder / "m.glb"
 
 
-def same_place(mesh, atol=1e-9):
+def check_vertices(mesh, atol=1e-9):
     corners = mesh.vertices[mesh.faces] - ZERO
     np.testing.assert_allclose(corners, CORNERS[FACES], atol=atol)
 
 
 @pytest.mark.parametrize("write", [write_obj, write_ply, write_glb])
-def test_each_format_gives_the_same_mesh_and_photo(write, texture, tmp_path):
+def test_read_mesh_formats_give_the_same_mesh_and_orthophoto(write, texture, tmp_path):
     mesh = read_mesh(write(tmp_path, texture), **PLACED)
-    same_place(mesh)
+    check_vertices(mesh)
     assert mesh.crs == CRS
     assert mesh.notes == ()
     photo = orthophoto(mesh, GRID)
     assert np.abs(np.moveaxis(photo.colour, 0, -1).astype(int) - texture).max() <= 1
 
 
-def test_two_materials_keep_their_textures(tmp_path, texture):
+def test_read_mesh_two_materials_keep_their_textures(tmp_path, texture):
     red = np.full((4, 4, 3), (200, 10, 10), np.uint8)
     path = write_obj(tmp_path, texture, "usemtl m\nf 1/1 2/2 3/3\nusemtl red\nf 1/1 3/3 4/4\n")
     with (tmp_path / "m.mtl").open("a") as file:
@@ -94,14 +94,14 @@ def test_two_materials_keep_their_textures(tmp_path, texture):
     assert np.abs(colour[11, 15].astype(int) - texture[11, 15]).max() <= 1
 
 
-def test_one_corner_may_have_several_texture_coordinates(tmp_path, texture):
-    """The second face looks at the texture upside down, through corners it shares with the first."""
+def test_read_mesh_shared_corner_keeps_several_texture_coordinates(tmp_path, texture):
+    """The second face has the texture upside down, at corners it shares with the first."""
     mesh = read_mesh(write_obj(tmp_path, texture, "usemtl m\nf 1/1 2/2 3/3\nf 1/3 3/1 4/2\n"), **PLACED)
-    same_place(mesh)
+    check_vertices(mesh)
     np.testing.assert_allclose(mesh.uv, [UV[[0, 1, 2]], UV[[2, 0, 1]]])
 
 
-def test_coordinates_in_the_world_lose_no_digit(tmp_path, texture):
+def test_read_mesh_large_coordinates_keep_all_digits(tmp_path, texture):
     far = "".join(f"v {ZERO[0] + x + 0.1234567} {ZERO[1] + y + 0.7654321} {z}\n" for x, y, z in CORNERS)
     path = write_obj(tmp_path, texture)
     path.write_text(path.read_text().replace(OBJ, far))
@@ -111,7 +111,7 @@ def test_coordinates_in_the_world_lose_no_digit(tmp_path, texture):
     )
 
 
-def test_colours_of_vertices_and_of_materials(tmp_path):
+def test_read_mesh_reads_colours_of_vertices_and_materials(tmp_path):
     colours = np.array([(250, 0, 0), (0, 250, 0), (0, 0, 250), (90, 90, 90)], np.uint8)
     trimesh.Trimesh(CORNERS, FACES, vertex_colors=colours, process=False).export(tmp_path / "v.ply")
     mesh = read_mesh(tmp_path / "v.ply", **PLACED)
@@ -121,7 +121,7 @@ def test_colours_of_vertices_and_of_materials(tmp_path):
     assert (read_mesh(tmp_path / "k.obj", **PLACED).colours == (255, 0, 51)).all()
 
 
-def test_our_own_glb_knows_its_place(tmp_path):
+def test_read_mesh_of_own_glb_uses_its_georeference(tmp_path):
     mesh = Mesh(
         CRS,
         (552_000.0, 4_114_500.0, 590.0),
@@ -132,21 +132,22 @@ def test_our_own_glb_knows_its_place(tmp_path):
     (tmp_path / "t.glb").write_bytes(glb.encode(mesh, (550_000.0, 4_114_000.0, 590.0)))
     back = read_mesh(tmp_path / "t.glb")
     assert back.crs == CRS
-    same_place(back, atol=1e-3)
-    # The page's colours, to the last step of the 8 bits that the file keeps in linear light.
+    check_vertices(back, atol=1e-3)
+    # The colours of the viewer, within one step: the file stores 8 bits in linear light.
     np.testing.assert_allclose(back.colours[:, 0], [(0x3A, 0x3A, 0x40), (0xC4, 0xBE, 0xAE)], atol=1)
 
 
-def test_an_upright_mesh_wants_to_be_turned(tmp_path, texture):
+def test_read_mesh_wrong_upward_axis_is_an_error(tmp_path, texture):
     path = write_glb(tmp_path, texture)
-    same_place(read_mesh(path, up="y", **PLACED))
-    with pytest.raises(TaskError, match="m.glb stands upright.*--up y"):
+    check_vertices(read_mesh(path, up="y", **PLACED))
+    with pytest.raises(TaskError, match="m.glb has a wrong upward axis.*--up y"):
         read_mesh(path, up="z", **PLACED)
 
 
-def test_inside_out_is_a_note(tmp_path, texture):
+def test_read_mesh_inside_out_gives_a_note(tmp_path, texture):
     path = write_obj(tmp_path, texture, "usemtl m\nf 3/3 2/2 1/1\nf 4/4 3/3 1/1\n")
-    assert read_mesh(path, **PLACED).notes == ("m.obj is inside out: most faces look down; taken as it lies",)
+    note = "m.obj is inside out: most faces point down; it is used unchanged"
+    assert read_mesh(path, **PLACED).notes == (note,)
 
 
 SIDECARS = {
@@ -161,7 +162,7 @@ SIDECARS = {
 
 @pytest.mark.parametrize("name", SIDECARS)
 @pytest.mark.parametrize("above", [0, 1, 2])
-def test_sidecars_up_to_two_folders_above_give_the_place(name, above, tmp_path, texture):
+def test_read_mesh_uses_sidecar_up_to_two_folders_above(name, above, tmp_path, texture):
     text, up = SIDECARS[name]
     folder = tmp_path.joinpath(*["x"] * above)
     folder.mkdir(parents=True, exist_ok=True)
@@ -170,15 +171,15 @@ def test_sidecars_up_to_two_folders_above_give_the_place(name, above, tmp_path, 
     mesh = read_mesh(write_obj(folder, texture))
     assert mesh.crs == CRS
     np.testing.assert_allclose(mesh.vertices[mesh.faces] - ZERO - (0, 0, up), CORNERS[FACES], atol=1e-9)
-    # What the user says goes before the sidecar.
+    # Arguments take precedence over the sidecar.
     assert read_mesh(folder / "m.obj", crs="EPSG:25832", offset=(0, 0, 0)).crs == "EPSG:25832"
 
 
-def test_a_prj_gives_the_crs_of_coordinates_in_the_world(tmp_path, texture):
+def test_read_mesh_prj_gives_only_the_crs(tmp_path, texture):
     path = write_obj(tmp_path, texture)
     (tmp_path / "m.prj").write_text("+proj=utm +zone=17 +datum=WGS84 +units=m +no_defs\n")
-    same_place(read_mesh(path, offset=ZERO))
-    with pytest.raises(TaskError, match="m.obj does not say where it lies.*--offset"):
+    check_vertices(read_mesh(path, offset=ZERO))
+    with pytest.raises(TaskError, match="m.obj has no georeference.*--offset"):
         read_mesh(path)
 
 
@@ -186,7 +187,7 @@ def no_crs(folder, texture):
     return write_obj(folder, texture), {}
 
 
-def no_place(folder, texture):
+def no_offset(folder, texture):
     return write_obj(folder, texture), {"crs": CRS}
 
 
@@ -236,9 +237,9 @@ def no_colours(folder, texture):
     return write_obj(folder, texture, head="", faces="f 1 2 3\nf 1 3 4\n"), PLACED
 
 
-def texture_lost_in_glb(folder, texture):
+def no_texture_in_glb(folder, texture):
     path = folder / "m.glb"
-    bare = made(texture)
+    bare = textured(texture)
     bare.vertices = CORNERS[:, [0, 2, 1]] * (1, 1, -1)
     bare.visual = trimesh.visual.TextureVisuals(uv=UV, material=trimesh.visual.material.PBRMaterial())
     path.write_bytes(trimesh.Scene(bare).export(file_type="glb"))
@@ -275,32 +276,32 @@ def other_format(folder, texture):
 
 
 BAD = {
-    no_crs: "m.obj does not say where it lies.*--crs EPSG:.*--offset",
-    no_place: "m.obj does not say where it lies",
+    no_crs: "m.obj has no georeference.*--crs EPSG:.*--offset",
+    no_offset: "m.obj has no georeference",
     wrong_crs: "m.obj: unknown CRS 'EPSG:nothing'",
     sidecar_without_zone: "data_meta.json has no reference_utm",
     sidecar_without_offset: "coords.txt has no CRS in its first line and an offset",
-    no_texture: "m.obj wants the texture .*m.png, which is not there.*--no-dop",
-    no_texture_of_ply: "m.ply wants the texture .*m.png, which is not there.*--no-dop",
+    no_texture: "m.obj needs the texture .*m.png, which does not exist.*--no-dop",
+    no_texture_of_ply: "m.ply needs the texture .*m.png, which does not exist.*--no-dop",
     broken_texture: "the texture .*m.png of .*m.obj cannot be read",
-    no_materials: "m.obj takes its materials from m.mtl, which is not beside it.*--no-dop",
+    no_materials: "m.obj needs the material file m.mtl, which is not beside it.*--no-dop",
     no_uv: "m.obj has a texture but no texture coordinates.*--no-dop",
     no_colours: "m.obj has no colours.*--no-dop",
-    texture_lost_in_glb: "m.glb has no colours",
+    no_texture_in_glb: "m.glb has no colours",
     no_faces: "m.obj has no faces",
     no_area: "m.obj has faces but no area",
-    no_numbers: "m.obj has faces with corners that are missing or no numbers",
+    no_numbers: "m.obj has faces with missing or non-finite corners",
     cut_short: "m.glb cannot be read as a mesh",
     missing: "gone.obj does not exist",
-    other_format: "m.fbx is none of",
+    other_format: "m.fbx is not a mesh of a supported format",
 }
 
 
 @pytest.mark.parametrize("case", BAD, ids=lambda case: case.__name__)
-def test_what_cannot_be_used_is_one_line_with_file_and_remedy(case, tmp_path, texture):
-    path, asked = case(tmp_path, texture)
+def test_read_mesh_invalid_input_is_one_line_with_file_and_remedy(case, tmp_path, texture):
+    path, options = case(tmp_path, texture)
     with pytest.raises(TaskError, match=BAD[case]) as caught:
-        read_mesh(path, **asked)
+        read_mesh(path, **options)
     assert "\n" not in str(caught.value)
     assert caught.value.file
 
@@ -308,8 +309,8 @@ def test_what_cannot_be_used_is_one_line_with_file_and_remedy(case, tmp_path, te
 @pytest.mark.parametrize(
     "case", [no_texture, no_texture_of_ply, broken_texture, no_materials, no_uv, no_colours]
 )
-def test_without_an_orthophoto_no_colours_are_wanted(case, tmp_path, texture):
-    path, asked = case(tmp_path, texture)
-    mesh = read_mesh(path, **asked, colours=False)
-    same_place(mesh)
+def test_read_mesh_without_colours_ignores_missing_textures(case, tmp_path, texture):
+    path, options = case(tmp_path, texture)
+    mesh = read_mesh(path, **options, colours=False)
+    check_vertices(mesh)
     assert not mesh.coloured

@@ -6,7 +6,13 @@ from scipy.stats import chisquare
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.mesh import sample as acquire
-from flexroad.tasks.acquire.mesh.sample import TexturedMesh, cover, orthophoto, sample, tops
+from flexroad.tasks.acquire.mesh.sample import (
+    TexturedMesh,
+    covered_cells,
+    orthophoto,
+    sample,
+    surface_heights,
+)
 
 CRS = "EPSG:25832"
 EAST, NORTH = 552_208.0, 4_114_742.0
@@ -90,7 +96,7 @@ def test_each_face_has_its_own_texture():
 def test_the_higher_surface_hides_the_lower_whatever_comes_first():
     ground, bridge = (rectangle(0, 0, 20, 20, 100), RED), (rectangle(8, 0, 12, 20, 106), BLUE)
     for made in (plain(ground, bridge), plain(bridge, ground)):
-        photo, heights = orthophoto(made, grid(20, 20)), tops(made, grid(20, 20))
+        photo, heights = orthophoto(made, grid(20, 20)), surface_heights(made, grid(20, 20))
         over = np.zeros((20, 20), bool)
         over[:, 8:12] = True
         assert (heights == np.where(over, 106, 100)).all()
@@ -103,7 +109,7 @@ def test_tops_are_those_of_the_plane():
         return 100 + 0.25 * x - 0.125 * y
 
     where = grid(30, 20, cell=0.5)
-    heights = tops(plain((rectangle(0, 0, 15, 10, slope), RED)), where)
+    heights = surface_heights(plain((rectangle(0, 0, 15, 10, slope), RED)), where)
     truth = slope(where.eastings[None] - EAST, where.northings[:, None] - NORTH)
     np.testing.assert_allclose(heights, truth, atol=1e-8)
 
@@ -116,7 +122,7 @@ def test_every_centre_is_hit_though_triangles_meet_under_it():
     around = np.arange(720)
     faces = np.column_stack([np.zeros(720, int), around + 1, (around + 1) % 720 + 1]).astype(np.int32)
     made = TexturedMesh(CRS, vertices, faces, np.full(720, -1, np.int32))
-    assert cover(made, grid(21, 21, cell=1)).all()
+    assert covered_cells(made, grid(21, 21, cell=1)).all()
 
 
 def test_inside_out_and_not_manifold_change_nothing_from_above(texture):
@@ -135,14 +141,14 @@ def test_inside_out_and_not_manifold_change_nothing_from_above(texture):
     here = orthophoto(made, grid(16, 12))
     for other in (turned, twice):
         assert np.array_equal(orthophoto(other, grid(16, 12)).colour, here.colour)
-        assert np.array_equal(tops(other, grid(16, 12)), tops(made, grid(16, 12)))
+        assert np.array_equal(surface_heights(other, grid(16, 12)), surface_heights(made, grid(16, 12)))
 
 
 def test_cover_is_what_lies_below_or_above_a_face():
     made = plain((rectangle(2, 3, 6.4, 8, 0), RED), (rectangle(5, 0, 9.6, 4, 50), RED))
     truth = np.zeros((10, 10), bool)
     truth[2:7, 2:6] = truth[6:10, 5:10] = True
-    assert np.array_equal(cover(made, grid(10, 10)), truth)
+    assert np.array_equal(covered_cells(made, grid(10, 10)), truth)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 from pyproj import Transformer
 
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire.photos.exif import place, read_control, read_shot
+from flexroad.tasks.acquire.photos.exif import place_photos, read_control, read_shot
 from tests import make_photos
 
 XMP = (
@@ -40,7 +40,7 @@ def three(tmp_path):
 
 
 def test_positions_are_those_of_the_tags_in_the_zone_of_the_place(three):
-    placed = place(three)
+    placed = place_photos(three)
     assert placed.crs == make_photos.CRS
     np.testing.assert_allclose(placed.positions, CENTRE + STEPS, atol=0.001)
     np.testing.assert_array_equal(placed.accuracy[0], [3, 3, 5])
@@ -50,7 +50,7 @@ def test_positions_are_those_of_the_tags_in_the_zone_of_the_place(three):
 
 
 def test_another_crs_is_where_the_same_degrees_lie(three):
-    placed = place(three, "EPSG:25833")
+    placed = place_photos(three, "EPSG:25833")
     np.testing.assert_allclose(
         degrees("EPSG:25833", *placed.positions[0, :2]), degrees(make_photos.CRS, *CENTRE[:2]), atol=1e-8
     )
@@ -146,18 +146,18 @@ def test_a_file_that_was_cut_off_is_named(tmp_path):
 
 def test_two_photographs_are_too_few(three):
     with pytest.raises(TaskError, match="2 photographs are too few"):
-        place(three[:2])
+        place_photos(three[:2])
 
 
 def test_photographs_of_two_places_are_told(three, tmp_path):
     far = read_shot(write(tmp_path / "far.jpg", make_photos.exif(CENTRE, offset=(3000, 0, 0))))
     with pytest.raises(TaskError, match=r"2 places more than 1000 m apart.*far\.jpg"):
-        place([*three, far])
+        place_photos([*three, far])
 
 
 def test_degrees_are_no_frame_for_rasters(three):
     with pytest.raises(TaskError, match="counts in degree"):
-        place(three, "EPSG:4326")
+        place_photos(three, "EPSG:4326")
 
 
 def test_control_points_are_gathered_by_name_and_moved(three, tmp_path):
@@ -168,7 +168,7 @@ def test_control_points_are_gathered_by_name_and_moved(three, tmp_path):
         f"0.jpg,10.5,20,{east},{north},101.5,A\n1.jpg,30,20,{east},{north},101.5,A\n"
         f"2.jpg,1,2,{east + 5},{north},100,B\n"
     )
-    control = read_control(table, place(three), "EPSG:25833")
+    control = read_control(table, place_photos(three), "EPSG:25833")
     assert control.names == ("A", "B")
     np.testing.assert_allclose(control.points[0], [*CENTRE[:2], 101.5], atol=0.001)
     assert control.marks[0] == {three[0].path: (10.5, 20.0), three[1].path: (30.0, 20.0)}
@@ -179,4 +179,4 @@ def test_a_bad_row_of_control_points_is_named(three, tmp_path, row):
     table = tmp_path / "control.csv"
     table.write_text(f"image,x_px,y_px,easting,northing,height\n0.jpg,1,2,3,4,5\n{row}\n")
     with pytest.raises(TaskError, match=r"control\.csv, row 2: .*columns are image,x_px"):
-        read_control(table, place(three))
+        read_control(table, place_photos(three))

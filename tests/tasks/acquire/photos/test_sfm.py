@@ -9,7 +9,7 @@ from PIL import Image
 
 from flexroad.tasks import TaskError
 from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu
-from flexroad.tasks.acquire.photos.exif import Control, place, read_shot
+from flexroad.tasks.acquire.photos.exif import Control, place_photos, read_shot
 from flexroad.tasks.acquire.photos.poisson import poisson, write_ply
 from flexroad.tasks.acquire.photos.sfm import Options, reconstruct
 from tests import make_photos
@@ -28,7 +28,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def placed(made):
-    return place([read_shot(photo.path) for photo in made])
+    return place_photos([read_shot(photo.path) for photo in made])
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def cloud(found):
     clouds = []
     for number, view in enumerate(found.views):
         others = [found.views[other] for other in mvs_cpu.partners(found, number, STEREO)]
-        clouds.append(mvs_cpu.photo_cloud(view, others, found.points[view.seen], STEREO))
+        clouds.append(mvs_cpu.photo_cloud(view, others, found.points[view.visible], STEREO))
     return mvs_cpu.merge(clouds, SPACING)
 
 
@@ -149,7 +149,7 @@ def test_photographs_that_have_nothing_in_common_are_told(tmp_path):
         noise = rng.integers(0, 255, (240, 320, 3), np.uint8)
         centre = [*make_photos.CORNER + 10 * number, 140]
         Image.fromarray(noise).save(tmp_path / f"{number}.jpg", exif=make_photos.exif(centre))
-    placed = place([read_shot(path) for path in sorted(tmp_path.glob("*.jpg"))])
+    placed = place_photos([read_shot(path) for path in sorted(tmp_path.glob("*.jpg"))])
     (tmp_path / "work").mkdir()
     with pytest.raises(TaskError, match="none of the 3 photographs match.*--image-size 1280"):
         reconstruct(placed, tmp_path / "work", QUICK)
@@ -165,7 +165,7 @@ def test_strangers_among_the_photographs_are_named(placed, made, tmp_path):
         shots.append(read_shot(path))
     (tmp_path / "work").mkdir()
     with pytest.raises(TaskError, match=r"3 of 7 photographs could be placed, not stranger0\.jpg, stranger1"):
-        reconstruct(place(shots), tmp_path / "work", QUICK)
+        reconstruct(place_photos(shots), tmp_path / "work", QUICK)
 
 
 def test_without_pycolmap_the_command_that_installs_it_is_told(placed, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points import ground_filter as slope_filter
-from flexroad.tasks.acquire.points.to_rasters import Options, tags, rasterise, reach_m
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m, tags
 from flexroad.tasks.acquire.types import Points, Rasters
 
 NO_CLASS, GROUND, TREE, HOUSE, DECK = 0, 2, 5, 6, 17
