@@ -68,7 +68,7 @@ def two_files(folder: Path, *, crs="EPSG:25832", suffix="laz", swap=False, **wor
 
 def prepare(files, out, executor=None, ground="auto", options=None, **common):
     lines = []
-    made = prepare_points(
+    result = prepare_points(
         files,
         out,
         PrepareOptions(**common),
@@ -77,7 +77,7 @@ def prepare(files, out, executor=None, ground="auto", options=None, **common):
         lines.append,
         ground,
     )
-    return made, lines
+    return result, lines
 
 
 def read(folder, layer):
@@ -105,7 +105,7 @@ def highest(xyz, kind, raster):
 )
 def test_prepare_points_gives_true_heights(tmp_path, unit, crs, metric, corner):
     files = two_files(tmp_path, crs=crs, unit=unit, corner=corner)
-    made, _ = prepare(files, tmp_path / "out", roads=None)
+    result, _ = prepare(files, tmp_path / "out", roads=None)
     xyz, kind, _ = world(unit, corner)
     dsm, raster = read(tmp_path / "out", "dsm")
     assert raster.crs == metric
@@ -126,7 +126,7 @@ def test_prepare_points_gives_true_heights(tmp_path, unit, crs, metric, corner):
     inner = (slice(2, -2), slice(2, -2))
     assert np.abs(dtm - plane)[inner].max() < WITHIN
 
-    (tile,) = Catalog.read(made.catalog).tiles
+    (tile,) = Catalog.read(result.catalog).tiles
     data = load(tile, LoadOptions())
     deck = np.isfinite(read(tmp_path / "out", "bridges")[0])
     assert deck.any()
@@ -204,10 +204,10 @@ def test_prepare_points_ground_auto_uses_classes_only_if_present(tmp_path):
             [("good", kind), ("alike", 1), ("few", np.where(np.arange(len(kind)) % 150, 1, 2))]}  # fmt: skip
 
     def method(*names, ground="auto"):
-        made, _ = prepare([flat[name] for name in names], tmp_path / "out", ground=ground)
+        result, _ = prepare([flat[name] for name in names], tmp_path / "out", ground=ground)
         with rasterio.open(tmp_path / "out" / "dtm.tif") as dtm:
             processing = dtm.tags()["DTM"]
-        return processing, " ".join(made.notes)
+        return processing, " ".join(result.notes)
 
     by_class, by_slope = " of points of class 2;", " of slope-filtered points "
     assert by_class in method("good")[0]
@@ -230,17 +230,17 @@ def test_prepare_points_dense_noisy_cloud_gives_unbiased_ground(tmp_path):
     xyz = np.column_stack(
         [rng.uniform(0, 40, (160_000, 2)) + np.array([356e3, 5699e3]), rng.normal(50, 0.05, 160_000)]
     )
-    made, _ = prepare([write_cloud(tmp_path / "dense.laz", xyz, 0, "EPSG:25832")], tmp_path / "out")
+    result, _ = prepare([write_cloud(tmp_path / "dense.laz", xyz, 0, "EPSG:25832")], tmp_path / "out")
     dtm, _ = read(tmp_path / "out", "dtm")
-    assert any("100 points per m2" in note for note in made.notes)
+    assert any("100 points per m2" in note for note in result.notes)
     assert abs(np.nanmedian(dtm) - 50) < 0.01
 
 
 def test_prepare_points_out_of_range_heights_are_left_out_with_note(tmp_path):
     xyz, kind, _ = world()
     xyz[:3, 2] = -32767
-    made, _ = prepare([write_cloud(tmp_path / "a.laz", xyz, kind, "EPSG:25832")], tmp_path / "out")
-    assert "left out 3 points with heights outside -500..9000 m; check --height-unit" in made.notes
+    result, _ = prepare([write_cloud(tmp_path / "a.laz", xyz, kind, "EPSG:25832")], tmp_path / "out")
+    assert "left out 3 points with heights outside -500..9000 m; check --height-unit" in result.notes
     assert np.nanmin(read(tmp_path / "out", "dtm")[0]) > 40
 
 

@@ -39,7 +39,7 @@ def three(tmp_path):
     ]
 
 
-def test_positions_are_those_of_the_tags_in_the_zone_of_the_place(three):
+def test_place_photos_gives_tagged_positions_in_local_utm_zone(three):
     placed = place_photos(three)
     assert placed.crs == make_photos.CRS
     np.testing.assert_allclose(placed.positions, CENTRE + STEPS, atol=0.001)
@@ -49,7 +49,7 @@ def test_positions_are_those_of_the_tags_in_the_zone_of_the_place(three):
     assert three[0].taken == datetime(2024, 5, 17, 10, 30, tzinfo=UTC)
 
 
-def test_another_crs_is_where_the_same_degrees_lie(three):
+def test_place_photos_to_other_crs_keeps_the_position(three):
     placed = place_photos(three, "EPSG:25833")
     np.testing.assert_allclose(
         degrees("EPSG:25833", *placed.positions[0, :2]), degrees(make_photos.CRS, *CENTRE[:2]), atol=1e-8
@@ -58,7 +58,7 @@ def test_another_crs_is_where_the_same_degrees_lie(three):
 
 @given(st.floats(-179.9, 179.9).filter(lambda degrees: abs(degrees) > 1e-3), st.floats(-80, 80))
 @settings(max_examples=40, deadline=None)
-def test_all_quarters_of_the_globe_are_told_apart(longitude, latitude):
+def test_read_shot_position_is_right_in_all_hemispheres(longitude, latitude):
     zone = f"+proj=aeqd +lon_0={longitude} +lat_0={latitude}"
     tags = make_photos.exif(CENTRE)
     gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
@@ -68,8 +68,8 @@ def test_all_quarters_of_the_globe_are_told_apart(longitude, latitude):
     file = io.BytesIO()
     Image.new("L", (16, 16)).save(file, "jpeg", exif=tags)
     shot = read_shot(file)
-    off = Transformer.from_crs("EPSG:4326", zone, always_xy=True).transform(shot.longitude, shot.latitude)
-    assert np.hypot(*off) < 0.2
+    offset = Transformer.from_crs("EPSG:4326", zone, always_xy=True).transform(shot.longitude, shot.latitude)
+    assert np.hypot(*offset) < 0.2
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_all_quarters_of_the_globe_are_told_apart(longitude, latitude):
         ({"RtkFlag": 0, "RtkStdLon": 0, "RtkStdLat": 0, "RtkStdHgt": 0}, (3, 5), None),
     ],
 )
-def test_the_drones_own_position_is_preferred(tmp_path, dji, accuracy, heights):
+def test_read_shot_prefers_position_in_xmp(tmp_path, dji, accuracy, heights):
     own = {"GpsLatitude": "+50.9962000", "GpsLongitude": "+7.8603000", "AbsoluteAltitude": "+151.20"}
     shot = read_shot(write(tmp_path / "a.jpg", make_photos.exif(CENTRE), **own, **dji))
     assert (shot.latitude, shot.longitude, shot.altitude) == (50.9962, 7.8603, 151.2)
@@ -99,7 +99,7 @@ def test_the_drones_own_position_is_preferred(tmp_path, dji, accuracy, heights):
     assert heights in (None, shot.heights)
 
 
-def test_an_altitude_alone_does_not_replace_the_exif_position(tmp_path):
+def test_read_shot_xmp_altitude_alone_keeps_exif_position(tmp_path):
     shot = read_shot(write(tmp_path / "a.jpg", make_photos.exif(CENTRE), AbsoluteAltitude="+151.20"))
     assert shot.altitude == 140.0
 
@@ -107,29 +107,29 @@ def test_an_altitude_alone_does_not_replace_the_exif_position(tmp_path):
 @pytest.mark.parametrize(
     ("size", "film_mm", "dji", "focal"),
     [
-        # Full frame: 36 mm are as many pixels as the picture is wide.
+        # Full frame: 36 mm are the width of the image.
         ((360, 240), 24, {}, 240.0),
-        # 4:3 has the full frame's diagonal, 43.27 mm.
+        # 4:3 has the diagonal of full frame, 43.27 mm.
         ((400, 300), 20, {}, 20 / np.hypot(36, 24) * 500),
-        # 16:9 is cut from a sensor of 3:2, whose width it keeps; upright pictures are no different.
+        # 16:9 is cropped from a 3:2 sensor of the same width; portrait orientation is the same.
         ((360, 202), 24, {}, 240.0),
         ((202, 360), 24, {}, 240.0),
         ((360, 240), 24, {"CalibratedFocalLength": "251.5"}, 251.5),
         ((360, 240), None, {}, None),
     ],
 )
-def test_focal_length_in_pixels(tmp_path, size, film_mm, dji, focal):
+def test_read_shot_focal_length_is_in_pixels(tmp_path, size, film_mm, dji, focal):
     path = write(tmp_path / "a.jpg", make_photos.exif(CENTRE, film_mm), size, **dji)
     assert read_shot(path).focal_px == pytest.approx(focal)
 
 
-def test_a_photograph_without_position_is_named(tmp_path):
+def test_read_shot_without_position_is_an_error(tmp_path):
     path = write(tmp_path / "indoors.jpg")
     with pytest.raises(TaskError, match=r"indoors\.jpg has no GNSS position.*leave it out"):
         read_shot(path)
 
 
-def test_a_receiver_without_a_fix_has_no_position(tmp_path):
+def test_read_shot_receiver_without_fix_is_an_error(tmp_path):
     tags = make_photos.exif(CENTRE)
     gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
     gps[ExifTags.GPS.GPSLongitude] = gps[ExifTags.GPS.GPSLatitude] = (0, 0, 0)
@@ -137,30 +137,30 @@ def test_a_receiver_without_a_fix_has_no_position(tmp_path):
         read_shot(write(tmp_path / "a.jpg", tags))
 
 
-def test_a_file_that_was_cut_off_is_named(tmp_path):
+def test_read_shot_truncated_file_is_an_error(tmp_path):
     path = write(tmp_path / "cut.jpg", make_photos.exif(CENTRE), (640, 480))
     path.write_bytes(path.read_bytes()[:-1500])
     with pytest.raises(TaskError, match=r"cut\.jpg cannot be read as a photograph"):
         read_shot(path)
 
 
-def test_two_photographs_are_too_few(three):
+def test_place_photos_two_photographs_are_an_error(three):
     with pytest.raises(TaskError, match="2 photographs are too few"):
         place_photos(three[:2])
 
 
-def test_photographs_of_two_places_are_told(three, tmp_path):
+def test_place_photos_two_places_are_an_error(three, tmp_path):
     far = read_shot(write(tmp_path / "far.jpg", make_photos.exif(CENTRE, offset=(3000, 0, 0))))
     with pytest.raises(TaskError, match=r"2 places more than 1000 m apart.*far\.jpg"):
         place_photos([*three, far])
 
 
-def test_degrees_are_no_frame_for_rasters(three):
-    with pytest.raises(TaskError, match="counts in degree"):
+def test_place_photos_to_crs_in_degrees_is_an_error(three):
+    with pytest.raises(TaskError, match="is in degree"):
         place_photos(three, "EPSG:4326")
 
 
-def test_control_points_are_gathered_by_name_and_moved(three, tmp_path):
+def test_read_control_groups_by_name_and_transforms(three, tmp_path):
     table = tmp_path / "control.csv"
     east, north = Transformer.from_crs(make_photos.CRS, "EPSG:25833", always_xy=True).transform(*CENTRE[:2])
     table.write_text(
@@ -175,7 +175,7 @@ def test_control_points_are_gathered_by_name_and_moved(three, tmp_path):
 
 
 @pytest.mark.parametrize("row", ["9.jpg,1,2,3,4,5", "0.jpg,1,two,3,4,5", "0.jpg,1,2"])
-def test_a_bad_row_of_control_points_is_named(three, tmp_path, row):
+def test_read_control_invalid_row_is_named(three, tmp_path, row):
     table = tmp_path / "control.csv"
     table.write_text(f"image,x_px,y_px,easting,northing,height\n0.jpg,1,2,3,4,5\n{row}\n")
     with pytest.raises(TaskError, match=r"control\.csv, row 2: .*columns are image,x_px"):

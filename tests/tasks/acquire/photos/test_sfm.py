@@ -1,4 +1,4 @@
-"""Photographs rendered from known places of a known hill: what comes back must be both."""
+"""Poses and surface are reconstructed from rendered photographs of a synthetic hill."""
 
 import sys
 from dataclasses import replace
@@ -22,74 +22,74 @@ SPACING = 0.3
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def photos(tmp_path_factory):
     return make_photos.photographs(tmp_path_factory.mktemp("photos"))
 
 
 @pytest.fixture(scope="module")
-def placed(made):
-    return place_photos([read_shot(photo.path) for photo in made])
+def placed(photos):
+    return place_photos([read_shot(photo.path) for photo in photos])
 
 
 @pytest.fixture(scope="module")
-def found(placed, tmp_path_factory):
+def reconstruction(placed, tmp_path_factory):
     return reconstruct(placed, tmp_path_factory.mktemp("work"), QUICK)
 
 
 @pytest.fixture(scope="module")
-def cloud(found):
+def cloud(reconstruction):
     clouds = []
-    for number, view in enumerate(found.views):
-        others = [found.views[other] for other in mvs_cpu.partners(found, number, STEREO)]
-        clouds.append(mvs_cpu.photo_cloud(view, others, found.points[view.visible], STEREO))
+    for number, view in enumerate(reconstruction.views):
+        others = [reconstruction.views[other] for other in mvs_cpu.partners(reconstruction, number, STEREO)]
+        clouds.append(mvs_cpu.photo_cloud(view, others, reconstruction.points[view.visible], STEREO))
     return mvs_cpu.merge(clouds, SPACING)
 
 
-def centres_off(found, made):
-    true = np.array([photo.centre for photo in made])
-    return np.abs(np.array([view.centre for view in found.views]) + found.origin - true)
+def centre_errors(reconstruction, photos):
+    true = np.array([photo.centre for photo in photos])
+    return np.abs(np.array([view.centre for view in reconstruction.views]) + reconstruction.origin - true)
 
 
-def off(points, origin):
+def height_errors(points, origin):
     east, north, up = (points + origin).T
     return up - make_photos.ground(east, north)
 
 
-def test_poses_are_the_true_ones(found, made):
-    assert [view.path for view in found.views] == [photo.path for photo in made]
-    assert not found.missing
-    assert found.focal_held
-    assert found.reprojection_px < 0.3
-    assert centres_off(found, made).max() < 0.05
-    for view, photo in zip(found.views, made, strict=True):
+def test_reconstruct_gives_true_poses(reconstruction, photos):
+    assert [view.path for view in reconstruction.views] == [photo.path for photo in photos]
+    assert not reconstruction.missing
+    assert reconstruction.focal_held
+    assert reconstruction.reprojection_px < 0.3
+    assert centre_errors(reconstruction, photos).max() < 0.05
+    for view, photo in zip(reconstruction.views, photos, strict=True):
         np.testing.assert_allclose(view.rotation, photo.rotation, atol=1e-3)
-    assert np.quantile(np.abs(off(found.points, found.origin)), 0.95) < 0.1
+    assert np.quantile(np.abs(height_errors(reconstruction.points, reconstruction.origin)), 0.95) < 0.1
 
 
-def test_control_points_overrule_a_receiver_that_is_off_and_a_wrong_focal_length(placed, made, tmp_path):
+def test_reconstruct_control_points_correct_gnss_and_focal_length(placed, photos, tmp_path):
     plan = make_photos.CORNER + np.array([[25, 22], [46, 25], [30, 48], [44, 44], [35, 35]])
     points = np.column_stack([plan, make_photos.ground(*plan.T)])
-    seen = [{photo.path: tuple(photo.pixels(point[None])[0]) for photo in made} for point in points]
+    pixels = [{photo.path: tuple(photo.pixels(point[None])[0]) for photo in photos} for point in points]
     marks = tuple(
         {path: (x, y) for path, (x, y) in each.items() if 5 < x < make_photos.WIDTH - 5 and 5 < y < 475}
-        for each in seen
+        for each in pixels
     )
     shots = tuple(replace(shot, focal_px=1.15 * shot.focal_px) for shot in placed.shots)
     wrong = replace(placed, shots=shots, positions=placed.positions + np.array([2, -1, 3]))
-    found = reconstruct(wrong, tmp_path, QUICK, Control(tuple("abcde"), points, marks))
-    assert not found.focal_held
-    assert found.views[0].camera.focal_px == pytest.approx(make_photos.FOCAL, rel=5e-3)
-    assert centres_off(found, made).max() < 0.15
-    assert np.abs(found.control_m).max() < 0.05
-    np.testing.assert_allclose(np.median(found.residuals, axis=0), [-2, 1, -3], atol=0.1)
+    reconstruction = reconstruct(wrong, tmp_path, QUICK, Control(tuple("abcde"), points, marks))
+    assert not reconstruction.focal_held
+    assert reconstruction.views[0].camera.focal_px == pytest.approx(make_photos.FOCAL, rel=5e-3)
+    assert centre_errors(reconstruction, photos).max() < 0.15
+    assert np.abs(reconstruction.control_m).max() < 0.05
+    np.testing.assert_allclose(np.median(reconstruction.residuals, axis=0), [-2, 1, -3], atol=0.1)
 
 
-def test_depths_and_normals_are_those_of_the_hill(found, cloud):
-    wrong = off(cloud.points, found.origin)
-    assert np.abs(np.median(wrong)) < 0.05
-    assert np.quantile(np.abs(wrong), 0.95) < 0.15
+def test_photo_cloud_has_true_heights_and_normals(reconstruction, cloud):
+    errors = height_errors(cloud.points, reconstruction.origin)
+    assert np.abs(np.median(errors)) < 0.05
+    assert np.quantile(np.abs(errors), 0.95) < 0.15
     assert np.ptp(cloud.points[:, :2], axis=0).min() > 30
-    east, north, _ = (cloud.points + found.origin).T
+    east, north, _ = (cloud.points + reconstruction.origin).T
     step = 0.01
     slope = [
         (make_photos.ground(east + x, north + y) - make_photos.ground(east - x, north - y)) / (2 * step)
@@ -100,50 +100,53 @@ def test_depths_and_normals_are_those_of_the_hill(found, cloud):
     assert np.degrees(np.arccos(np.median(cosine))) < 5
 
 
-def test_colours_are_those_of_the_photographs(found, cloud, made):
-    seen = make_photos.texture()
-    east, north, _ = (cloud.points + found.origin).T
+def test_photo_cloud_has_colours_of_the_photographs(reconstruction, cloud, photos):
+    texture = make_photos.texture()
+    east, north, _ = (cloud.points + reconstruction.origin).T
     col, row = (
         ((axis - corner) / make_photos.TEXEL_M).astype(int)
         for axis, corner in zip((east, north), make_photos.CORNER, strict=True)
     )
-    # Mixed over the merged cloud's spacing, so only the broad tints remain to compare.
+    # Colours are averaged over the spacing of the merged cloud, so only low frequencies are compared.
     for band in range(3):
-        assert np.corrcoef(seen[row, col, band], cloud.colours[:, band])[0, 1] > 0.5
+        assert np.corrcoef(texture[row, col, band], cloud.colours[:, band])[0, 1] > 0.5
 
 
-def test_the_mesh_is_the_hill_and_ends_with_the_points(found, cloud, tmp_path):
-    mesh = poisson(cloud, SPACING, found.crs, found.origin, tmp_path, threads=1)
+def test_poisson_gives_true_heights_and_ends_at_the_points(reconstruction, cloud, tmp_path):
+    mesh = poisson(cloud, SPACING, reconstruction.crs, reconstruction.origin, tmp_path, threads=1)
     used = mesh.vertices[np.unique(mesh.faces)]
-    wrong = off(used, 0)
-    assert np.abs(np.median(wrong)) < 0.05
-    assert np.quantile(np.abs(wrong), 0.95) < 0.15
-    low, high = (cloud.points + found.origin).min(axis=0), (cloud.points + found.origin).max(axis=0)
+    errors = height_errors(used, 0)
+    assert np.abs(np.median(errors)) < 0.05
+    assert np.quantile(np.abs(errors), 0.95) < 0.15
+    low, high = (
+        (cloud.points + reconstruction.origin).min(axis=0),
+        (cloud.points + reconstruction.origin).max(axis=0),
+    )
     assert (used.min(axis=0) > low - 10 * SPACING).all()
     assert (used.max(axis=0) < high + 10 * SPACING).all()
     assert mesh.coloured
 
 
-def test_a_cloud_that_colmap_writes_is_read_back(cloud, tmp_path):
+def test_read_ply_returns_written_cloud(cloud, tmp_path):
     write_ply(tmp_path / "cloud.ply", cloud)
-    again = mvs_gpu.read_ply(tmp_path / "cloud.ply")
-    np.testing.assert_allclose(again.points, cloud.points, atol=1e-5)
-    np.testing.assert_array_equal(again.colours, cloud.colours)
+    result = mvs_gpu.read_ply(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(result.points, cloud.points, atol=1e-5)
+    np.testing.assert_array_equal(result.colours, cloud.colours)
 
 
-def test_merging_is_the_mean_of_each_cube():
-    one = mvs_cpu.Cloud(
+def test_merge_gives_mean_of_each_cube():
+    cloud = mvs_cpu.Cloud(
         np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.2, 0, 0]]),
         np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0]]),
         np.array([[10, 0, 0], [20, 0, 0], [0, 0, 9]], np.uint8),
     )
-    merged = mvs_cpu.merge([one, one], 0.5)
+    merged = mvs_cpu.merge([cloud, cloud], 0.5)
     np.testing.assert_allclose(merged.points, [[-0.2, 0, 0], [0.2, 0.1, 0.1]])
     np.testing.assert_allclose(merged.normals, [[1, 0, 0], [0, 0, 1]])
     np.testing.assert_array_equal(merged.colours, [[0, 0, 9], [15, 0, 0]])
 
 
-def test_photographs_that_have_nothing_in_common_are_told(tmp_path):
+def test_reconstruct_unrelated_photographs_are_an_error(tmp_path):
     rng = np.random.default_rng(0)
     for number in range(3):
         noise = rng.integers(0, 255, (240, 320, 3), np.uint8)
@@ -155,20 +158,20 @@ def test_photographs_that_have_nothing_in_common_are_told(tmp_path):
         reconstruct(placed, tmp_path / "work", QUICK)
 
 
-def test_strangers_among_the_photographs_are_named(placed, made, tmp_path):
+def test_reconstruct_names_photographs_not_placed(placed, photos, tmp_path):
     rng = np.random.default_rng(0)
     shots = list(placed.shots[:3])
     for number in range(4):
-        path = tmp_path / f"stranger{number}.jpg"
+        path = tmp_path / f"other{number}.jpg"
         noise = rng.integers(0, 255, (240, 320, 3), np.uint8)
-        Image.fromarray(noise).save(path, exif=make_photos.exif(made[number].centre, model="Other"))
+        Image.fromarray(noise).save(path, exif=make_photos.exif(photos[number].centre, model="Other"))
         shots.append(read_shot(path))
     (tmp_path / "work").mkdir()
-    with pytest.raises(TaskError, match=r"3 of 7 photographs could be placed, not stranger0\.jpg, stranger1"):
+    with pytest.raises(TaskError, match=r"3 of 7 photographs could be placed, not other0\.jpg, other1"):
         reconstruct(place_photos(shots), tmp_path / "work", QUICK)
 
 
-def test_without_pycolmap_the_command_that_installs_it_is_told(placed, tmp_path, monkeypatch):
+def test_reconstruct_without_pycolmap_gives_install_command(placed, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(TaskError, match=r"pip install 'flexroad\[photogrammetry\]'"):
         reconstruct(placed, tmp_path, QUICK)

@@ -1,4 +1,4 @@
-"""The ground filter as the rule is written: every pair of points compared."""
+"""Reference implementation of the ground filter: compares all pairs of points."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ OUTNUMBERED = 20
 def ground(easting, northing, height, options):
     """Return which points are ground, ``(n,)``; for small clouds."""
     out = np.zeros(height.size, bool)
-    known = np.flatnonzero(np.isfinite(easting + northing + height))
+    valid = np.flatnonzero(np.isfinite(easting + northing + height))
     if options.low_m is not None:
-        low = lows(easting[known], northing[known], height[known], options)
-        known = known[~low]
+        low = low_outliers(easting[valid], northing[valid], height[valid], options)
+        valid = valid[~low]
     tolerance = options.confidence * np.sqrt(2) * options.noise_m
-    for p in known:
-        for q in known:
+    for p in valid:
+        for q in valid:
             d = np.sqrt((easting[p] - easting[q]) ** 2 + (northing[p] - northing[q]) ** 2)
             if d <= options.radius_m and height[p] - height[q] > options.slope * d + tolerance:
                 break
@@ -23,7 +23,7 @@ def ground(easting, northing, height, options):
     return out
 
 
-def lows(easting, northing, height, options):
+def low_outliers(easting, northing, height, options):
     """Return which points are low outliers, ``(n,)``."""
     out = np.zeros(height.size, bool)
     for p in range(height.size):

@@ -18,7 +18,7 @@ def plane(where: Grid):
 
 @pytest.mark.parametrize("cells", range(1, 9))
 @pytest.mark.parametrize("shape", ["square", "strip"])
-def test_voids_are_filled_up_to_the_stated_width(cells, shape):
+def test_fill_fills_voids_up_to_size_m(cells, shape):
     where = grid(40, 40)
     truth = plane(where)
     holed = truth.copy()
@@ -27,7 +27,7 @@ def test_voids_are_filled_up_to_the_stated_width(cells, shape):
     assert np.isnan(fill(holed, where, (cells - 1) * CELL)).any()
 
 
-def test_wide_voids_keep_their_shore_and_the_survey_its_border():
+def test_fill_keeps_wide_voids_and_border_of_survey():
     where = grid(60, 60)
     row, col = np.indices(where.shape)
     lake = np.hypot(row - 30, col - 30) < 12
@@ -39,7 +39,7 @@ def test_wide_voids_keep_their_shore_and_the_survey_its_border():
     assert not filled[beyond].any()
 
 
-def test_what_is_known_stays_and_nothing_comes_of_nothing():
+def test_fill_keeps_heights_and_all_void_stays_void():
     where = grid(9, 9)
     np.testing.assert_array_equal(fill(plane(where), where, 5), plane(where))
     assert np.isnan(fill(np.full(where.shape, np.nan), where, 5)).all()
@@ -47,7 +47,7 @@ def test_what_is_known_stays_and_nothing_comes_of_nothing():
 
 @pytest.mark.parametrize("size_m", [0.0, 0.4, 0.7, 1.3])
 @pytest.mark.parametrize("share", [0.2, 0.7])
-def test_cells_beyond_the_reach_change_nothing(size_m, share):
+def test_fill_cells_beyond_reach_m_have_no_effect(size_m, share):
     rng = np.random.default_rng(2)
     whole = grid(70, 60)
     heights = np.where(rng.random(whole.shape) < share, rng.uniform(100, 110, whole.shape), np.nan)
@@ -57,5 +57,5 @@ def test_cells_beyond_the_reach_change_nothing(size_m, share):
         core = slice(row, row + 7), slice(col, col + 9)
         rim = slice(row - n, row + 7 + n), slice(col - n, col + 9 + n)
         part = grid(9 + 2 * n, 7 + 2 * n, whole.west + (col - n) * CELL, whole.north - (row - n) * CELL)
-        found = fill(heights[rim], part, size_m)[n : n + 7, n : n + 9]
-        np.testing.assert_allclose(found, expected[core], rtol=0, atol=1e-9)
+        result = fill(heights[rim], part, size_m)[n : n + 7, n : n + 9]
+        np.testing.assert_allclose(result, expected[core], rtol=0, atol=1e-9)

@@ -7,7 +7,7 @@ from flexroad.tasks.acquire.points.binning import bins, means
 from flexroad.tasks.acquire.points.max_height import highest, spikes
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
-# Places in quarters of a cell, many of them on the lines; some are outside.
+# Positions in quarters of a cell, many of them on borders of cells; some are outside the grid.
 clouds = st.lists(st.tuples(st.integers(-8, 36), st.integers(-8, 28), st.integers(0, 12)), max_size=60)
 
 
@@ -17,11 +17,11 @@ def points(cloud):
 
 
 def by_cell(cloud) -> dict[tuple[int, int], list[float]]:
-    found: dict[tuple[int, int], list[float]] = {}
+    heights: dict[tuple[int, int], list[float]] = {}
     for x, y, z in cloud:
         if 0 <= x < 4 * GRID.width and 0 <= y < 4 * GRID.height:
-            found.setdefault((y // 4, x // 4), []).append(z / 4)
-    return found
+            heights.setdefault((y // 4, x // 4), []).append(z / 4)
+    return heights
 
 
 def raster(values: dict[tuple[int, int], float]):
@@ -33,38 +33,40 @@ def raster(values: dict[tuple[int, int], float]):
 
 @given(clouds)
 @settings(deadline=None)
-def test_each_cell_has_its_highest_point_and_its_mean(cloud):
+def test_highest_and_means_match_definition(cloud):
     easting, northing, height = points(cloud)
     cells = bins(easting, northing, GRID)
-    of = by_cell(cloud)
+    by_index = by_cell(cloud)
     tops = highest(cells, height, GRID.shape)
-    np.testing.assert_array_equal(tops, raster({at: max(zs) for at, zs in of.items()}))
+    np.testing.assert_array_equal(tops, raster({at: max(zs) for at, zs in by_index.items()}))
     (mean,) = means(cells, GRID.shape, height)
-    np.testing.assert_allclose(mean, raster({at: sum(zs) / len(zs) for at, zs in of.items()}), rtol=1e-14)
+    np.testing.assert_allclose(
+        mean, raster({at: sum(zs) / len(zs) for at, zs in by_index.items()}), rtol=1e-14
+    )
 
 
 @given(clouds, st.sampled_from([0.25, 1.0]))
 @settings(deadline=None)
-def test_spikes_are_those_of_the_definition(cloud, despike_m):
-    of = by_cell(cloud)
+def test_spikes_match_definition(cloud, despike_m):
+    by_index = by_cell(cloud)
     expected = []
-    for (row, col), zs in of.items():
+    for (row, col), zs in by_index.items():
         near = [(row + r, col + c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-        others = sorted(zs)[:-1] + [z for at in near for z in of.get(at, [])]
+        others = sorted(zs)[:-1] + [z for at in near for z in by_index.get(at, [])]
         if others and max(zs) > max(others) + despike_m:
             expected.append((row * GRID.width + col, max(zs)))
     easting, northing, height = points(cloud)
     cells = bins(easting, northing, GRID)
-    found = spikes(cells, height, GRID.shape, despike_m)
-    assert sorted(zip(cells[found], height[found], strict=True)) == sorted(expected)
+    indices = spikes(cells, height, GRID.shape, despike_m)
+    assert sorted(zip(cells[indices], height[indices], strict=True)) == sorted(expected)
 
 
-def test_grids_on_one_lattice_agree_about_points_on_its_lines():
+def test_bins_points_on_borders_are_in_same_cells_of_all_grids():
     lines = 295500 + np.arange(0, 400) * 0.2
     other = Grid("EPSG:25832", 295500 - 13 * 0.2, 5629500 + 29 * 0.2, 0.2, 450, 450)
-    here = Grid("EPSG:25832", 295500.0, 5629500.0, 0.2, 400, 400)
+    grid = Grid("EPSG:25832", 295500.0, 5629500.0, 0.2, 400, 400)
     northing = 5629500 - np.arange(0, 400) * 0.2
-    row, col = np.divmod(bins(lines, northing, here), 400)
+    row, col = np.divmod(bins(lines, northing, grid), 400)
     np.testing.assert_array_equal(col, np.arange(400))
     np.testing.assert_array_equal(row, np.arange(400))
     row, col = np.divmod(bins(lines, northing, other), 450)

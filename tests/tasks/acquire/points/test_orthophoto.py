@@ -28,15 +28,15 @@ def points(cloud) -> Points:
 
 @given(clouds, st.sampled_from([0, 1, 2, 3]))
 @settings(deadline=None)
-def test_colours_are_those_of_the_definition(cloud, pixels):
+def test_photo_matches_definition(cloud, pixels):
     tops = {}
     for col, row, z, colour in cloud:
         tops[row, col] = max(tops.get((row, col), (-1, ())), (z, colour))
-    found = photo(points(cloud), GRID, pixels * GRID.cell)
+    result = photo(points(cloud), GRID, pixels * GRID.cell)
     for row in range(GRID.height):
         for col in range(GRID.width):
             near = [((r - row) ** 2 + (c - col) ** 2, r, c) for r, c in tops]
             best = min(near, default=(np.inf, 0, 0))
-            assert found.known[row, col] == (best[0] <= pixels**2)
-            expected = tops[best[1:]][1] if found.known[row, col] else (0, 0, 0)
-            assert tuple(found.colour[:, row, col]) == expected
+            assert result.known[row, col] == (best[0] <= pixels**2)
+            expected = tops[best[1:]][1] if result.known[row, col] else (0, 0, 0)
+            assert tuple(result.colour[:, row, col]) == expected
