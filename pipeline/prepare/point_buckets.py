@@ -292,9 +292,10 @@ def scratch_folder(out: Path) -> Iterator[Path]:
     # Same prefix as the folders of `RasterWriter`, which removes those of killed processes.
     folder, new = out / f".prepare-points-{os.getpid()}", not out.exists()
     shutil.rmtree(folder, ignore_errors=True)
-    with disk_errors(out):
-        folder.mkdir(parents=True)
     try:
+        # Inside: an interruption right after it must not leave the folder behind.
+        with disk_errors(out):
+            folder.mkdir(parents=True)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
