@@ -32,7 +32,7 @@ from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup
 from flexroad.tasks.segment import vector
 from flexroad.tasks.segment.pixels import segment
 from flexroad.tasks.segment.pixels import train as training
-from flexroad.tasks.segment.pixels.features import features, look
+from flexroad.tasks.segment.pixels.features import features, read_tile_photo
 from flexroad.tasks.segment.pixels.model import read_model
 from flexroad.tasks.segment.training_types import Sample
 from flexroad.tasks.types import Bools, Source, TileData
@@ -144,7 +144,7 @@ def height_and_green(learn: Sequence[Case], score: Sequence[Case]) -> Maps:
     """Segment cells that are low and not green; both thresholds are tuned on the training half."""
 
     def height_and_greenness(cases: Sequence[Case]) -> list[tuple[np.ndarray, np.ndarray]]:
-        feature_maps = [features(case.data, look(case.data)) for case in cases]
+        feature_maps = [features(case.data, read_tile_photo(case.data)) for case in cases]
         return [tuple(f.values[f.names.index(name)] for name in ("above", "greenness")) for f in feature_maps]
 
     train_values = height_and_greenness(learn)

@@ -1,1 +1,1 @@
-"""One file per method of finding the road: TileData -> RoadMask, the paper's M^r."""
+"""Road segmentation, one file or folder per method: TileData -> RoadMask, the paper's M^r."""

@@ -1,4 +1,4 @@
-"""Step B of the paper, road extraction: M^r as an existing mask layer has it."""
+"""Step B of the paper, road extraction: M^r from an existing mask layer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ VERSION = 1
 
 
 class Options(options.Options):
-    """Take the catalog's road mask; there is nothing to set."""
+    """Use the catalog's road mask; there are no options."""
 
     method: Literal["mask"] = "mask"
 
@@ -24,7 +24,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     Raises
     ------
     TaskError
-        If the tile has no road mask, or none of its cells is road.
+        If the tile has no road mask, or no cell of its core is road.
     """
     if data.road_mask is None:
         raise TaskError(
@@ -33,8 +33,8 @@ def segment(data: TileData, options: Options) -> RoadMask:
         )
     if not data.road_mask[data.grid.window(data.core)].any():
         raise TaskError(
-            "the road mask has no road cell on this tile: leave the tile out, or say with --road-value "
-            "of `flexroad catalog rasters` which values mean road",
+            "the road mask has no road cell on this tile: leave the tile out, or give the values that mean "
+            "road with --road-value of `flexroad catalog rasters`",
             layer="road_mask",
         )
     return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=beyond_extent(data))

@@ -1,4 +1,4 @@
-"""What travels between the training command and the methods that learn."""
+"""Types shared by the training command and the trainable segmentation methods."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from flexroad.tasks.types import Bools, TileData
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One tile to learn from."""
+    """One labelled tile for training or validation."""
 
     data: TileData
-    """The tile and its halo."""
+    """The tile with its halo."""
     road: Bools
-    """Road by the labels, ``(H, W)``."""
-    known: Bools
-    """Cells whose label counts, ``(H, W)``: inside survey and tile, outside the band along label edges."""
+    """Road according to the labels, ``(H, W)``."""
+    labelled: Bools
+    """Cells whose label is used, ``(H, W)``: inside survey and tile, outside the band along label edges."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """How learning stood after one round (of boosting) or epoch (of a network)."""
+    """Losses after one boosting round or one epoch."""
 
     train_loss: float
     validation_loss: float
-    """NaN where it was not measured."""
+    """NaN if not measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """What a method learnt."""
+    """The result of training."""
 
     model: bytes
-    """Content of the one file."""
+    """Content of the model file."""
     suffix: str
-    """How such files end: ``.skops``, ``.safetensors``."""
+    """Suffix of the model file: ``.skops``, ``.safetensors``."""
     history: tuple[Round, ...]
-    """One entry per round or epoch, the first first."""
+    """One entry per round or epoch, in order."""
 
 
 class Progress(Protocol):
-    """Told of every round as it ends; counts from 1."""
+    """Callback, called at the end of every round or epoch."""
 
     def __call__(self, done: int, of: int, last: Round) -> None:
-        """Take note of round ``done`` of at most ``of``."""
+        """Report round ``done`` (from 1) of at most ``of``."""

@@ -1,4 +1,4 @@
-"""Step B of the paper, road extraction: M^r from vectors, as areas or as centre lines with a width."""
+"""Step B of the paper, road extraction: M^r from vector areas, or from centre lines with a width."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ READS = ("roads",)
 
 
 class Options(rasterise.Options):
-    """Which features are roads, how wide they are, and how the mask is tidied."""
+    """Selection of the road features, widths of the lines, and cleanup of the mask."""
 
     method: Literal["vector"] = "vector"
-    cleanup: Cleanup = Field(NOTHING, description="tidying of the mask; by default it is left as it is")
+    cleanup: Cleanup = Field(NOTHING, description="cleanup of the mask; none by default")
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
-    """Return the cells whose centre is on a road of the catalog's vectors; those on bridges are flagged.
+    """Return the cells whose centre lies on a road of the catalog's vectors, with those on bridges flagged.
 
     Raises
     ------
     TaskError
-        If the tile has no vectors, they cannot be used, or none of its cells is road.
+        If the tile has no vectors, they cannot be read, or no cell of its core is road.
     """
-    found = rasterise.roads(data.roads, data.grid, options)
-    burnt = rasterise.cells(found.areas, data.grid)
-    mask = clean(burnt, data, options.cleanup)
+    roads = rasterise.roads(data.roads, data.grid, options)
+    mask = clean(rasterise.cells(roads.areas, data.grid), data, options.cleanup)
     if not mask[data.grid.window(data.core)].any():
         files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
         raise TaskError(
@@ -46,6 +45,6 @@ def segment(data: TileData, options: Options) -> RoadMask:
         core=data.core,
         mask=mask,
         outside=beyond_extent(data),
-        bridge=rasterise.cells(found.areas[found.bridge], data.grid) & mask,
-        notes=found.notes,
+        bridge=rasterise.cells(roads.areas[roads.bridge], data.grid) & mask,
+        notes=roads.notes,
     )

@@ -1,4 +1,4 @@
-"""The head over DINOv2 and its file: one linear map, and everything one must know to use it.
+"""The head on DINOv2 and its file: a linear map and its metadata.
 
 The file is safetensors: the arrays ``weight`` and ``bias``, and `About` as JSON in its metadata.
 """
@@ -19,28 +19,30 @@ from flexroad.tasks.segment.dinov2.backbone import Backbone, missing_extra
 from flexroad.tasks.segment.dinov2.windows import Predict
 
 KEY = "flexroad"
-"""Under which the file's metadata holds `About`."""
-HOW = "train one: `flexroad train CATALOG --method dinov2 --labels mask -o MODEL.safetensors`"
+"""Key of `About` in the file's metadata."""
+REMEDY = "train one: `flexroad train CATALOG --method dinov2 --labels mask -o MODEL.safetensors`"
 
 
 class About(Options):
-    """What a head fits and where it comes from."""
+    """Metadata of a head: the backbone it needs and its provenance."""
 
     kind: Literal["linear head on DINOv2 patch tokens"] = "linear head on DINOv2 patch tokens"
     version: Literal[1] = 1
     backbone: str = Field(description="hub name, or folder on the machine where the head was trained")
     model_type: str = Field(description="dinov2 or dinov2_with_registers")
     registers: int = Field(ge=0, description="number of register tokens")
-    weights: str = Field(description="which weights the backbone had, by `Backbone.weights`")
+    weights: str = Field(description="hash of the backbone's weights, see `Backbone.weights`")
     hidden_size: int = Field(gt=0, description="length of a token")
-    layers: int = Field(gt=0, description="tokens of the last so many layers, one after the other")
+    layers: int = Field(gt=0, description="number of last layers whose tokens are concatenated")
     window_px: int = Field(gt=0, description="side of the windows in training (pixels)")
     gsd_m: float = Field(gt=0, description="ground sampling distance in training (m)")
-    mean: tuple[float, float, float] = Field(description="subtracted from red, green and blue of 0 to 1")
-    std: tuple[float, float, float] = Field(description="then divided by")
-    classes: tuple[str, ...] = Field(description="one per row of the weight; the sigmoid is its probability")
+    mean: tuple[float, float, float] = Field(description="subtracted from red, green and blue (0 to 1)")
+    std: tuple[float, float, float] = Field(description="divisor of red, green and blue after that")
+    classes: tuple[str, ...] = Field(
+        description="class of each weight row; sigmoid(logit) is its probability"
+    )
     threshold: float = Field(gt=0, lt=1, description="probability from which a pixel is road")
-    trained: dict[str, str | int | float] = Field(description="provenance: data, labels, options, figures")
+    trained: dict[str, str | int | float] = Field(description="provenance: data, labels, options, metrics")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,69 +70,77 @@ def read_head(path: Path) -> Head:
     Raises
     ------
     TaskError
-        If it is not there, damaged, or something else; or if safetensors is not installed.
+        If the file does not exist, is damaged or is not a head, or safetensors is not installed.
     """
     try:
         from safetensors import SafetensorError, safe_open
     except ImportError as error:
         raise missing_extra(error) from error
     if not path.is_file():
-        raise TaskError(f"no head for DINOv2 at {path}; {HOW}", str(path))
+        raise TaskError(f"no head for DINOv2 at {path}; {REMEDY}", str(path))
     try:
         with safe_open(path, framework="numpy") as file:
             about = About.model_validate_json((file.metadata() or {}).get(KEY, "{}"))
             head = Head(file.get_tensor("weight"), file.get_tensor("bias"), about)
     except (SafetensorError, ValidationError, OSError) as error:
-        why = error.errors()[0]["loc"] if isinstance(error, ValidationError) else error
-        what = f"its metadata lack {'.'.join(map(str, why))}" if isinstance(why, tuple) else why
-        raise TaskError(f"{path} is no head for DINOv2, or damaged ({what}); {HOW}", str(path)) from error
+        cause = error.errors()[0]["loc"] if isinstance(error, ValidationError) else error
+        reason = f"its metadata lack {'.'.join(map(str, cause))}" if isinstance(cause, tuple) else cause
+        raise TaskError(
+            f"{path} is not a head for DINOv2, or is damaged ({reason}); {REMEDY}", str(path)
+        ) from error
     if "road" not in about.classes or head.weight.shape != (
         len(about.classes),
         about.layers * about.hidden_size,
     ):
         raise TaskError(
             f"{path}: a weight of shape {head.weight.shape} does not fit classes {about.classes} and "
-            f"{about.layers} layers of {about.hidden_size}; {HOW}",
+            f"{about.layers} layers of {about.hidden_size}; {REMEDY}",
             str(path),
         )
     return head
 
 
 def check(head: Head, backbone: Backbone) -> None:
-    """Make sure that a head was trained on this backbone.
+    """Check that a head was trained on this backbone.
 
     Raises
     ------
     TaskError
-        If kind, size, layers or weights differ.
+        If model type, size, layers or weights differ.
     """
     about = head.about
-    asked = {"model_type": about.model_type, "registers": about.registers, "hidden_size": about.hidden_size}
-    found = {name: getattr(backbone, name) for name in asked}
-    if asked != found:
-        what = ", ".join(
-            f"{name} {asked[name]} not {found[name]}" for name in asked if asked[name] != found[name]
+    expected = {
+        "model_type": about.model_type,
+        "registers": about.registers,
+        "hidden_size": about.hidden_size,
+    }
+    actual = {name: getattr(backbone, name) for name in expected}
+    if expected != actual:
+        difference = ", ".join(
+            f"{name} {expected[name]} not {actual[name]}"
+            for name in expected
+            if expected[name] != actual[name]
         )
     elif about.layers > backbone.layers:
-        what = f"it takes {about.layers} layers of {backbone.layers}"
+        difference = f"it uses {about.layers} layers, the backbone has {backbone.layers}"
     elif about.weights != backbone.weights:
-        what = f"weights {about.weights}, not {backbone.weights}"
+        difference = f"weights {about.weights}, not {backbone.weights}"
     else:
         return
     raise TaskError(
-        f"the head was trained on {about.backbone}, which {backbone.name} is not ({what}); "
-        "set segment.backbone to that model's folder, or train a head on this one"
+        f"the head was trained on {about.backbone}, not on {backbone.name} ({difference}); "
+        "set segment.backbone to the folder of that model, or train a head on this one"
     )
 
 
-def predictor(head: Head, backbone: Backbone, of: str = "road") -> Predict:
-    """Return what gives the probability of a class for every pixel of windows.
+def predictor(head: Head, backbone: Backbone, class_name: str = "road") -> Predict:
+    """Return a function: windows -> probability of a class for each of their pixels.
 
-    The logits of the patches are interpolated (bilinear) to the pixels, as DINOv2's segmentation heads do.
+    The logits of the patches are interpolated to the pixels (bilinear), as in DINOv2's segmentation heads.
     """
     import torch
 
-    row = head.about.classes.index(of)
+    row = head.about.classes.index(class_name)
     weight = torch.from_numpy(head.weight[row]).to(backbone.device)
     bias = float(head.bias[row])
 

@@ -1,7 +1,8 @@
 """Step B of the paper, road extraction: M^r by DINOv2 on the orthophoto.
 
-A frozen backbone, a linear head on its patch tokens, overlapping windows over the photo; the mask comes to
-the cells of the DSM by nearest neighbour, as in the paper, the probability as its mean over the cell.
+A frozen backbone and a linear head on its patch tokens are applied to overlapping windows of the photo. A
+cell of the DSM takes its mask from the nearest pixel, as in the paper; its probability is the mean over the
+cell.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ from flexroad.tasks.types import Bools, Orthophoto, RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")
-"""The roads where the cleanup fuses with them."""
+"""``roads`` is read only if the cleanup uses it."""
 TIE_M = 1e-6
-"""Of pixels equally near to a cell's centre the one in the south-east is taken, in every tile."""
+"""Shift of the cell centres to the south-east: of pixels equally near, every tile takes the same one."""
 
 
 class Options(options.Options):
-    """Which model, on what windows. What is null is as the head was trained."""
+    """Model, windows and cleanup. A value of null means the value that the head was trained with."""
 
     method: Literal["dinov2"] = "dinov2"
-    model: Path = Field(description="file of the head: `flexroad train CATALOG --method dinov2` makes one")
+    model: Path = Field(description="file of the head, made by `flexroad train CATALOG --method dinov2`")
     backbone: str | None = Field(
-        None, description="hub name or folder of the backbone's weights; null: the head's own"
+        None, description="hub name or folder of the backbone's weights; null: the head's"
     )
     gsd_m: float | None = Field(
         None, ge=0.02, le=5, description="ground sampling distance of the windows (m); null: the head's"
@@ -46,19 +47,19 @@ class Options(options.Options):
         None, ge=28, le=2044, multiple_of=PATCH, description="side of a window (pixels); null: the head's"
     )
     overlap: float = Field(
-        0.25, ge=0, le=0.5, description="part of a window's side that it shares with the next"
+        0.25, ge=0, le=0.5, description="overlap of neighbouring windows, as a fraction of their side"
     )
-    batch: int = Field(4, ge=1, le=1024, description="windows at a time: what memory allows")
-    device: Device = Field("auto", description="cpu, cuda, or auto: a GPU where there is one")
+    batch: int = Field(4, ge=1, le=1024, description="windows per batch; more need more memory")
+    device: Device = Field("auto", description="cpu, cuda, or auto: a GPU if there is one")
     half: bool = Field(False, description="half precision: float16 on a GPU, bfloat16 on the CPU")
     threshold: float | None = Field(
         None, gt=0, lt=1, description="probability from which a pixel is road; null: the head's"
     )
-    cleanup: Cleanup = Field(Cleanup(), description="how the mask is tidied")
+    cleanup: Cleanup = Field(Cleanup(), description="cleanup of the mask")
 
 
 def files(options: Options) -> tuple[Path, ...]:
-    """Return the files that the result depends on beside the tile: the head and a local backbone."""
+    """Return the files that the result depends on besides the tile: the head and a local backbone."""
     folder = Path(options.backbone).expanduser() if options.backbone else None
     local = (
         (folder / "config.json", *sorted(folder.glob("*.safetensors"))) if folder and folder.is_dir() else ()
@@ -67,34 +68,34 @@ def files(options: Options) -> tuple[Path, ...]:
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
-    """Return where the head sees road in the orthophoto.
+    """Return the road mask predicted from the orthophoto.
 
-    Windows reach beyond the tile and its halo as far as its photo does, and lie on a lattice fixed to the
-    ground: neighbouring tiles agree along their common edge.
+    Windows lie on a lattice fixed to the ground and extend beyond the tile and its halo where the photo does,
+    so neighbouring tiles agree along their common edge.
 
     Raises
     ------
     TaskError
-        If the tile has no orthophoto, or no cell is road; if head or backbone are missing, damaged or do
-        not belong together.
+        If the tile has no orthophoto, no cell of its core is road, or head or backbone are missing, damaged
+        or do not fit each other.
     """
     if data.dop is None:
         raise TaskError(
-            "no orthophoto (layer dop) for segment: dinov2 to look at; give --dop to "
-            "`flexroad catalog rasters`, or segment by another method",
+            "no orthophoto (layer dop), which segment: dinov2 needs; give --dop to "
+            "`flexroad catalog rasters`, or use another segmentation method",
             layer="dop",
         )
     head = read_head(options.model)
     backbone = load_backbone(options.backbone or head.about.backbone, options.device, options.half)
     check(head, backbone)
-    photo, probability = _seen(data, head, backbone, options)
+    photo, probability = _predict(data, head, backbone, options)
     row, col = photo.grid.cells(*_centres(data.grid))
     threshold = options.threshold or head.about.threshold
     mask = clean(probability[row, col] >= threshold, data, options.cleanup)
     if not mask[data.grid.window(data.core)].any():
         raise TaskError(
             f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
-            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on tiles like it",
+            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",
             layer="dop",
         )
     return RoadMask(
@@ -107,10 +108,10 @@ def segment(data: TileData, options: Options) -> RoadMask:
     )
 
 
-def _seen(
+def _predict(
     data: TileData, head: Head, backbone: Backbone, options: Options
 ) -> tuple[Orthophoto, NDArray[np.float32]]:
-    """Return the photo around the tile and the probability of road of its pixels, 0 where it has none."""
+    """Return the photo around the tile and the road probability of its pixels, 0 where it has no data."""
     gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
     from flexroad.tasks.io.orthophoto import read_photo
 
@@ -118,17 +119,18 @@ def _seen(
     assert data.dop is not None
     photo = read_photo(data.dop, cover(data.grid, gsd_m, size, overlap), gsd_m)
     image = normalised(photo, head.about.mean, head.about.std)
-    found = blend(predictor(head, backbone), image, photo.known, size, overlap, options.batch)
-    return photo, np.where(photo.known, found, np.float32(0))
+    blended = blend(predictor(head, backbone), image, photo.known, size, overlap, options.batch)
+    return photo, np.where(photo.known, blended, np.float32(0))
 
 
 def _centres(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return easting and northing of the cell centres, shifted by `TIE_M`, ``(H, W)`` each."""
     easting, northing = np.meshgrid(grid.eastings + TIE_M, grid.northings - TIE_M)
     return easting, northing
 
 
 def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray[np.float32]:
-    """Return the mean over each cell, ``(H, W)``; between pixels where they are coarser than cells."""
+    """Return the mean over each cell, ``(H, W)``; bilinear interpolation if pixels are coarser than cells."""
     from rasterio.enums import Resampling
     from rasterio.warp import reproject
 
@@ -147,5 +149,5 @@ def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray
 
 def _notes(known: Bools, shifted: str | None) -> tuple[str, ...]:
     share = np.count_nonzero(~known) / known.size
-    dark = f"dop: {share:.1%} of the cells have no orthophoto and count as no road" if share else None
-    return tuple(note for note in (dark, shifted) if note)
+    missing = f"dop: {share:.1%} of the cells have no orthophoto and count as no road" if share else None
+    return tuple(note for note in (missing, shifted) if note)

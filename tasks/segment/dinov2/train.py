@@ -1,7 +1,7 @@
-"""Train the linear head over a frozen DINOv2: its tokens once, then logistic regression on them.
+"""Train the linear head on a frozen DINOv2: logistic regression on its patch tokens.
 
-The backbone sees every labelled window once; its tokens wait in a scratch file in float16, so that memory
-does not grow with the land.
+The tokens of every labelled window are computed once and kept in a temporary file (float16), so memory does
+not grow with the number of tiles.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from flexroad.tasks.types import Bools
 
 
 class Options(Settings):
-    """The backbone, what of it is used, and how the head learns."""
+    """The backbone, its layers, the windows, and the training of the head."""
 
     backbone: str = Field(EXAMPLE, description="hub name, or folder with the backbone's weights")
-    layers: int = Field(4, ge=1, le=40, description="tokens of the last so many layers are used")
+    layers: int = Field(4, ge=1, le=40, description="number of last layers whose tokens are used")
     gsd_m: float = Field(0.2, ge=0.02, le=5, description="ground sampling distance of the windows (m)")
     window_px: int = Field(448, ge=28, le=2044, multiple_of=PATCH, description="side of a window (pixels)")
-    device: Device = Field("auto", description="cpu, cuda, or auto: a GPU where there is one")
-    half: bool = Field(False, description="half precision of the backbone")
+    device: Device = Field("auto", description="cpu, cuda, or auto: a GPU if there is one")
+    half: bool = Field(False, description="run the backbone in half precision")
 
 
 def train(
@@ -51,28 +51,29 @@ def train(
     options: Options,
     progress: Progress | None = None,
 ) -> Trained:
-    """Learn to tell road from the rest; keep what did best on the validation tiles.
+    """Train a head; keep the epoch with the lowest loss on the validation tiles.
 
     Raises
     ------
     TaskError
-        If the backbone is missing, or no tile has an orthophoto and labels of both kinds.
+        If the backbone is missing, or no training or no validation tile has an orthophoto and labels of both
+        road and other ground.
     """
     backbone = load_backbone(options.backbone, options.device, options.half)
     if options.layers > backbone.layers:
         raise TaskError(f"{backbone.name} has {backbone.layers} layers, not {options.layers}; lower layers")
     with tempfile.TemporaryFile() as first, tempfile.TemporaryFile() as second:
-        learnt = _windows(train, backbone, options, first, "training")
-        judged = _windows(validate, backbone, options, second, "validation")
-        line, history = regress(learnt, judged, options, progress)
-        threshold, iou = best_threshold(judged, line)
+        train_windows = _windows(train, backbone, options, first, "training")
+        validation = _windows(validate, backbone, options, second, "validation")
+        line, history = regress(train_windows, validation, options, progress)
+        threshold, iou = best_threshold(validation, line)
     facts: dict[str, str | int | float] = {
-        "train_tiles": " ".join(learnt.tiles),
-        "validation_tiles": " ".join(judged.tiles),
-        "train_cells": learnt.cells,
-        "train_road_cells": learnt.road,
-        "validation_cells": judged.cells,
-        "validation_road_cells": judged.road,
+        "train_tiles": " ".join(train_windows.tiles),
+        "validation_tiles": " ".join(validation.tiles),
+        "train_cells": train_windows.cells,
+        "train_road_cells": train_windows.road,
+        "validation_cells": validation.cells,
+        "validation_road_cells": validation.road,
         "validation_loss": min(past.validation_loss for past in history),
         "validation_iou": iou,
         "epochs": len(history),
@@ -109,7 +110,7 @@ def _head(
 def _windows(
     samples: Sequence[Sample], backbone: Backbone, options: Options, scratch: IO[bytes], name: str
 ) -> Windows:
-    """Let the backbone see all labelled windows; its tokens go to the scratch file."""
+    """Compute the tokens of all labelled windows and write them to the scratch file."""
     side = options.window_px // PATCH
     shape = (side, side, options.layers * backbone.hidden_size)
     labels: list[Labels] = []
@@ -123,7 +124,7 @@ def _windows(
     road = sum(float(part.road.sum()) for part in labels)
     if not 0 < road < sum(len(part.road) for part in labels):
         raise TaskError(
-            f"no {name} tile has an orthophoto and labels of road and of something else; "
+            f"no {name} tile has an orthophoto and labels of both road and other ground; "
             "give --dop to `flexroad catalog`, or train on more tiles"
         )
     scratch.flush()
@@ -131,9 +132,9 @@ def _windows(
 
 
 def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.float32], list[Labels]]]:
-    """Yield a tile's windows, some at a time, and the labels in each; none without labels."""
+    """Yield a tile's windows in batches, each with its labels; windows without labels are left out."""
     data, size = sample.data, options.window_px
-    if data.dop is None or not sample.known.any():
+    if data.dop is None or not sample.labelled.any():
         return
     photo = read_photo(data.dop, cover(data.grid, options.gsd_m, size), options.gsd_m)
     image = normalised(photo)
@@ -142,10 +143,10 @@ def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.floa
         window = np.s_[row : row + size, col : col + size]
         west, north = photo.grid.west + col * options.gsd_m, photo.grid.north - row * options.gsd_m
         ground = Grid(photo.grid.crs, west, north, options.gsd_m, size, size)
-        found = _labels(sample, ground, photo.known[window])
-        if len(found.road):
+        window_labels = _labels(sample, ground, photo.known[window])
+        if len(window_labels.road):
             images.append(image[(slice(None), *window)])
-            labels.append(found)
+            labels.append(window_labels)
         if len(images) == options.batch:
             yield np.stack(images), labels
             images, labels = [], []
@@ -153,16 +154,16 @@ def _batches(sample: Sample, options: Options) -> Iterator[tuple[NDArray[np.floa
         yield np.stack(images), labels
 
 
-def _labels(sample: Sample, window: Grid, seen: Bools) -> Labels:
-    """Return the labelled cells of a tile whose centres lie in a window where its photo is known."""
+def _labels(sample: Sample, window: Grid, covered: Bools) -> Labels:
+    """Return the tile's labelled cells whose centres lie on pixels of a window that the photo covers."""
     grid = sample.data.grid
     rows = np.flatnonzero((grid.northings < window.north) & (grid.northings >= window.south))
     cols = np.flatnonzero((grid.eastings >= window.west) & (grid.eastings < window.east))
     north, east = (
         axis.ravel() for axis in np.meshgrid(grid.northings[rows], grid.eastings[cols], indexing="ij")
     )
-    counts = sample.known[np.ix_(rows, cols)].ravel() & seen[window.cells(east, north)]
+    used = sample.labelled[np.ix_(rows, cols)].ravel() & covered[window.cells(east, north)]
     x = 2 * (east - window.west) / (window.east - window.west) - 1
     y = 2 * (window.north - north) / (window.north - window.south) - 1
-    road = sample.road[np.ix_(rows, cols)].ravel()[counts]
-    return Labels(np.stack([x, y], axis=1)[counts].astype(np.float32), road.astype(np.float32))
+    road = sample.road[np.ix_(rows, cols)].ravel()[used]
+    return Labels(np.stack([x, y], axis=1)[used].astype(np.float32), road.astype(np.float32))

@@ -1,7 +1,7 @@
-"""The model of `pixels` and its file: a gradient-boosted classifier, and everything one must know to use it.
+"""The model of `pixels` and its file: a gradient-boosted classifier and its metadata.
 
-The file is skops': a zip of arrays and JSON. Unlike a pickle it can be taken from others, for what is not
-on the list of known types is refused before anything of it is built.
+The file format is skops: a zip of arrays and JSON. Unlike a pickle, a file from others is safe to load: types
+that are not on a list of trusted ones are rejected before any object is created.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from flexroad.tasks.segment.pixels.features import Features
 from flexroad.tasks.types import Bools
 
 TRUSTED = ("sklearn.ensemble._hist_gradient_boosting.predictor.TreePredictor",)
-"""What skops does not know of itself: scikit-learn's holder of a tree's array of nodes."""
-HOW = "train one: `flexroad train CATALOG --method pixels --labels mask -o MODEL.skops`"
+"""Type that skops does not trust by default: scikit-learn's container of a tree's nodes."""
+REMEDY = "train one: `flexroad train CATALOG --method pixels --labels mask -o MODEL.skops`"
 
 
 class About(Options):
-    """What a model needs and where it comes from."""
+    """Metadata of a model: the features it needs and its provenance."""
 
     kind: Literal["road by features of cells"] = "road by features of cells"
     version: Literal[1] = 1
     features: tuple[str, ...] = Field(description="names of the features, in the classifier's order")
-    photo: bool = Field(description="whether some of them are of an orthophoto")
-    cell_m: float = Field(gt=0, description="cell size of the tiles it learnt from (m)")
+    photo: bool = Field(description="whether some features come from an orthophoto")
+    cell_m: float = Field(gt=0, description="cell size of the training tiles (m)")
     threshold: float = Field(gt=0, lt=1, description="probability from which a cell is road")
-    scikit_learn: str = Field(description="version that made the classifier")
-    trained: dict[str, str | int | float] = Field(description="provenance: tiles, options, figures")
+    scikit_learn: str = Field(description="version of scikit-learn that trained it")
+    trained: dict[str, str | int | float] = Field(description="provenance: tiles, options, metrics")
 
 
 def require() -> None:
@@ -69,22 +69,22 @@ class Model:
         content: bytes = dumps({"about": about, "classifier": self.classifier}, compression=8)
         return content
 
-    def probability(self, features: Features, where: Bools) -> NDArray[np.float32]:
-        """Return the probability of road, ``(H, W)``; 0 but for the cells asked for.
+    def probability(self, features: Features, cells: Bools) -> NDArray[np.float32]:
+        """Return the probability of road in the given cells, ``(H, W)``; 0 elsewhere.
 
         Raises
         ------
         TaskError
-            If the model needs features that these are not.
+            If a feature that the model needs is missing.
         """
         missing = [name for name in self.about.features if name not in features.names]
         if missing:
-            raise TaskError(f"the model needs {missing[0]!r}, which this version does not compute; {HOW}")
+            raise TaskError(f"the model needs {missing[0]!r}, which this version does not compute; {REMEDY}")
         order = [features.names.index(name) for name in self.about.features]
-        found = np.zeros(where.shape, np.float32)
-        if where.any():
-            found[where] = self.classifier.predict_proba(features.values[order][:, where].T)[:, 1]
-        return found
+        result = np.zeros(cells.shape, np.float32)
+        if cells.any():
+            result[cells] = self.classifier.predict_proba(features.values[order][:, cells].T)[:, 1]
+        return result
 
 
 def read_model(path: Path) -> Model:
@@ -93,12 +93,12 @@ def read_model(path: Path) -> Model:
     Raises
     ------
     TaskError
-        If it is not there, damaged, or something else.
+        If the file does not exist, is damaged or is not a model.
     """
     try:
         stat = path.stat()
     except OSError as error:
-        raise TaskError(f"no model of pixels at {path}; {HOW}", str(path)) from error
+        raise TaskError(f"no model for segment: pixels at {path}; {REMEDY}", str(path)) from error
     return _read(path, stat.st_size, stat.st_mtime_ns)
 
 
@@ -116,12 +116,13 @@ def _read(path: Path, size: int, mtime_ns: int) -> Model:
         classifier = content["classifier"]
         if not isinstance(classifier, HistGradientBoostingClassifier):
             raise TypeError(f"its classifier is a {type(classifier).__name__}")
-        # A classifier of another version can be built, and fail when it is asked.
+        # A classifier of another scikit-learn version may load, but fail to predict.
         classifier.predict_proba(np.zeros((1, len(about.features)), np.float32))
-    # Strange bytes fail in as many ways as there are lines in zip, JSON, numpy and scikit-learn.
-    except Exception as error:
-        why = str(error).partition("\n")[0] or type(error).__name__
+    except Exception as error:  # zip, JSON, numpy and scikit-learn raise many types for damaged files
+        reason = str(error).partition("\n")[0] or type(error).__name__
         if about and about.scikit_learn != __version__:
-            why = f"made with scikit-learn {about.scikit_learn}, here is {__version__}: {why}"
-        raise TaskError(f"{path} is no model of pixels, or damaged ({why}); {HOW}", str(path)) from error
+            reason = f"made with scikit-learn {about.scikit_learn}, installed is {__version__}: {reason}"
+        raise TaskError(
+            f"{path} is not a model for segment: pixels, or is damaged ({reason}); {REMEDY}", str(path)
+        ) from error
     return Model(classifier, about)

@@ -1,4 +1,4 @@
-"""Step B of the paper, road extraction: M^r by a light model of cells and what lies around them."""
+"""Step B of the paper, road extraction: M^r by gradient-boosted trees on cells and their neighbourhood."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
-from flexroad.tasks.segment.pixels.features import features, look
+from flexroad.tasks.segment.pixels.features import features, read_tile_photo
 from flexroad.tasks.segment.pixels.model import About, read_model
 from flexroad.tasks.types import Orthophoto, RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")
-"""The roads where the cleanup fuses with them."""
-SHOWN = 0.99
-"""Share of the tile below which it is said how much the photo shows."""
+"""``roads`` is read only if the cleanup uses it."""
+FULL_COVERAGE = 0.99
+"""Fraction of the tile covered by the photo, below which a note gives the fraction."""
 
 
 class Options(options.Options):
-    """Which model, and how its mask is made."""
+    """Model, threshold and cleanup."""
 
     method: Literal["pixels"] = "pixels"
-    model: Path = Field(description="the model's file: `flexroad train CATALOG --method pixels` makes one")
+    model: Path = Field(description="file of the model, made by `flexroad train CATALOG --method pixels`")
     threshold: float | None = Field(
         None, gt=0, lt=1, description="probability from which a cell is road; null: the model's"
     )
-    cleanup: Cleanup = Field(Cleanup(), description="how the mask is tidied")
+    cleanup: Cleanup = Field(Cleanup(), description="cleanup of the mask")
 
 
 def files(options: Options) -> tuple[Path, ...]:
-    """Return the files that the result depends on beside the tile."""
+    """Return the files that the result depends on besides the tile: the model."""
     return (options.model,)
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
-    """Return where the model sees road.
+    """Return the road mask predicted by the model.
 
     Raises
     ------
     TaskError
-        If the model is missing or damaged, it needs an orthophoto that the tile lacks, or no cell is road.
+        If the model is missing or damaged, it needs an orthophoto and the tile has none, or no cell of the
+        core is road.
     """
     model = read_model(options.model)
     photo = _photo(data, model.about, options.model)
@@ -57,7 +58,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     if not mask[core].any():
         raise TaskError(
             f"no road on this tile: probabilities reach {probability[core].max():.2f}, the threshold is "
-            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on tiles like it",
+            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",
             layer="dop" if photo else "dsm",
         )
     notes = _notes(data, photo, model.about)
@@ -65,10 +66,10 @@ def segment(data: TileData, options: Options) -> RoadMask:
 
 
 def _photo(data: TileData, about: About, path: Path) -> Orthophoto | None:
-    """Return the tile's photo if the model looks at one."""
+    """Return the tile's photo, or None if the model does not use one."""
     if not about.photo:
         return None
-    photo = look(data)
+    photo = read_tile_photo(data)
     if photo is None:
         raise TaskError(
             f"the tile has no orthophoto (layer dop), and {path.name} was trained with colours: give --dop "
@@ -81,9 +82,13 @@ def _photo(data: TileData, about: About, path: Path) -> Orthophoto | None:
 def _notes(data: TileData, photo: Orthophoto | None, about: About) -> tuple[str, ...]:
     notes: list[str | None] = []
     if abs(data.grid.cell / about.cell_m - 1) > 0.01:
-        notes.append(f"segment: the model learnt from cells of {about.cell_m:g} m, not {data.grid.cell:g} m")
+        notes.append(
+            f"segment: the model was trained on cells of {about.cell_m:g} m, not {data.grid.cell:g} m"
+        )
     if photo is not None:
-        shown = photo.known.mean()
-        notes.append(f"dop: shows {shown:.0%} of the tile and its halo" if shown < SHOWN else None)
+        covered = photo.known.mean()
+        notes.append(
+            f"dop: covers {covered:.0%} of the tile and its halo" if covered < FULL_COVERAGE else None
+        )
         notes.append(coregistration.note(data, photo))
     return tuple(filter(None, notes))

@@ -1,9 +1,9 @@
 """Train the model of `pixels`: gradient-boosted trees on some cells of each tile.
 
-Road is rare, so half of the cells drawn from a tile are road as far as it has any; weights give the shares
-back, so that what the model tells is a probability. When to stop and where the threshold lies is found on
-strips of training tiles set apart in turn: from a few validation tiles it would be theirs alone, and what is
-told of these is told of ground that had no part in the model.
+Road is rare, so half of the cells drawn from a tile are road if it has enough; weights restore the true
+fractions, so that the model predicts probabilities. The number of rounds and the threshold come from
+cross-validation over strips of training tiles. The validation tiles do not influence the model, so metrics on
+them are independent.
 """
 
 from __future__ import annotations
@@ -19,51 +19,56 @@ from pydantic import Field
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.segment.pixels.features import features, look
+from flexroad.tasks.segment.pixels.features import features, read_tile_photo
 from flexroad.tasks.segment.pixels.model import About, Model, require
 from flexroad.tasks.segment.training_types import Progress, Round, Sample, Trained
 from flexroad.tasks.types import Bools, Floats
 
 BINS = 63
-"""Values of a feature are told apart by so many quantiles; more take longer to find than to learn from."""
+"""Number of quantile bins per feature; binning with more takes longer than the training."""
 
 
 class Options(options.Options):
-    """What is looked at, and how the trees learn."""
+    """Features, sampling of the cells, and training of the trees."""
 
     photo: bool | None = Field(
-        None, description="learn colours, too; null: if the first tile has an orthophoto"
+        None, description="use colours, too; null: if the first tile has an orthophoto"
     )
-    cells: int = Field(12000, ge=100, description="cells drawn from a tile at most, half of them road")
-    rounds: int = Field(200, ge=1, le=5000, description="trees at most")
+    cells: int = Field(
+        12000, ge=100, description="greatest number of cells drawn per tile, half of them road"
+    )
+    rounds: int = Field(200, ge=1, le=5000, description="greatest number of trees")
     patience: int = Field(
-        50, ge=1, description="rounds without gain in IoU on what is set apart before the end"
+        50, ge=1, description="stop after this many rounds without a better IoU on the held-out strips"
     )
-    folds: int = Field(5, ge=2, le=20, description="strips of training tiles that are set apart in turn")
-    learning_rate: float = Field(0.1, gt=0, le=1, description="share of each tree that counts")
-    leaves: int = Field(15, ge=2, le=255, description="leaves of a tree")
-    leaf_cells: int = Field(100, ge=1, description="cells in a leaf at least")
-    smooth: float = Field(5.0, ge=0, description="L2 penalty on the values of leaves")
-    share: float = Field(0.3, gt=0, le=1, description="share of the features that each split may look at")
-    seed: int = Field(0, ge=0, description="of the draws")
+    folds: int = Field(5, ge=2, le=20, description="strips of training tiles, each held out once")
+    learning_rate: float = Field(
+        0.1, gt=0, le=1, description="learning rate: factor on the values of each tree"
+    )
+    leaves: int = Field(15, ge=2, le=255, description="greatest number of leaves per tree")
+    leaf_cells: int = Field(100, ge=1, description="least number of cells in a leaf")
+    smooth: float = Field(5.0, ge=0, description="L2 penalty on leaf values")
+    share: float = Field(0.3, gt=0, le=1, description="fraction of the features that each split chooses from")
+    seed: int = Field(0, ge=0, description="seed of the random draws")
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cells with labels."""
+    """Labelled cells with their features."""
 
     names: tuple[str, ...]
     features: NDArray[np.float32]
     """``(n, features)``."""
     road: Bools
     weight: Floats
-    """How many cells of its tile each stands for, ``(n,)``."""
+    """Number of cells of its tile that each cell represents, ``(n,)``."""
     tile: NDArray[np.intp]
     """Index of each cell's tile, ``(n,)``."""
     tiles: tuple[tuple[str, Grid], ...]
+    """Id and core of each tile."""
 
     def __getitem__(self, which: Bools) -> _Cells:
-        """Return some of the cells."""
+        """Return a subset of the cells."""
         return replace(
             self,
             features=self.features[which],
@@ -74,12 +79,12 @@ class _Cells:
 
     @property
     def has_colours(self) -> bool:
-        """Whether some features are of a photo."""
+        """Whether some features come from a photo."""
         return "light" in self.names
 
     @property
     def has_both(self) -> bool:
-        """Whether there is road and something else."""
+        """Whether the cells include both road and other ground."""
         return bool(self.road.any() and not self.road.all())
 
 
@@ -89,22 +94,23 @@ def train(
     options: Options,
     progress: Progress | None = None,
 ) -> Trained:
-    """Learn to tell road from the rest.
+    """Train a classifier of road cells.
 
-    The validation tiles are only told of in the history and in the model's provenance, unless there is but
-    one tile to train on: then they are what is set apart.
+    The validation tiles only give the losses of the history and of the model's provenance. Exception: with a
+    single training tile they also give the number of rounds and the threshold.
 
     Raises
     ------
     TaskError
-        If scikit-learn or skops is missing, there is no tile to train or to validate on, one lacks the
-        orthophoto that others have, or the labels know only one kind of cell.
+        If scikit-learn or skops is missing, there are no training or no validation tiles, a tile lacks the
+        orthophoto that others have, or the labels do not include both road and other ground.
     """
     require()
-    learnt = _draw(train, options, "training")
-    judged = _draw(validate, options.model_copy(update={"photo": learnt.has_colours}), "validation")
-    rounds, threshold, expected = _set_apart(learnt, judged, options)
-    classifier = _fit(learnt, judged, rounds, options)
+    train_cells = _draw(train, options, "training")
+    same_features = options.model_copy(update={"photo": train_cells.has_colours})
+    validation_cells = _draw(validate, same_features, "validation")
+    rounds, threshold, expected = _cross_validate(train_cells, validation_cells, options)
+    classifier = _fit(train_cells, validation_cells, rounds, options)
     history = tuple(
         Round(-float(a), -float(b))
         for a, b in zip(classifier.train_score_[1:], classifier.validation_score_[1:], strict=True)
@@ -112,73 +118,74 @@ def train(
     if progress is not None:
         progress(rounds, rounds, history[-1])
     facts: dict[str, str | int | float] = {
-        "train_tiles": " ".join(name for name, _ in learnt.tiles),
-        "validation_tiles": " ".join(name for name, _ in judged.tiles),
-        "train_cells": len(learnt.road),
-        "train_road_cells": int(learnt.road.sum()),
+        "train_tiles": " ".join(name for name, _ in train_cells.tiles),
+        "validation_tiles": " ".join(name for name, _ in validation_cells.tiles),
+        "train_cells": len(train_cells.road),
+        "train_road_cells": int(train_cells.road.sum()),
         "expected_iou": expected,
         "validation_loss": history[-1].validation_loss,
         "rounds": rounds,
         "options": options.model_dump_json(),
     }
-    return Trained(_model(classifier, learnt, threshold, facts).encode(), ".skops", history)
+    return Trained(_model(classifier, train_cells, threshold, facts).encode(), ".skops", history)
 
 
-def _set_apart(learnt: _Cells, judged: _Cells, options: Options) -> tuple[int, float, float]:
-    """Return rounds and threshold that serve ground that was not learnt from, and the IoU to expect.
+def _cross_validate(train: _Cells, validation: _Cells, options: Options) -> tuple[int, float, float]:
+    """Return the number of rounds and the threshold with the best IoU on held-out strips, and that IoU.
 
-    Rounds are told by IoU: on other ground a few cells that are surely wrong spoil the mean loss long before
-    the mask gets worse.
+    IoU, not the loss, decides: on held-out ground a few cells that are confidently wrong raise the mean loss
+    long before the mask gets worse.
     """
-    strips = _strips([grid for _, grid in learnt.tiles], options.folds)[learnt.tile]
-    pairs = [(learnt[strips != k], learnt[strips == k]) for k in range(strips.max() + 1)]
-    pairs = [(rest, apart) for rest, apart in pairs if rest.has_both] or [(learnt, judged)]
-    road = np.concatenate([apart.road for _, apart in pairs])
-    weight = np.concatenate([apart.weight for _, apart in pairs])
-    told = [
-        _fit(rest, apart, options.rounds, options).staged_predict_proba(apart.features)
-        for rest, apart in pairs
+    strips = _strips([grid for _, grid in train.tiles], options.folds)[train.tile]
+    folds = [(train[strips != k], train[strips == k]) for k in range(strips.max() + 1)]
+    folds = [(rest, held_out) for rest, held_out in folds if rest.has_both] or [(train, validation)]
+    road = np.concatenate([held_out.road for _, held_out in folds])
+    weight = np.concatenate([held_out.weight for _, held_out in folds])
+    predictions = [
+        _fit(rest, held_out, options.rounds, options).staged_predict_proba(held_out.features)
+        for rest, held_out in folds
     ]
     best = (0, 0.5, -1.0)
-    for done, parts in enumerate(zip(*told, strict=True), start=1):
+    for rounds, parts in enumerate(zip(*predictions, strict=True), start=1):
         threshold, iou = even_threshold(np.concatenate([part[:, 1] for part in parts]), road, weight)
         if iou > best[2]:
-            best = done, threshold, iou
-        elif done - best[0] >= options.patience:
+            best = rounds, threshold, iou
+        elif rounds - best[0] >= options.patience:
             break
     return best
 
 
 def _strips(grids: Sequence[Grid], most: int) -> NDArray[np.intp]:
-    """Cut tiles into strips across their longer extent; return each tile's strip, ``(n,)``.
+    """Divide tiles into strips across their longer extent; return the strip number of each tile, ``(n,)``.
 
-    One strip if all lie at one place.
+    There is one strip if all tiles lie at the same place.
     """
-    places = np.array([(grid.west, grid.north) for grid in grids])
-    along = places[:, np.argmax(np.ptp(places, axis=0))]
-    # Neighbours across the strip share its number.
+    corners = np.array([(grid.west, grid.north) for grid in grids])
+    along = corners[:, np.argmax(np.ptp(corners, axis=0))]
+    # Tiles side by side across a strip have the same number.
     level = np.unique(along, return_inverse=True)[1]
     strips: NDArray[np.intp] = level * min(most, level.max() + 1) // (level.max() + 1)
     return strips
 
 
 def even_threshold(probability: Floats, road: Bools, weight: Floats) -> tuple[float, float]:
-    """Return the probability from which as many cells count as road as are road, and the IoU there.
+    """Return the threshold at which the predicted road area equals the true one, and the IoU there.
 
-    IoU is flat around its best threshold, and where on the plateau the best lies is chance; from this one
-    on, misses and false alarms balance, and area is right.
+    IoU is flat around its maximum, so the position of the maximum is random. At this threshold misses and
+    false alarms balance.
     """
     order = np.argsort(-probability, kind="stable")
-    ranked, called, hit = probability[order], np.cumsum(weight[order]), np.cumsum((weight * road)[order])
-    last = int(np.searchsorted(called, hit[-1]))
-    # Cells of one probability are called together.
+    ranked = probability[order]
+    predicted, hit = np.cumsum(weight[order]), np.cumsum((weight * road)[order])
+    last = int(np.searchsorted(predicted, hit[-1]))
+    # Cells of equal probability are on the same side of the threshold.
     last = int(np.searchsorted(-ranked, -ranked[last], side="right")) - 1
     below = ranked[last + 1] if last + 1 < len(ranked) else 0.0
     threshold = float(np.clip((ranked[last] + below) / 2, 0.01, 0.99))
-    return threshold, float(hit[last] / (called[last] + hit[-1] - hit[last]))
+    return threshold, float(hit[last] / (predicted[last] + hit[-1] - hit[last]))
 
 
-def _fit(learnt: _Cells, judged: _Cells, rounds: int, options: Options) -> Any:
+def _fit(train: _Cells, validation: _Cells, rounds: int, options: Options) -> Any:
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     classifier = HistGradientBoostingClassifier(
@@ -189,29 +196,29 @@ def _fit(learnt: _Cells, judged: _Cells, rounds: int, options: Options) -> Any:
         l2_regularization=options.smooth,
         max_features=options.share,
         max_bins=BINS,
-        # It never stops early: so that it tells the losses of all rounds.
+        # Records validation losses; with this patience it never stops early.
         early_stopping=True,
         n_iter_no_change=rounds,
         random_state=options.seed,
     )
     return classifier.fit(
-        learnt.features,
-        learnt.road,
-        # Around 1, or the penalty on leaves would mean something else on other tiles.
-        sample_weight=learnt.weight / learnt.weight.mean(),
-        X_val=judged.features,
-        y_val=judged.road,
-        sample_weight_val=judged.weight / judged.weight.mean(),
+        train.features,
+        train.road,
+        # Weights have mean 1, so that the penalty on leaf values does not depend on the tiles.
+        sample_weight=train.weight / train.weight.mean(),
+        X_val=validation.features,
+        y_val=validation.road,
+        sample_weight_val=validation.weight / validation.weight.mean(),
     )
 
 
-def _model(classifier: Any, learnt: _Cells, threshold: float, facts: dict[str, str | int | float]) -> Model:
+def _model(classifier: Any, train: _Cells, threshold: float, facts: dict[str, str | int | float]) -> Model:
     from sklearn import __version__
 
     about = About(
-        features=learnt.names,
-        photo=learnt.has_colours,
-        cell_m=learnt.tiles[0][1].cell,
+        features=train.names,
+        photo=train.has_colours,
+        cell_m=train.tiles[0][1].cell,
         threshold=threshold,
         scikit_learn=__version__,
         trained=facts,
@@ -220,29 +227,29 @@ def _model(classifier: Any, learnt: _Cells, threshold: float, facts: dict[str, s
 
 
 def _draw(samples: Sequence[Sample], options: Options, name: str) -> _Cells:
-    """Draw cells of every tile, one tile at a time."""
-    wanted = options.photo
+    """Draw labelled cells from every tile; reads one tile at a time."""
+    use_photo = options.photo
     names: tuple[str, ...] = ()
-    values, roads, weights, of, tiles = [], [], [], [], []
+    values, roads, weights, tile_index, tiles = [], [], [], [], []
     for k in range(len(samples)):
         sample = samples[k]
         data = sample.data
-        photo = None if wanted is False else look(data)
-        wanted = photo is not None if wanted is None else wanted
-        if wanted and photo is None:
+        photo = None if use_photo is False else read_tile_photo(data)
+        use_photo = photo is not None if use_photo is None else use_photo
+        if use_photo and photo is None:
             raise TaskError(
                 f"tile {data.tile_id} has no orthophoto (layer dop): give --dop to `flexroad catalog "
-                "rasters`, leave the tile out, or learn from heights alone (--set photo=false)",
+                "rasters`, leave the tile out, or train on heights alone (--set photo=false)",
                 layer="dop",
             )
-        found = features(data, photo)
-        names = found.names
+        tile_features = features(data, photo)
+        names = tile_features.names
         rng = np.random.default_rng([options.seed, k])
-        index, weight = _some(sample, options.cells, rng)
-        values.append(found.values.reshape(len(names), -1)[:, index].T)
+        index, weight = _draw_tile(sample, options.cells, rng)
+        values.append(tile_features.values.reshape(len(names), -1)[:, index].T)
         roads.append(sample.road.ravel()[index])
         weights.append(weight)
-        of.append(np.full(len(index), k))
+        tile_index.append(np.full(len(index), k))
         tiles.append((data.tile_id, data.core))
     if not tiles:
         raise TaskError(f"no {name} tiles; use more tiles")
@@ -251,20 +258,20 @@ def _draw(samples: Sequence[Sample], options: Options, name: str) -> _Cells:
         np.concatenate(values),
         np.concatenate(roads),
         np.concatenate(weights),
-        np.concatenate(of),
+        np.concatenate(tile_index),
         tuple(tiles),
     )
     if not cells.has_both:
-        raise TaskError(f"the {name} tiles have no labels of road and of something else; use more tiles")
+        raise TaskError(f"the {name} tiles have no labels of both road and other ground; use more tiles")
     return cells
 
 
-def _some(sample: Sample, most: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], Floats]:
-    """Draw cells whose label counts, at most half of ``most`` of each kind, and what each stands for."""
+def _draw_tile(sample: Sample, most: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], Floats]:
+    """Draw labelled cells, at most half of ``most`` of each class; return their indices and weights."""
     index, weight = [], []
-    for kind in (True, False):
-        there = np.flatnonzero(sample.known & (sample.road == kind))
-        n = min(len(there), most // 2)
-        index.append(np.sort(rng.choice(there, n, replace=False)))
-        weight.append(np.full(n, len(there) / max(n, 1)))
+    for label in (True, False):
+        cells = np.flatnonzero(sample.labelled & (sample.road == label))
+        n = min(len(cells), most // 2)
+        index.append(np.sort(rng.choice(cells, n, replace=False)))
+        weight.append(np.full(n, len(cells) / max(n, 1)))
     return np.concatenate(index), np.concatenate(weight)

@@ -21,7 +21,7 @@ def data(void=None, mask=None, halo=0, dtm_void=None) -> TileData:
     return TileData("a", grid, CORE, dsm, dtm, road_mask=mask)
 
 
-def test_the_mask_is_taken_as_it_is():
+def test_segment_returns_mask_unchanged():
     mask = np.eye(6, 8, dtype=bool)
     road = segment(data(mask=mask), Options())
     np.testing.assert_array_equal(road.mask, mask)
@@ -29,12 +29,12 @@ def test_the_mask_is_taken_as_it_is():
     assert not road.outside.any()
 
 
-def test_no_mask_says_how_to_get_one():
+def test_segment_no_mask_names_remedy():
     with pytest.raises(TaskError, match="give --road-mask"):
         segment(data(), Options())
 
 
-def test_road_in_the_halo_alone_is_none():
+def test_segment_road_only_in_halo_raises():
     mask = np.zeros((10, 12), bool)
     mask[0] = True
     with pytest.raises(TaskError, match="no road cell on this tile: .* --road-value"):
@@ -43,7 +43,7 @@ def test_road_in_the_halo_alone_is_none():
     assert segment(data(mask=mask, halo=2), Options()).mask.sum() == 13
 
 
-def test_only_voids_that_reach_the_edge_are_outside():
+def test_beyond_extent_is_void_connected_to_edge():
     void = np.array(
         [
             [1, 0, 0, 0, 0, 0, 1, 1],
@@ -55,29 +55,31 @@ def test_only_voids_that_reach_the_edge_are_outside():
         ],
         bool,
     )
-    want = void.copy()
-    want[1, 1] = False  # touches the corner's void by a corner only
-    want[2:4, 3:5] = False
-    np.testing.assert_array_equal(beyond_extent(data(void)), want)
+    expected = void.copy()
+    expected[1, 1] = False  # connected to the void in the corner only diagonally
+    expected[2:4, 3:5] = False
+    np.testing.assert_array_equal(beyond_extent(data(void)), expected)
 
 
-def test_a_cell_that_has_one_of_both_heights_is_inside():
-    void, other = np.zeros((6, 8), bool), np.zeros((6, 8), bool)
+def test_beyond_extent_cell_with_one_height_is_inside():
+    void, dtm_void = np.zeros((6, 8), bool), np.zeros((6, 8), bool)
     void[:3] = True
-    other[3:] = True
-    assert not beyond_extent(data(void, dtm_void=other)).any()
-    other[2] = True
-    np.testing.assert_array_equal(np.flatnonzero(beyond_extent(data(void, dtm_void=other)).all(axis=1)), [2])
+    dtm_void[3:] = True
+    assert not beyond_extent(data(void, dtm_void=dtm_void)).any()
+    dtm_void[2] = True
+    np.testing.assert_array_equal(
+        np.flatnonzero(beyond_extent(data(void, dtm_void=dtm_void)).all(axis=1)), [2]
+    )
 
 
 @given(arrays(bool, (6, 8)))
-def test_outside_is_what_water_from_the_edge_would_reach(void):
-    """Against a flood that spreads cell by cell."""
-    wet = np.zeros_like(void)
+def test_beyond_extent_equals_flood_fill_from_edge(void):
+    """Compared with a flood fill that spreads cell by cell."""
+    filled = np.zeros_like(void)
     rim = np.ones_like(void)
     rim[1:-1, 1:-1] = False
-    wet |= void & rim
+    filled |= void & rim
     for _ in range(void.size):
-        spread = np.pad(wet, 1)
-        wet |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
-    np.testing.assert_array_equal(beyond_extent(data(void)), wet)
+        spread = np.pad(filled, 1)
+        filled |= void & (spread[:-2, 1:-1] | spread[2:, 1:-1] | spread[1:-1, :-2] | spread[1:-1, 2:])
+    np.testing.assert_array_equal(beyond_extent(data(void)), filled)

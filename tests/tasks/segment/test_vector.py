@@ -12,7 +12,7 @@ GOLDEN = (1, 2045, 106474, 109174, 672)
 """Version, cells of the mask, sums of their rows and columns, cells on bridges."""
 
 
-def test_mask_bridges_and_survey(tmp_path):
+def test_segment_lines_give_mask_and_bridges(tmp_path):
     lines = [LineString(on_grid((0, 50), (60, 50))), LineString(on_grid((60, 50), (100, 50)))]
     road = segment(
         tile(write(tmp_path / "r.gpkg", lines, width=["6 m"] * 2, bridge=["no", "yes"])), Options()
@@ -25,16 +25,18 @@ def test_mask_bridges_and_survey(tmp_path):
     assert not road.outside.any()
 
 
-def test_roads_in_degrees_lie_where_they_belong(tmp_path):
+def test_segment_lines_in_degrees_are_reprojected(tmp_path):
     import geopandas
 
     lines = geopandas.GeoSeries([LINE], crs=GRID.crs).to_crs("EPSG:4326")
-    plain = segment(tile(write(tmp_path / "m.gpkg", [LINE], width=[6.4])), Options())
-    turned = segment(tile(write(tmp_path / "d.geojson", list(lines), "EPSG:4326", width=[6.4])), Options())
-    np.testing.assert_array_equal(plain.mask, turned.mask)
+    projected = segment(tile(write(tmp_path / "m.gpkg", [LINE], width=[6.4])), Options())
+    reprojected = segment(
+        tile(write(tmp_path / "d.geojson", list(lines), "EPSG:4326", width=[6.4])), Options()
+    )
+    np.testing.assert_array_equal(projected.mask, reprojected.mask)
 
 
-def test_a_crs_given_in_the_catalog_stands_in(tmp_path):
+def test_segment_file_without_crs_uses_that_of_catalog(tmp_path):
     with pytest.warns(UserWarning, match="'crs' was not provided"):
         path = write(tmp_path / "r.gpkg", [LINE], None, width=[6])
     with pytest.raises(
@@ -45,20 +47,20 @@ def test_a_crs_given_in_the_catalog_stands_in(tmp_path):
     assert segment(tile(path, crs=GRID.crs), Options()).mask.sum() == 600
 
 
-def test_hygiene_tidies_what_is_asked_for(tmp_path):
+def test_segment_cleanup_drops_small_areas(tmp_path):
     lines = [LINE, LineString(on_grid((20, 80), (24, 80)))]
     path = write(tmp_path / "r.gpkg", lines, width=[6, 4])
     assert segment(tile(path), Options()).mask[:40].any()
     assert not segment(tile(path), Options(cleanup=Cleanup(drop_m2=20))).mask[:40].any()
 
 
-def test_a_road_beside_the_tile_reaches_in_by_its_half_width(tmp_path):
+def test_segment_line_beside_tile_covers_cells_within_half_width(tmp_path):
     line = LineString(on_grid((0, -10), (100, -10)))
     path = write(tmp_path / "r.gpkg", [line], width=[24])
     assert segment(tile(path), Options()).mask.sum() == 200
 
 
-def test_road_in_the_halo_alone_is_none(tmp_path):
+def test_segment_road_only_in_halo_raises(tmp_path):
     core = GRID
     path = write(tmp_path / "r.gpkg", [LineString(on_grid((0, -10), (100, -10)))], width=[6])
     with pytest.raises(TaskError, match="no road of r.gpkg lies on this tile: .*segment.where") as caught:
@@ -66,14 +68,14 @@ def test_road_in_the_halo_alone_is_none(tmp_path):
     assert caught.value.layer == "roads"
 
 
-def test_several_files_add_up(tmp_path):
-    one = write(tmp_path / "a.gpkg", [LINE], width=[6])
-    other = write(tmp_path / "b.geojson", [box(*on_grid((0, 0))[0], *on_grid((10, 10))[0])])
-    assert segment(tile(one, other), Options()).mask.sum() == 700
+def test_segment_several_files_are_merged(tmp_path):
+    lines = write(tmp_path / "a.gpkg", [LINE], width=[6])
+    areas = write(tmp_path / "b.geojson", [box(*on_grid((0, 0))[0], *on_grid((10, 10))[0])])
+    assert segment(tile(lines, areas), Options()).mask.sum() == 700
 
 
 @pytest.mark.parametrize(
-    ("make", "options", "says"),
+    ("make", "options", "message"),
     [
         (lambda path: None, {}, "cannot be opened .*put it back"),
         (lambda path: path.write_text("roads"), {}, "cannot be read as vectors"),
@@ -85,16 +87,16 @@ def test_several_files_add_up(tmp_path):
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore:GPKG. bad application_id")
-def test_what_is_no_road_is_one_line(tmp_path, make, options, says):
+def test_segment_unusable_file_raises_one_line(tmp_path, make, options, message):
     path = tmp_path / "r.gpkg"
     make(path)
-    with pytest.raises(TaskError, match=says) as caught:
+    with pytest.raises(TaskError, match=message) as caught:
         segment(tile(path), Options(**options))
     assert "\n" not in str(caught.value)
     assert caught.value.layer == "roads"
 
 
-def test_a_file_cut_short_costs_its_tile(tmp_path):
+def test_segment_truncated_file_raises(tmp_path):
     whole = write(tmp_path / "whole.geojson", [LINE] * 50)
     path = tmp_path / "r.geojson"
     path.write_bytes(whole.read_bytes()[:-500])
@@ -102,13 +104,13 @@ def test_a_file_cut_short_costs_its_tile(tmp_path):
         segment(tile(path), Options())
 
 
-def test_no_vectors_says_how_to_get_them():
+def test_segment_no_vectors_names_remedy():
     with pytest.raises(TaskError, match="no roads layer in the catalog: give a vector file with --roads"):
         segment(tile(), Options())
 
 
-def test_golden(tmp_path):
-    """Whoever changes the mask on purpose counts VERSION up, and so makes stored masks anew."""
+def test_segment_golden(tmp_path):
+    """After an intended change of the mask, raise VERSION, so that stored masks are recomputed."""
     lines = [
         LineString(on_grid((5, 12), (48, 50.3), (95, 71))),
         LineString(on_grid((48, 50.3), (20, 95))),
@@ -116,13 +118,13 @@ def test_golden(tmp_path):
         LineString(on_grid((2, 70), (98, 40))),
         box(*on_grid((70, 10))[0], *on_grid((91.2, 22.7))[0]),
     ]
-    told = {
+    attributes = {
         "highway": ["secondary", "service", "residential", "cycleway", "pedestrian_zone"],
         "width": ["7,5", None, "24'6\"", None, None],
         "lanes": [None, "2", None, None, None],
         "bridge": [None, None, "yes", None, None],
     }
-    road = segment(tile(write(tmp_path / "r.gpkg", lines, **told)), Options())
+    road = segment(tile(write(tmp_path / "r.gpkg", lines, **attributes)), Options())
     rows, cols = np.nonzero(road.mask)
     sums = int(rows.sum()), int(cols.sum())
     assert (VERSION, len(rows), *sums, int(road.bridge.sum())) == GOLDEN

@@ -11,14 +11,14 @@ SIZES = st.integers(4, 40).flatmap(lambda size: st.tuples(st.just(size), st.inte
 PLACES = st.integers(-24000, 24000).map(lambda quarters: quarters / 4)
 
 
-def picture(pixels: Grid) -> np.ndarray:
-    """A value for every place on the ground, whatever grid it is seen on."""
+def ground_image(pixels: Grid) -> np.ndarray:
+    """An image that is a function of map coordinates, the same on every grid."""
     x, y = np.meshgrid(pixels.eastings, pixels.northings)
     return np.stack([np.sin(x / 3) * np.cos(y / 5), np.sin(x / 1.3 + y / 2.1)]).astype(np.float32)
 
 
 def inside(values: np.ndarray, pixels: Grid, grid: Grid) -> np.ndarray:
-    """The pixels whose centres lie on the grid."""
+    """Values of the pixels whose centres lie on the grid."""
     rows = (pixels.northings < grid.north) & (pixels.northings > grid.south)
     cols = (pixels.eastings > grid.west) & (pixels.eastings < grid.east)
     return values[np.ix_(rows, cols)]
@@ -26,12 +26,12 @@ def inside(values: np.ndarray, pixels: Grid, grid: Grid) -> np.ndarray:
 
 def blended(predict, grid: Grid, size: int, overlap: int, gsd: float = 0.5) -> np.ndarray:
     pixels = cover(grid, gsd, size, overlap)
-    image = picture(pixels)
+    image = ground_image(pixels)
     return inside(blend(predict, image, np.ones(pixels.shape, bool), size, overlap, batch=3), pixels, grid)
 
 
 @given(SIZES, st.floats(0.1, 3), PLACES, PLACES, st.integers(1, 40), st.integers(1, 40))
-def test_windows_cover_the_grid_and_their_weights_sum_to_one(window, gsd, west, north, width, height):
+def test_cover_contains_grid_and_weights_sum_to_one(window, gsd, west, north, width, height):
     size, overlap = window
     grid = Grid("EPSG:25832", west, north, 1.0, width, height)
     pixels = cover(grid, gsd, size, overlap)
@@ -46,27 +46,27 @@ def test_windows_cover_the_grid_and_their_weights_sum_to_one(window, gsd, west, 
 
 
 @given(SIZES, SIZES)
-def test_what_looks_at_each_pixel_alone_does_not_see_the_windows(one, other):
+def test_blend_pixelwise_model_does_not_depend_on_windows(first, second):
     def predict(windows):
         return windows[:, 0] ** 2 + windows[:, 1]
 
-    np.testing.assert_allclose(blended(predict, GRID, *one), blended(predict, GRID, *other), atol=2e-6)
+    np.testing.assert_allclose(blended(predict, GRID, *first), blended(predict, GRID, *second), atol=2e-6)
 
 
-def test_neighbouring_tiles_agree_where_both_look():
-    """Whatever the model: the windows lie where the ground is, not where the tile begins."""
+def test_blend_neighbouring_tiles_agree_on_overlap():
+    """For any model: windows are fixed to the ground, not to the tile."""
 
     def predict(windows):
         mean = windows.mean(axis=(1, 2, 3))[:, None, None]
         return mean + np.linspace(0, 1, windows.shape[-1], dtype=np.float32)[None, :, None] * windows[:, 0]
 
     east = Grid(GRID.crs, GRID.west + 13, GRID.north - 4, 1.0, 30, 16)
-    both = blended(predict, GRID, 24, 8)[8:, 26:]
-    np.testing.assert_allclose(blended(predict, east, 24, 8)[:, :34], both, atol=1e-5)
+    overlap = blended(predict, GRID, 24, 8)[8:, 26:]
+    np.testing.assert_allclose(blended(predict, east, 24, 8)[:, :34], overlap, atol=1e-5)
 
 
-def test_results_of_windows_meet_without_a_step():
-    """Windows that say different things pass into one another over the overlap."""
+def test_blend_different_windows_has_no_step():
+    """Different predictions change smoothly into each other over the overlap."""
 
     def predict(windows):
         values = np.arange(len(windows), dtype=np.float32)[:, None, None]
@@ -74,23 +74,23 @@ def test_results_of_windows_meet_without_a_step():
 
     image = np.zeros((1, 20, 36), np.float32)
     known = np.ones(image.shape[1:], bool)
-    found = blend(predict, image, known, 20, 4, batch=9)[10]
-    np.testing.assert_allclose(found[4:16], 0)
-    np.testing.assert_allclose(found[16:20], taper(20, 4)[:4], atol=1e-6)
-    np.testing.assert_allclose(found[20:32], 1)
+    row = blend(predict, image, known, 20, 4, batch=9)[10]
+    np.testing.assert_allclose(row[4:16], 0)
+    np.testing.assert_allclose(row[16:20], taper(20, 4)[:4], atol=1e-6)
+    np.testing.assert_allclose(row[20:32], 1)
 
 
 @pytest.mark.parametrize("batch", [1, 3, 100])
-def test_windows_without_a_known_pixel_are_not_looked_at(batch):
-    asked = []
+def test_blend_skips_windows_without_data(batch):
+    batches = []
 
     def predict(windows):
-        asked.append(len(windows))
+        batches.append(len(windows))
         return np.ones(windows[:, 0].shape, np.float32)
 
     known = np.zeros((40, 60), bool)
     known[:20, :40] = True
-    found = blend(predict, np.zeros((3, 40, 60), np.float32), known, 20, 0, batch)
-    np.testing.assert_array_equal(found, known)
-    assert sum(asked) == 2
-    assert max(asked) <= batch
+    result = blend(predict, np.zeros((3, 40, 60), np.float32), known, 20, 0, batch)
+    np.testing.assert_array_equal(result, known)
+    assert sum(batches) == 2
+    assert max(batches) <= batch

@@ -1,4 +1,4 @@
-"""`pixels` from made tiles with an orthophoto to a mask, end to end."""
+"""`pixels` from synthetic tiles with an orthophoto to a mask, end to end."""
 
 import importlib.util
 from dataclasses import replace
@@ -26,18 +26,18 @@ QUICK = training.Options(cells=2000, rounds=25, learning_rate=0.2, leaf_cells=30
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
-    """Six tiles of a made town, each with a photo of its own."""
+    """Six tiles of a synthetic suburb, each with its own photo."""
     folder = tmp_path_factory.mktemp("town")
-    return [sample(name, grid, folder / f"{name}.tif") for name, grid in block(6, SIZE_M)]
+    return [make_sample(name, grid, folder / f"{name}.tif") for name, grid in block(6, SIZE_M)]
 
 
-def sample(name, grid, path) -> Sample:
+def make_sample(name, grid, path) -> Sample:
     scene = make_scene(grid, SEED, "suburban")
     colour = orthophoto(grid, SEED, "suburban")
-    form = {"driver": "GTiff", "count": 3, "dtype": "uint8", "crs": grid.crs}
-    form |= {"height": colour.shape[1], "width": colour.shape[2]}
-    form["transform"] = from_origin(grid.west, grid.north, 0.5, 0.5)
-    with rasterio.open(path, "w", **form) as file:
+    profile = {"driver": "GTiff", "count": 3, "dtype": "uint8", "crs": grid.crs}
+    profile |= {"height": colour.shape[1], "width": colour.shape[2]}
+    profile["transform"] = from_origin(grid.west, grid.north, 0.5, 0.5)
+    with rasterio.open(path, "w", **profile) as file:
         file.write(colour)
     data = TileData(name, grid, grid, scene.dsm, scene.dtm, dop=Source("dop", (path,)))
     return Sample(data, scene.reference_road, np.isfinite(scene.dsm))
@@ -74,36 +74,36 @@ def without_photo(sample):
     return replace(sample, data=replace(sample.data, dop=None))
 
 
-def test_roads_of_a_tile_never_seen(samples, model, trained):
-    found = segment(samples[5].data, Options(model=model, cleanup=NOTHING))
+def test_segment_unseen_tile_gives_most_roads(samples, model, trained):
+    result = segment(samples[5].data, Options(model=model, cleanup=NOTHING))
     road = samples[5].road
     threshold = read_model(model).about.threshold
-    np.testing.assert_array_equal(found.mask, found.probability >= threshold)
-    assert found.probability.dtype == np.float32
-    assert found.probability.min() >= 0
-    assert found.probability.max() <= 1
+    np.testing.assert_array_equal(result.mask, result.probability >= threshold)
+    assert result.probability.dtype == np.float32
+    assert result.probability.min() >= 0
+    assert result.probability.max() <= 1
     low = samples[5].data.dsm - samples[5].data.dtm < 0.3
-    assert iou(found.mask, road) > 0.75 > iou(low, road)
+    assert iou(result.mask, road) > 0.75 > iou(low, road)
     assert trained.history[-1].train_loss < trained.history[0].train_loss
     assert trained.history[-1].validation_loss < trained.history[0].validation_loss
 
 
 @pytest.mark.slow
-def test_heights_alone(samples, tmp_path, model):
+def test_segment_heights_only_ignores_photo(samples, tmp_path, model):
     bare = [without_photo(sample) for sample in samples]
     path = written(training.train(bare[:4], bare[4:5], QUICK), tmp_path)
     assert not read_model(path).about.photo
-    found = segment(bare[5].data, Options(model=path, cleanup=NOTHING))
-    # A photo that the model never saw counts for nothing.
+    result = segment(bare[5].data, Options(model=path, cleanup=NOTHING))
+    # A model trained without photos ignores the photo of a tile.
     np.testing.assert_array_equal(
-        found.probability, segment(samples[5].data, Options(model=path, cleanup=NOTHING)).probability
+        result.probability, segment(samples[5].data, Options(model=path, cleanup=NOTHING)).probability
     )
     with_colours = segment(samples[5].data, Options(model=model, cleanup=NOTHING))
-    assert 0.2 < iou(found.mask, samples[5].road) < iou(with_colours.mask, samples[5].road)
+    assert 0.2 < iou(result.mask, samples[5].road) < iou(with_colours.mask, samples[5].road)
 
 
 @pytest.mark.slow
-def test_training_comes_out_the_same_again_whatever_the_validation_tiles(samples, trained):
+def test_train_is_repeatable_and_ignores_validation_tiles(samples, trained):
     again = training.train(samples[:4], samples[4:5], QUICK)
     assert (content(again), again.history) == (content(trained), trained.history)
     other = training.train(samples[:4], samples[5:6], QUICK)
@@ -112,21 +112,21 @@ def test_training_comes_out_the_same_again_whatever_the_validation_tiles(samples
 
 
 def content(trained):
-    """What is in the file; the zip around it carries the time."""
-    found = loads(trained.model, trusted=list(TRUSTED))
-    return found["about"], [tree.nodes.tobytes() for (tree,) in found["classifier"]._predictors]
+    """Metadata and trees of a model; the bytes of its zip also contain the time."""
+    model = loads(trained.model, trusted=list(TRUSTED))
+    return model["about"], [tree.nodes.tobytes() for (tree,) in model["classifier"]._predictors]
 
 
 def trees(content):
     return content[1]
 
 
-def test_one_tile_is_enough_to_train_on(samples, tmp_path):
+def test_train_single_tile_gives_usable_model(samples, tmp_path):
     path = written(training.train(samples[:1], samples[1:2], QUICK), tmp_path)
     assert iou(segment(samples[5].data, Options(model=path)).mask, samples[5].road) > 0.5
 
 
-def test_a_threshold_of_ones_own(samples, model):
+def test_segment_threshold_replaces_that_of_model(samples, model):
     few, many = (
         segment(samples[5].data, Options(model=model, threshold=t, cleanup=NOTHING)).mask for t in (0.9, 0.1)
     )
@@ -135,29 +135,29 @@ def test_a_threshold_of_ones_own(samples, model):
     assert files(Options(model=model)) == (model,)
 
 
-def test_void_beyond_the_survey_is_no_road(samples, model):
+def test_segment_void_beyond_survey_is_no_road(samples, model):
     data = samples[5].data
     dsm, dtm = data.dsm.copy(), data.dtm.copy()
     dsm[:, :40], dtm[:, :40] = np.nan, np.nan
-    found = segment(replace(data, dsm=dsm, dtm=dtm), Options(model=model))
-    assert not found.mask[:, :40].any()
-    assert not found.probability[:, :40].any()
-    assert found.outside[:, :40].all()
+    result = segment(replace(data, dsm=dsm, dtm=dtm), Options(model=model))
+    assert not result.mask[:, :40].any()
+    assert not result.probability[:, :40].any()
+    assert result.outside[:, :40].all()
 
 
-def test_tiles_that_cannot_be_done(samples, model):
+def test_segment_and_train_unusable_tile_raises(samples, model):
     error = fails("no orthophoto .* was trained with colours", without_photo(samples[5]).data, model=model)
     assert error.layer == "dop"
     fails("no road on this tile: probabilities reach", samples[5].data, model=model, threshold=0.9999)
     with pytest.raises(TaskError, match="has no orthophoto"):
         training.train([samples[0], without_photo(samples[1])], samples[2:3], QUICK)
-    with pytest.raises(TaskError, match="no labels of road and of something else"):
-        training.train([replace(samples[0], road=samples[0].known)], samples[2:3], QUICK)
+    with pytest.raises(TaskError, match="no labels of both road and other ground"):
+        training.train([replace(samples[0], road=samples[0].labelled)], samples[2:3], QUICK)
 
 
-def test_files_that_are_no_model(samples, model, tmp_path):
+def test_segment_broken_model_names_file_and_remedy(samples, model, tmp_path):
     data, path = samples[5].data, tmp_path / "model.skops"
-    assert fails("no model of pixels at .*: `flexroad train", data, model=path).file == str(path)
+    assert fails("no model for segment: pixels at .*: `flexroad train", data, model=path).file == str(path)
     whole = model.read_bytes()
     middle = len(whole) // 2
     for content in (
@@ -170,47 +170,47 @@ def test_files_that_are_no_model(samples, model, tmp_path):
         dumps({"about": read_model(model).about.model_dump_json(), "classifier": np.zeros(3)}),
     ):
         path.write_bytes(content)
-        assert fails("is no model of pixels, or damaged .*`flexroad train", data, model=path).file == str(
-            path
-        )
+        assert fails(
+            "is not a model for segment: pixels, or is damaged .*`flexroad train", data, model=path
+        ).file == str(path)
 
 
-def test_a_model_that_would_run_code_is_refused(samples, tmp_path):
+def test_segment_model_with_code_raises(samples, tmp_path):
     path = tmp_path / "model.skops"
     path.write_bytes(dumps({"about": "{}", "classifier": tmp_path.joinpath}))
-    fails("is no model of pixels, or damaged", samples[5].data, model=path)
+    fails("is not a model for segment: pixels, or is damaged", samples[5].data, model=path)
 
 
-def test_cells_of_another_size_are_told(samples, model):
+def test_segment_other_cell_size_adds_note(samples, model):
     data = samples[5].data
     coarse = replace(data.grid, cell=2.0, width=60, height=60)
     half = replace(data, grid=coarse, core=coarse, dsm=data.dsm[::2, ::2], dtm=data.dtm[::2, ::2])
     notes = segment(half, Options(model=model, threshold=0.05)).notes
-    assert "the model learnt from cells of 1 m, not 2 m" in notes[0]
+    assert "the model was trained on cells of 1 m, not 2 m" in notes[0]
 
 
-def test_the_even_threshold_calls_as_much_as_there_is():
+def test_even_threshold_predicts_true_area():
     rng = np.random.default_rng(1)
     for _ in range(20):
         road = rng.random(500) < 0.3
-        told = np.clip(rng.normal(0.3 + 0.2 * road, 0.2), 0.02, 0.98)
+        probability = np.clip(rng.normal(0.3 + 0.2 * road, 0.2), 0.02, 0.98)
         weight = rng.choice([1.0, 3.0], 500)
-        threshold, iou = even_threshold(told, road, weight)
-        called = told >= threshold
-        assert abs(weight[called].sum() - weight[road].sum()) <= 3
-        assert iou == pytest.approx(weight[called & road].sum() / weight[called | road].sum())
+        threshold, iou = even_threshold(probability, road, weight)
+        predicted = probability >= threshold
+        assert abs(weight[predicted].sum() - weight[road].sum()) <= 3
+        assert iou == pytest.approx(weight[predicted & road].sum() / weight[predicted | road].sum())
 
 
-def test_cells_of_one_probability_are_called_together():
-    told = np.array([0.8, 0.6, 0.6, 0.6, 0.2])
+def test_even_threshold_does_not_split_equal_probabilities():
+    probability = np.array([0.8, 0.6, 0.6, 0.6, 0.2])
     road = np.array([True, True, False, False, False])
-    threshold, iou = even_threshold(told, road, np.ones(5))
+    threshold, iou = even_threshold(probability, road, np.ones(5))
     assert threshold == pytest.approx(0.4)
     assert iou == pytest.approx(2 / 4)
 
 
 @pytest.mark.parametrize("module", ["sklearn", "skops"])
-def test_missing_extra_is_named_in_one_line(monkeypatch, module):
+def test_require_missing_package_names_extra(monkeypatch, module):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == module else find(name))
     with pytest.raises(TaskError, match=r"pip install 'flexroad\[train\]'"):
