@@ -1,4 +1,4 @@
-"""Scenes with known truth: streets, houses, trees and cars as functions of a seed and a place."""
+"""Synthetic scenes with known truth: streets, houses, trees and cars, functions of seed and coordinates."""
 
 from flexroad.tasks.synthetic.layout import block
 from flexroad.tasks.synthetic.options import SceneOptions

@@ -1,4 +1,4 @@
-"""Paved and bare areas off the road: car parks and fields, which a segmentation takes for road."""
+"""Paved and bare areas off the road: car parks and fields, which a segmentation mistakes for road."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from flexroad.tasks.synthetic.objects import Car, GroundAt, House
 from flexroad.tasks.types import Floats
 
 BAY_M, AISLE_M = 2.6, 16.0
-"""Width of a bay, and from one double row's middle to the next."""
-FULL = 0.55
-"""Part of the bays with a car."""
-FOUND = 0.6
-"""Part of the car parks and fields that the segmentation takes for road."""
+"""Width of a parking bay, and distance between the middles of double rows (m)."""
+OCCUPIED = 0.55
+"""Fraction of the bays with a car."""
+MISTAKEN = 0.6
+"""Fraction of the car parks and fields that the segmentation mistakes for road."""
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)])
 
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle beside a street."""
+    """A rectangle beside a street, in the plan's frame; lengths in m, heading in rad."""
 
     x: float
     y: float
@@ -31,38 +31,38 @@ class Area:
     half_length: float
     half_width: float
     as_road: bool
-    """Whether the segmentation takes it for road."""
+    """Whether the segmentation mistakes it for road."""
 
     def at(self, part: Floats) -> tuple[Floats, Floats]:
-        """Return the place of points given in parts of the half sides, ``(N, 2)``."""
+        """Return x and y of points given as fractions of the half sides, ``(N, 2)``."""
         u, v = (part * (self.half_length, self.half_width)).T
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return self.x + cos * u - sin * v, self.y + sin * u + cos * v
 
 
 def car_parks(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
-    """Return car parks, so many to a street on average."""
+    """Return car parks, ``mean`` per street on average."""
     return _beside(streets, seed, "car parks", ground_at, mean, ((9, 17), (8, 13), (2, 5)))
 
 
 def fields(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
-    """Return bare fields, so many to a street on average."""
+    """Return bare fields, ``mean`` per street on average."""
     return _beside(streets, seed, "fields", ground_at, mean, ((10, 20), (5, 14), (1.5, 4)))
 
 
 def _beside(
     streets: Sequence[Street],
     seed: int,
-    what: str,
+    purpose: str,
     ground_at: GroundAt,
     mean: float,
     sizes: tuple[tuple[float, float], ...],
 ) -> tuple[Area, ...]:
-    """Return rectangles with half length, half width and distance from the road drawn from ``sizes``."""
+    """Return rectangles; ``sizes``: ranges of half length, half width and distance from the road (m)."""
     planned = [
         area
         for street in streets
-        for area in _planned(street, generator(seed, what, *street.key), mean, sizes)
+        for area in _planned(street, generator(seed, purpose, *street.key), mean, sizes)
     ]
     if not planned:
         return ()
@@ -75,22 +75,22 @@ def _beside(
 def _planned(
     street: Street, rng: np.random.Generator, mean: float, sizes: tuple[tuple[float, float], ...]
 ) -> list[Area]:
-    found = []
+    planned = []
     for _ in range(rng.poisson(mean)):
         length, width, away = (rng.uniform(*size) for size in sizes)
         along = rng.uniform(street.start, street.end)
         lateral = rng.choice((-1, 1)) * (street.half_width_m + away + width)
         x, y = (float(c) for c in street.point(along, lateral))
-        found.append(Area(x, y, float(street.heading(along)), length, width, bool(rng.random() < FOUND)))
-    return found
+        planned.append(Area(x, y, float(street.heading(along)), length, width, bool(rng.random() < MISTAKEN)))
+    return planned
 
 
-def off(houses: Sequence[House], areas: Sequence[Area]) -> tuple[House, ...]:
-    """Return the houses that stand on none of the areas."""
-    return tuple(house for house in houses if not any(_on(house, area) for area in areas))
+def houses_off(houses: Sequence[House], areas: Sequence[Area]) -> tuple[House, ...]:
+    """Return the houses that overlap none of the areas."""
+    return tuple(house for house in houses if not any(_overlap(house, area) for area in areas))
 
 
-def _on(house: House, area: Area) -> bool:
+def _overlap(house: House, area: Area) -> bool:
     dx, dy = house.x - area.x, house.y - area.y
     cos, sin = np.cos(area.heading), np.sin(area.heading)
     u, v = abs(cos * dx + sin * dy), abs(cos * dy - sin * dx)
@@ -101,13 +101,13 @@ def _on(house: House, area: Area) -> bool:
 def parked(area: Area, seed: int) -> tuple[Car, ...]:
     """Return the cars on a car park, in double rows."""
     rng = generator(seed, "bays", int(np.floor(area.x)), int(np.floor(area.y)))
-    found = []
+    cars = []
     for row in np.arange(-area.half_width + 3, area.half_width - 2, AISLE_M / 2):
         for bay in np.arange(-area.half_length + 2, area.half_length - 2, BAY_M):
-            if rng.random() < FULL:
+            if rng.random() < OCCUPIED:
                 part = np.array([[bay / area.half_length, row / area.half_width]])
                 (x,), (y,) = area.at(part)
                 length, height = rng.uniform(3.9, 4.7), rng.uniform(1.4, 1.75)
                 across = area.heading + np.pi / 2
-                found.append(Car(float(x), float(y), across, length / 2, 0.9, height, moving=False))
-    return tuple(found)
+                cars.append(Car(float(x), float(y), across, length / 2, 0.9, height, moving=False))
+    return tuple(cars)

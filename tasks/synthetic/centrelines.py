@@ -1,4 +1,4 @@
-"""The made streets as a map has them: centre lines with a class and a width, in map coordinates."""
+"""Centre lines of the synthetic streets with class and width, in map coordinates."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from flexroad.tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M, SUNKEN_M
 from flexroad.tasks.types import Floats
 
 STEP_M = 5.0
-"""Between the points of a line."""
+"""Distance between the points of a line (m)."""
 MARGIN_M = 50.0
-"""Lines are given as far as this around the ground asked for."""
+"""Lines within this distance around the grid are included (m)."""
 MAIN, SIDE, SUNKEN = "secondary", "residential", "primary"
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """One carriageway."""
+    """The centre line of one carriageway."""
 
     points: Floats
     """``(n, 2)``: easting and northing (m)."""
     width_m: float
     highway: str
-    """Class, in OSM's words."""
+    """Class: a value of OSM's ``highway`` key."""
 
 
 def centre_lines(
     grid: Grid, seed: int, stratum: str | None = None, options: SceneOptions = DEFAULTS
 ) -> list[CentreLine]:
-    """Return the centre lines on and around a grid, of the world `make_scene` makes of the same arguments.
+    """Return the centre lines on and around a grid, in the world of `make_scene` with the same arguments.
 
-    A dual carriageway has two. Not told are medians' noses and roundabouts' islands where streets run in.
+    A dual carriageway has two lines. The ends of medians are not represented, nor are the islands of
+    roundabouts where streets join.
     """
     plan = plan_of(seed, stratum, options)
     west, south, east, north = grid.buffered(MARGIN_M).bounds
     x, y = plan.from_map(np.array([west, west, east, east]), np.array([south, north, south, north]))
     box = (float(x.min()), float(y.min()), float(x.max()), float(y.max()))
-    found = [line for street in plan.streets(box) for line in _carriageways(plan, street)]
-    found += [_sunken(plan, stream, box[1], box[3]) for stream in plan.streams(box) if stream.paved]
-    return found + [_circle(plan, *centre) for centre in plan.circles(box, 0)]
+    lines = [line for street in plan.streets(box) for line in _carriageways(plan, street)]
+    lines += [_sunken(plan, stream, box[1], box[3]) for stream in plan.streams(box) if stream.paved]
+    return lines + [_circle(plan, *centre) for centre in plan.circles(box, 0)]
 
 
 def _carriageways(plan: Plan, street: Street) -> Iterator[CentreLine]:
@@ -60,9 +61,9 @@ def _carriageways(plan: Plan, street: Street) -> Iterator[CentreLine]:
 
 
 def _sunken(plan: Plan, stream: Stream, low: float, high: float) -> CentreLine:
-    one, other = stream.banks
+    left, right = stream.banks
     y = _steps(low, high)
-    return CentreLine(_on_map(plan, (one.across(y) + other.across(y)) / 2, y), 2 * SUNKEN_M, SUNKEN)
+    return CentreLine(_on_map(plan, (left.across(y) + right.across(y)) / 2, y), 2 * SUNKEN_M, SUNKEN)
 
 
 def _circle(plan: Plan, x: float, y: float) -> CentreLine:

@@ -1,8 +1,8 @@
 """The stand-in for the paper's dataset DSC3D: five urban scenes, from level to steep.
 
-The paper tells of five scenes with meshes of 35 to 101 thousand triangles, and differences in height from
-4.5 m to 33.9 m. Its table gives RGT 45 thousand triangles, which is a square of 150 m in cells of a metre.
-What the numbers were held against, and what not, is told in ``docs/decisions.md`` ("the stand-in").
+The paper describes five scenes with meshes of 35 to 101 thousand triangles and height differences of 4.5 m to
+33.9 m. Its table gives RGT 45 thousand triangles: a square of 150 m with cells of 1 m. ``docs/decisions.md``
+("the stand-in") lists which numbers were checked, and against what.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from flexroad.tasks.synthetic.reconstruction import Faults
 from flexroad.tasks.synthetic.scene import make_scene
 
 CRS = "EPSG:32632"
-"""UTM as such, which is what DSC3D's own meshes are placed by."""
+"""UTM zone 32 on WGS 84, as for DSC3D's own meshes."""
 SIZE_M = 150
 APART_M = 3000
-"""Between scenes, as in the benchmark: farther than the hills' longest wave."""
+"""Distance between scenes (m), as in the benchmark: more than the longest wave of the hills."""
 STEEPEST = 0.2
 """Greatest root mean square slope of a scene's hills."""
 HUMPS, BANKS = 0.1, 0.05
-"""Root mean square height of a scene's humps and of its embankments, of its rise."""
+"""Root mean square height of a scene's humps and embankments, as fractions of its rise."""
 COARSE_M = 3.0
-"""Cells in which a place is looked at before a scene is laid there."""
+"""Cell size used to check whether a location suits a scene (m)."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """What one of the scenes is like, wherever it lies."""
+    """Properties of one scene, independent of its location."""
 
     name: str
     stratum: str
     rise_m: float
-    """Height difference of its true ground."""
+    """Height difference of its true ground (m)."""
     triangles: int
-    """Of its mesh."""
+    """Number of triangles of its mesh."""
     options: SceneOptions
-    """Slope, humps, embankments and direction follow from the rise and the place."""
+    """Slope, humps, embankments and direction are set from the rise and the location."""
     faults: Faults
 
 
@@ -72,36 +72,36 @@ SITES = (
     Site("hillside", "suburban", 23.0, 46_000, SUBURB, Faults()),
     Site("steep_quarter", "urban", 33.9, 60_000, TOWN, Faults(blank=0.06)),
 )
-"""Ends of the ranges are the paper's; what lies between, and which scene is what, are guesses."""
+"""The ends of the ranges are the paper's; the values between them and their order are assumptions."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """One of the scenes in a world."""
+    """A scene at its location in a world."""
 
     site: Site
     grid: Grid
-    """Its cells of a metre."""
+    """Its grid with cells of 1 m."""
     options: SceneOptions
 
 
 def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
-    """Return where the first of the scenes lie in a world.
+    """Return the locations of the first ``scenes`` scenes in a world.
 
-    A scene lies at the first place of its row where hills that are not too steep rise as much as it asks
-    for; how steep they must be follows.
+    A scene takes the first location of its row where hills of at most slope `STEEPEST` give its rise. The
+    slope is then set so that they give exactly its rise.
 
     Parameters
     ----------
     scenes : int
-        How many of `SITES`.
+        Number of scenes, the first of `SITES`.
     seed : int
-        The world.
+        Seed of the world.
     """
-    return [_settle(row, site, seed) for row, site in enumerate(SITES[:scenes])]
+    return [_locate(row, site, seed) for row, site in enumerate(SITES[:scenes])]
 
 
-def _settle(row: int, site: Site, seed: int) -> Place:
+def _locate(row: int, site: Site, seed: int) -> Place:
     for number in count():
         west, south = WEST_M + number * APART_M, SOUTH_M - (row + 1) * APART_M
         turn = generator(seed, "dsc3d", row, number).uniform(0, 90)
@@ -112,11 +112,11 @@ def _settle(row: int, site: Site, seed: int) -> Place:
         if excess(0.0) < 0 < excess(STEEPEST):
             slope = brentq(excess, 0.0, STEEPEST, xtol=1e-4)
             return Place(site, _square(west, south, 1.0), _with(turned, slope=slope))
-    raise AssertionError("places go on for ever")
+    raise AssertionError("unreachable: the loop has no end")
 
 
 def _excess(site: Site, options: SceneOptions, grid: Grid, seed: int, slope: float) -> float:
-    """Return by how much the ground of a place rises more than asked for (m), hills being so steep."""
+    """Return the rise of the ground at a location minus the rise of the site (m), for a slope."""
     empty = _with(options, slope=slope, density=0.0)
     return float(np.ptp(make_scene(grid, seed, site.stratum, empty).reference)) - site.rise_m
 

@@ -1,6 +1,6 @@
-"""The benchmark: independent tiles in the strata of the paper's dataset GeRoD, with what spoils real tiles.
+"""The benchmark: independent tiles in the strata of the paper's dataset GeRoD, with the errors of real tiles.
 
-What the numbers were held against, and what not, is told in ``docs/decisions.md`` ("the benchmark").
+``docs/decisions.md`` ("the benchmark") lists which numbers were checked, and against what.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ STRATA = {"urban": 168, "suburban": 23, "rural": 49}
 TILES = sum(STRATA.values())
 SIZE_M = 250
 APART_M = 3000
-"""Between the tiles' corners: farther than the hills' longest wave, so that tiles have nothing in common."""
+"""Distance between tile corners (m): more than the longest wave of the hills, so tiles are independent."""
 COLUMNS = 16
 VARIED = {"block_m": 0.2, "slope": 0.4, "roughness_m": 0.3, "built": 0.3, "trees": 0.4, "growth_m": 0.3}
-"""By how much tiles of one stratum differ: greatest relative deviation from its options."""
+"""Variation of tiles within a stratum: greatest relative deviation from its options."""
 
 PRESET: Mapping[str, SceneOptions] = {
     "urban": SceneOptions(
@@ -103,20 +103,21 @@ PRESET: Mapping[str, SceneOptions] = {
         scars_m=0.25,
     ),
 }
-"""What the tiles of a stratum are like on average."""
+"""Mean options of the tiles of each stratum."""
 
 
 def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, SceneOptions]]:
-    """Return id, grid, stratum and options of the benchmark's tiles, the strata in the paper's shares.
+    """Return id, grid, stratum and options of the benchmark's tiles, in the paper's shares of the strata.
 
-    A smaller survey's tiles are among those of a larger one. Tiles lie on the absolute grid, 3 km apart.
+    The tiles of a smaller survey are a subset of those of a larger one. Tiles lie on the absolute grid, 3 km
+    apart.
 
     Parameters
     ----------
     tiles : int
-        How many; 240 as in the paper.
+        Number of tiles; 240 as in the paper.
     seed : int
-        The world, from which each tile's options are drawn too.
+        Seed of the world and of each tile's options.
     """
     return [
         _place(row, stratum, number, seed)
@@ -126,7 +127,7 @@ def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, Scen
 
 
 def _counts(tiles: int) -> list[int]:
-    """Return how many tiles of each stratum: the whole parts, then the largest remainders."""
+    """Return the number of tiles of each stratum, by the largest remainder method."""
     exact = [tiles * share / TILES for share in STRATA.values()]
     counts = [int(number) for number in exact]
     by_rest = sorted(range(len(exact)), key=lambda i: counts[i] - exact[i])

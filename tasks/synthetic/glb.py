@@ -1,4 +1,4 @@
-"""A textured mesh as binary glTF that any viewer opens and ``flexroad prepare mesh`` puts in its place."""
+"""A textured mesh as binary glTF, for viewers and for ``flexroad prepare mesh``."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 def encode(mesh: TexturedMesh) -> bytes:
     """Return a mesh with one texture as GLB.
 
-    Vertices are relative to the whole-metre corner of the mesh, turned to glTF's axes (x east, y up, z
-    south); CRS and corner are in the scene's ``extras``, as in FlexRoad's other GLB. Equal input gives
-    equal bytes.
+    Vertices are relative to the whole-metre corner of the mesh, in glTF's axes (x east, y up, z south). CRS
+    and corner are in the scene's ``extras``, as in FlexRoad's other GLB files. Equal input gives equal bytes.
 
     Parameters
     ----------
     mesh : TexturedMesh
-        Faces that share a vertex share its place in the texture, too.
+        Faces that share a vertex must also share its texture coordinates.
     """
     import trimesh
     from PIL import Image

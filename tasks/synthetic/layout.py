@@ -1,4 +1,4 @@
-"""Which tiles a synthetic survey consists of."""
+"""The tiles of a synthetic survey."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import islice
 from flexroad.catalog.grid import Grid
 
 WEST_M, SOUTH_M = 500_000, 5_600_000
-"""Where every block starts: on the central meridian of EPSG:25832, and a multiple of common tile sizes."""
+"""South-west corner of a block: on the central meridian of EPSG:25832, a multiple of common tile sizes."""
 
 
 def block(
@@ -19,7 +19,7 @@ def block(
     Parameters
     ----------
     tiles : int
-        How many; the last row may be short.
+        Number of tiles; the last row may be incomplete.
     size_m : int
         Side of a tile on the absolute grid (m).
     cell : float

@@ -1,4 +1,4 @@
-"""What is long and thin: guard rails, parapets of bridges, and overhead lines."""
+"""Long, thin objects: guard rails, parapets of bridges, and overhead lines."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from flexroad.tasks.synthetic.objects import CORNER_M, GroundAt
 from flexroad.tasks.types import Floats
 
 STEP_M = 0.25
-"""Between the points a line is drawn by."""
+"""Distance between the points of a line (m)."""
 RAIL_M, RAIL_OFFSET_M = 0.8, 0.4
-"""Height of a rail over the ground, and its place beyond the carriageway's edge."""
+"""Height of a rail over the ground, and its distance from the carriageway's edge (m)."""
 POLE_SPACING_M, WIRE_M, SAG_M = 40.0, 7.5, 0.8
-"""Overhead lines: between poles, height at the pole over the ground, and sag."""
+"""Overhead lines: distance between poles, height over the ground at a pole, and sag (m)."""
 SERVICE_M = 12.0
-"""From the wire to the house it serves, across the street."""
+"""Distance from the centre line to the house at the end of a connection, across the street (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Points along thin things, ``(N,)``, m."""
+    """Points along thin objects, ``(N,)`` each, in the plan's frame (m)."""
 
     x: Floats
     y: Floats
@@ -37,7 +37,7 @@ class Trace:
 
 
 def rails(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Trace:
-    """Return guard rails beside a share of the street sides, and parapets on all bridges."""
+    """Return guard rails along a fraction of the street sides, and parapets on all bridges."""
     sides = [
         side for street in streets for side in _sides(street, generator(seed, "rails", *street.key), share)
     ]
@@ -53,15 +53,15 @@ def rails(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: floa
 def _sides(street: Street, rng: np.random.Generator, share: float) -> list[Floats]:
     """Return x, y and whether there is a rail along both sides of a street, ``(3, N)`` each."""
     along = np.arange(street.start, street.end, STEP_M)
-    found = []
+    sides = []
     for side in (-1, 1):
         x, y = street.point(along, side * (street.half_width_m + RAIL_OFFSET_M))
-        found.append(np.stack([x, y, np.full(x.shape, rng.random() < share)]))
-    return found
+        sides.append(np.stack([x, y, np.full(x.shape, rng.random() < share)]))
+    return sides
 
 
 def wires(streets: Sequence[Street], seed: int, ground_at: GroundAt, share: float) -> Trace:
-    """Return overhead lines along a share of the streets, with connections across them."""
+    """Return overhead lines along a fraction of the streets, with connections to houses across the street."""
     lines = [
         _line(street, rng)
         for street in streets

@@ -1,8 +1,8 @@
-"""Where the streets and streams run: a gently bent lattice, turned against the raster.
+"""Plan of the streets and streams: a lattice of slightly curved lines, rotated against the raster.
 
-Streets are pieces of lattice lines between two crossings. Everything is a function of the seed and of
-absolute coordinates: each tile evaluates the part of the plan near it, and neighbours agree. Distances
-are exact to second order in a line's curvature, whose radius is several blocks.
+Streets are pieces of lattice lines between two crossings. Everything is a function of seed and absolute
+coordinates: each tile evaluates the part of the plan near it, and neighbours agree. Distances are exact to
+second order in a line's curvature; the radius of curvature is several blocks.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from typing import Any
 import numpy as np
 
 from flexroad.tasks.synthetic.noise import generator
-from flexroad.tasks.synthetic.strata import Stratum, named, stratum_at
+from flexroad.tasks.synthetic.strata import Stratum, find_stratum, stratum_at
 from flexroad.tasks.types import Floats
 
 Box = tuple[float, float, float, float]
-"""Lowest x and y, highest x and y (m) in the plan's frame."""
+"""Lowest x and y, highest x and y in the plan's frame (m)."""
 
 BENDS = ((3.7, 0.06), (7.9, 0.14))
 """Wavelength and amplitude of a line's bends, in blocks."""
 JITTER = 0.15
-"""Greatest shift of a line from its place in the lattice, in blocks."""
+"""Greatest shift of a line from its position in the lattice, in blocks."""
 MEDIAN_M = 1.5
-"""Half width of the strip between two carriageways."""
+"""Half width of the strip between two carriageways (m)."""
 MEDIAN_END_M = 10.0
-"""From a crossing to the median's nose, and from there to its full width."""
-OUT_OF_STEP = 0.6
-"""Greatest phase difference (rad) of a line's bends from those all lines share: blocks stay blocks."""
+"""Distance from a crossing to the end of the median, and from there to its full width (m)."""
+PHASE_SPREAD = 0.6
+"""Greatest phase difference (rad) of a line's bends from the shared phase: keeps lines roughly parallel."""
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A lattice line: where it runs across, as a smooth function of where we are along it."""
+    """A lattice line: its coordinate across as a smooth function of the coordinate along it."""
 
     position: float
+    """Mean coordinate across (m)."""
     wavenumbers: Floats
     phases: Floats
     amplitudes: Floats
@@ -59,17 +60,17 @@ class Street:
     """One street between two crossings."""
 
     key: tuple[int, int, int]
-    """Axis, line and piece: the street's name for random generators."""
+    """Axis, line and piece: the key of the street's random generators."""
     line: Line
     start: float
     end: float
     half_width_m: float
-    """Half of the carriageway."""
+    """Half width of the street, median included (m)."""
     stratum: Stratum
     cross_slope: float = 0.0
-    """One-sided fall of the carriageway, on top of its crown."""
+    """One-sided slope of the carriageway, added to its crossfall."""
     median_m: float = 0.0
-    """Half of the strip that parts the two carriageways; 0 where there is one."""
+    """Half width of the strip between two carriageways (m); 0 if there is one carriageway."""
 
     @property
     def runs_along_y(self) -> bool:
@@ -84,7 +85,7 @@ class Street:
         return (low, self.start, high, self.end) if self.runs_along_y else (self.start, low, self.end, high)
 
     def foot(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return how far along the nearest point of the centre line is, and the distance to it (m)."""
+        """Return the coordinate along of the nearest point of the centre line, and the distance to it (m)."""
         along, across = (y, x) if self.runs_along_y else (x, y)
         slope = self.line.slope(along)
         step = (across - self.line.across(along)) * slope / (1 + slope**2)
@@ -92,21 +93,21 @@ class Street:
         return foot, np.hypot(across - self.line.across(foot), along - foot)
 
     def lateral(self, x: Floats, y: Floats, along: Floats) -> Floats:
-        """Return the signed offset of points from their foot, across the street only (m).
+        """Return the signed offset of points from the centre line, across the street only (m).
 
-        Beyond the street's ends it shrinks to 0 on the axis: no step where a dead end's sides meet.
+        Beyond the street's ends it falls to 0 on the axis, so a dead end has no step between its sides.
         """
         across = x if self.runs_along_y else y
         offset: Floats = (across - self.line.across(along)) * np.sqrt(1 + self.line.slope(along) ** 2)
         return offset
 
     def strip(self, along: Floats) -> Floats:
-        """Return half of the median's width (m); it ends before the crossings."""
+        """Return half of the median's width (m); 0 near the crossings."""
         inside = np.minimum(along - self.start, self.end - along) - MEDIAN_END_M
         return self.median_m * np.clip(inside / MEDIAN_END_M, 0, 1)
 
     def point(self, along: Any, lateral: Any) -> tuple[Any, Any]:
-        """Return x and y of points beside the centre line (``lateral`` m, to either side)."""
+        """Return x and y of points ``lateral`` m beside the centre line; the sign is the side."""
         slope = self.line.slope(along)
         length = np.sqrt(1 + slope**2)
         across = self.line.across(along) + lateral / length
@@ -125,14 +126,14 @@ class Stream:
 
     banks: tuple[Line, Line]
     paved: bool = False
-    """Whether it is a sunken road instead."""
+    """Whether it is a sunken road, not a stream."""
 
     def distance(self, x: Floats, y: Floats) -> Floats:
         """Return the distance from the stream's axis (m)."""
-        one, other = self.banks
-        axis = (one.across(y) + other.across(y)) / 2
-        away: Floats = np.abs(x - axis) / np.hypot(1, (one.slope(y) + other.slope(y)) / 2)
-        return away
+        left, right = self.banks
+        axis = (left.across(y) + right.across(y)) / 2
+        distance: Floats = np.abs(x - axis) / np.hypot(1, (left.slope(y) + right.slope(y)) / 2)
+        return distance
 
 
 @dataclass(frozen=True)
@@ -141,21 +142,21 @@ class Plan:
 
     seed: int
     block_m: float
-    """Mean distance of neighbouring lattice lines."""
+    """Mean distance of neighbouring lattice lines (m)."""
     stream_share: float
-    """Part of the gaps between lines with a stream."""
+    """Fraction of the gaps between lines with a stream."""
     stratum: str | None = None
     """The stratum of the whole world, or None for a mix of districts."""
     turn_deg: float | None = None
-    """Direction of the lattice, or None for one of the seed."""
+    """Direction of the lattice (degrees); None if drawn from the seed."""
     sunken_share: float = 0.0
-    """Part of the other gaps with a sunken road, which streets cross on bridges too."""
+    """Fraction of the other gaps with a sunken road, which streets cross on bridges."""
     cross_slope: float = 0.0
-    """Greatest one-sided fall of a street."""
+    """Greatest one-sided slope of a street."""
     medians: float = 0.0
-    """Part of the main streets that are dual carriageways."""
+    """Fraction of the main streets that are dual carriageways."""
     roundabouts: float = 0.0
-    """Part of the crossings of two main streets that are roundabouts."""
+    """Fraction of the crossings of two main streets that are roundabouts."""
 
     @cached_property
     def _turn(self) -> tuple[float, float]:
@@ -164,25 +165,25 @@ class Plan:
         return math.cos(angle), math.sin(angle)
 
     def from_map(self, easting: Any, northing: Any) -> tuple[Any, Any]:
-        """Turn map coordinates into the plan's frame."""
+        """Return map coordinates in the plan's frame."""
         cos, sin = self._turn
         return cos * easting + sin * northing, cos * northing - sin * easting
 
     def to_map(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Turn the plan's frame into map coordinates."""
+        """Return coordinates of the plan's frame in map coordinates."""
         cos, sin = self._turn
         return cos * x - sin * y, sin * x + cos * y
 
     def stratum_at(self, x: Any, y: Any) -> Stratum:
         """Return the stratum at one point."""
-        return named(self.stratum) if self.stratum else stratum_at(self.seed, *self.to_map(x, y))
+        return find_stratum(self.stratum) if self.stratum else stratum_at(self.seed, *self.to_map(x, y))
 
     def streets(self, box: Box) -> list[Street]:
         """Return the streets that touch the box."""
         columns, rows = self._reach(box[0], box[2]), self._reach(box[1], box[3])
         pieces = ((axis, i, j) for i in columns for j in rows for axis in (0, 1))
-        found = (_street(self, axis, *((i, j) if axis == 0 else (j, i))) for axis, i, j in pieces)
-        return [street for street in found if street is not None and _touch(street.box, box)]
+        streets = (_street(self, axis, *((i, j) if axis == 0 else (j, i))) for axis, i, j in pieces)
+        return [street for street in streets if street is not None and _touch(street.box, box)]
 
     def streams(self, box: Box) -> Iterator[Stream]:
         """Yield the streams and sunken roads that may touch the box; they run along y."""
@@ -192,7 +193,7 @@ class Plan:
                 yield Stream((_line(self, 0, i), _line(self, 0, i + 1)), paved=not wet)
 
     def circles(self, box: Box, margin_m: float) -> Iterator[tuple[float, float]]:
-        """Yield the centres of the roundabouts in the box grown by a margin; only main streets meet there."""
+        """Yield the centres of the roundabouts in the box plus a margin; only main streets meet there."""
         for i in self._reach(box[0], box[2]):
             for j in self._reach(box[1], box[3]):
                 if i % 2 or j % 2 or generator(self.seed, "circle", i, j).random() >= self.roundabouts:
@@ -203,7 +204,7 @@ class Plan:
                     yield x, y
 
     def _reach(self, low: float, high: float) -> range:
-        """Return the indices of lines whose bends may bring them between two coordinates."""
+        """Return the indices of the lines that may lie between two coordinates."""
         return range(math.floor(low / self.block_m) - 2, math.ceil(high / self.block_m) + 2)
 
 
@@ -217,13 +218,13 @@ def _line(plan: Plan, axis: int, index: int) -> Line:
     shared = generator(plan.seed, "bends", axis).uniform(0, 2 * np.pi, lengths.size)
     rng = generator(plan.seed, "line", axis, index)
     position = (index + rng.uniform(-JITTER, JITTER)) * plan.block_m
-    phases = shared + rng.uniform(-OUT_OF_STEP, OUT_OF_STEP, lengths.size)
+    phases = shared + rng.uniform(-PHASE_SPREAD, PHASE_SPREAD, lengths.size)
     return Line(position, 2 * np.pi / lengths, phases, amplitudes)
 
 
 @lru_cache(maxsize=4096)
 def _crossing(plan: Plan, column: int, row: int) -> tuple[float, float]:
-    """Where two lines meet: a fixed point, as the slopes' product is far below one."""
+    """Return where two lines meet, by fixed-point iteration; the slopes' product is far below 1."""
     upright, level = _line(plan, 0, column), _line(plan, 1, row)
     x, y = upright.position, level.position
     for _ in range(12):
@@ -233,9 +234,9 @@ def _crossing(plan: Plan, column: int, row: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=4096)
 def _street(plan: Plan, axis: int, line: int, piece: int) -> Street | None:
-    """Piece ``piece`` of a line, up to the next crossing line, or None if it was not built.
+    """Return piece ``piece`` of a line, up to the next crossing line, or None if there is no street.
 
-    Lines of even number are main streets; one end of every side street is therefore at a main one.
+    Lines of even number are main streets, so one end of every side street lies on a main street.
     """
     ends = [_crossing(plan, *((line, p) if axis == 0 else (p, line))) for p in (piece, piece + 1)]
     stratum = plan.stratum_at(*np.mean(ends, axis=0))
@@ -244,20 +245,20 @@ def _street(plan: Plan, axis: int, line: int, piece: int) -> Street | None:
     if rng.random() > stratum.side_streets and not is_main:
         return None
     # Drawn per line, not per piece: a street keeps its width across a crossing.
-    wide = generator(plan.seed, "width", axis, line).random()
+    fraction = generator(plan.seed, "width", axis, line).random()
     low, high = stratum.main_width_m if is_main else stratum.side_width_m
-    width = low + wide * (high - low)
+    width = low + fraction * (high - low)
     along = 1 - axis
     key = (axis, line, piece)
-    lean = plan.cross_slope * generator(plan.seed, "lean", axis, line).uniform(-1, 1)
-    parted = is_main and generator(plan.seed, "median", axis, line).random() < plan.medians
+    cross_slope = plan.cross_slope * generator(plan.seed, "lean", axis, line).uniform(-1, 1)
+    dual = is_main and generator(plan.seed, "median", axis, line).random() < plan.medians
     return Street(
         key,
         _line(plan, axis, line),
         ends[0][along],
         ends[1][along],
-        width / 2 + parted * MEDIAN_M,
+        width / 2 + dual * MEDIAN_M,
         stratum,
-        lean,
-        parted * MEDIAN_M,
+        cross_slope,
+        dual * MEDIAN_M,
     )

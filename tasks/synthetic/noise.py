@@ -1,4 +1,4 @@
-"""Chance that depends on a seed and a place alone, and smooth fields made of it."""
+"""Random generators and smooth random fields that depend only on seed and location."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike
 from flexroad.tasks.types import Floats
 
 KEY_OFFSET = 2**31
-"""Makes lattice indices non-negative, as seeds must be."""
+"""Added to lattice indices, because seeds must not be negative."""
 
 
 def generator(seed: int, purpose: str, *key: int) -> np.random.Generator:
-    """Return the random generator of one thing in the world, the same whichever tile asks for it."""
+    """Return the random generator of one object of the world; it is the same for every tile."""
     return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *(k + KEY_OFFSET for k in key)])
 
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """A smooth field: plane waves of several lengths and directions, summed.
+    """A smooth field: a sum of plane waves of several lengths and directions.
 
-    Defined everywhere, so that tiles evaluated one by one join without a step.
+    It is defined everywhere, so tiles that are evaluated separately join without a step.
     """
 
     wavevectors: Floats

@@ -1,7 +1,7 @@
-"""What stands, grows and drives along a street, and what a segmentation takes for road or misses.
+"""Houses, trees and cars along a street, and round errors of the road mask.
 
-Each street has its own random generator, so an object that lies across a tile's border is the same
-object in both tiles. Lengths in metres, positions in the plan's frame.
+Each street has its own random generator, so an object across a tile border is the same object in both
+tiles. Lengths are in metres, headings in rad, positions in the plan's frame.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from flexroad.tasks.synthetic.surfaces import Ground
 from flexroad.tasks.types import Floats
 
 GroundAt = Callable[[Floats, Floats], Ground]
-"""The ground under points of the plan's frame."""
+"""x and y in the plan's frame -> the ground there."""
 
 CORNER_M = 8.0
-"""Kept free of parked cars and street trees at both ends of a street."""
+"""Length at both ends of a street without parked cars and street trees (m)."""
 HIDING = 0.4
-"""Part of the crowns below which the segmentation sees no road."""
+"""Fraction of the crowns that hide the road from the segmentation."""
 SLOT_M = 6.2
-"""Length of a kerb-side parking slot."""
+"""Length of a parking slot along the kerb (m)."""
 GARDEN_M = 30.0
-"""How far from the centre line a street's garden trees and false patches lie."""
+"""Greatest distance of garden trees and false patches from the carriageway (m)."""
 
 
 @dataclass(frozen=True)
 class House:
-    """A box with a flat roof or a gable whose ridge follows the street."""
+    """A box with a flat roof, or with a gable roof whose ridge is parallel to the street."""
 
     x: float
     y: float
@@ -39,9 +39,9 @@ class House:
     half_length: float
     half_depth: float
     eaves: float
-    """Absolute height."""
+    """Absolute height of the eaves."""
     rise: float
-    """Of the ridge over the eaves; 0 is a flat roof."""
+    """Height of the ridge over the eaves; 0 for a flat roof."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class Crown:
     y: float
     radius: float
     top: float
-    """Absolute height."""
+    """Absolute height of the top."""
     height: float
-    """Of the top over the ground."""
+    """Height of the top over the ground."""
     hides: bool
-    """Whether the segmentation takes the road below it for terrain."""
+    """Whether the segmentation misses the road below it."""
 
 
 @dataclass(frozen=True)
 class Car:
-    """A vehicle, as a box with a lower bonnet."""
+    """A vehicle: a box, lower at both ends."""
 
     x: float
     y: float
@@ -74,13 +74,13 @@ class Car:
 
 @dataclass(frozen=True)
 class Spot:
-    """A round patch the segmentation is wrong about."""
+    """A round patch that the segmentation classifies wrongly."""
 
     x: float
     y: float
     radius: float
     road: bool
-    """What it takes the patch for."""
+    """Its wrong class: True for road."""
 
 
 def houses(
@@ -88,7 +88,7 @@ def houses(
 ) -> tuple[House, ...]:
     """Return the houses along both sides of streets, none of them on a road or in a stream.
 
-    Of a stratum's houses the part ``density`` is there, ``storeys`` times as high.
+    ``density`` is the fraction of the stratum's houses to build, ``storeys`` a factor on their eaves.
     """
     planned = [
         house
@@ -98,7 +98,7 @@ def houses(
     ]
     if not planned:
         return ()
-    # A little more than the corners, so that eaves do not hang over the kerb; the centre comes last.
+    # Slightly beyond the corners, so that eaves do not reach over the kerb; the last point is the centre.
     spread = 1.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)])
     xy = np.stack([_footprint(house, spread) for house in planned], axis=1)
     under = ground_at(xy[..., 0], xy[..., 1])
@@ -143,17 +143,17 @@ def crowns(
     density: float,
     gardens: float,
 ) -> tuple[Crown, ...]:
-    """Return the trees at the kerbs, whose crowns hang over the road, and those in the gardens.
+    """Return the trees at the kerbs, whose crowns reach over the road, and those in the gardens.
 
-    Of a stratum's trees the part ``density`` is there; ``gardens`` is the number of garden trees, 1 as usual.
+    ``density`` is the fraction of the stratum's trees to plant, ``gardens`` a factor on the garden trees.
     """
     planned = [_trees(street, generator(seed, "crowns", *street.key), gardens) for street in streets]
     if not planned:
         return ()
-    x, y, radius, height, hides, chance = np.concatenate(planned, axis=1)
+    x, y, radius, height, hides, draw = np.concatenate(planned, axis=1)
     under = ground_at(x, y)
-    # No trunk in the carriageway or inside a house; a facade may still touch a crown.
-    free = (under.edge > 0.6) & (chance < density)
+    # No trunk on the carriageway or inside a house; a crown may touch a facade.
+    free = (under.edge > 0.6) & (draw < density)
     for house in built:
         free &= np.hypot(x - house.x, y - house.y) > house.half_depth + 1.5
     top = under.bare + height
@@ -164,7 +164,7 @@ def crowns(
 
 
 def _trees(street: Street, rng: np.random.Generator, gardens: float) -> Floats:
-    """Return x, y, radius, height, whether it hides the road, and a thinning chance, one column a tree."""
+    """Return x, y, radius, height, whether it hides the road, and a random draw; one column per tree."""
     along, lateral, radius = np.concatenate([_avenue(street, rng), _gardens(street, rng, gardens)], axis=1)
     height = radius * rng.uniform(2.2, 3.2, radius.size) + 1.0
     hides = rng.random(radius.size) < HIDING
@@ -172,7 +172,7 @@ def _trees(street: Street, rng: np.random.Generator, gardens: float) -> Floats:
 
 
 def _avenue(street: Street, rng: np.random.Generator) -> Floats:
-    """Return place along, lateral place and radius of the trees at the kerb, ``(3, N)``."""
+    """Return coordinate along, lateral offset and radius of the trees at the kerb, ``(3, N)``."""
     sides = np.array([-1.0, 1.0])[rng.random(2) < street.stratum.avenues]
     along = np.arange(street.start + CORNER_M, street.end - CORNER_M, rng.uniform(9, 15))
     offset = street.half_width_m + rng.uniform(1.0, 2.2)
@@ -182,24 +182,24 @@ def _avenue(street: Street, rng: np.random.Generator) -> Floats:
     return np.stack([along, lateral, rng.uniform(2.0, 4.2, along.size)])
 
 
-def _gardens(street: Street, rng: np.random.Generator, share: float) -> Floats:
-    """Return the same of the trees away from the kerb."""
-    count = rng.poisson(street.stratum.garden_trees * share)
+def _gardens(street: Street, rng: np.random.Generator, factor: float) -> Floats:
+    """Return the same for the trees away from the kerb."""
+    count = rng.poisson(street.stratum.garden_trees * factor)
     along = rng.uniform(street.start, street.end, count)
     lateral = rng.choice((-1.0, 1.0), count) * (street.half_width_m + rng.uniform(2, GARDEN_M, count))
     return np.stack([along, lateral, rng.uniform(1.5, 4.5, count)])
 
 
 def cars(street: Street, seed: int, density: float) -> list[Car]:
-    """Return the parked cars along both kerbs and those on the move."""
+    """Return the parked cars along both kerbs and the moving cars."""
     rng = generator(seed, "cars", *street.key)
     return [*_parked(street, rng, density), *_moving(street, rng, density)]
 
 
 def _parked(street: Street, rng: np.random.Generator, density: float) -> list[Car]:
-    found = []
+    parked = []
     for side in (-1, 1):
-        # Kerbs are used to a different degree, and cars come in rows.
+        # The occupancy differs between kerbs.
         share = np.clip(street.stratum.parked * rng.uniform(0.2, 1.8), 0, 1) * density
         slots = np.arange(street.start + CORNER_M, street.end - CORNER_M, SLOT_M)
         for slot in slots[rng.random(slots.size) < share]:
@@ -207,20 +207,20 @@ def _parked(street: Street, rng: np.random.Generator, density: float) -> list[Ca
             half_width = 1.0 if van else 0.9
             lateral = side * (street.half_width_m - half_width - rng.uniform(0.1, 0.3))
             length, height = (5.4, 2.2) if van else (rng.uniform(3.9, 4.7), rng.uniform(1.4, 1.65))
-            found.append(_car(street, slot, lateral, length, half_width, height, moving=False))
-    return found
+            parked.append(_car(street, slot, lateral, length, half_width, height, moving=False))
+    return parked
 
 
 def _moving(street: Street, rng: np.random.Generator, density: float) -> list[Car]:
-    found = []
+    moving = []
     for _ in range(rng.poisson(street.stratum.moving * density)):
         along, side = rng.uniform(street.start, street.end), rng.choice((-1, 1))
         truck = rng.random() < 0.1
-        # A scan smears what moves: some come out long, some short and low.
+        # A scan distorts moving cars: some appear longer, some shorter and lower.
         length, height = (10.0, 3.4) if truck else (4.4 * rng.uniform(0.6, 1.8), rng.uniform(0.8, 1.6))
         half_width = 1.25 if truck else 0.9
-        found.append(_car(street, along, side * street.half_width_m * 0.4, length, half_width, height, True))
-    return found
+        moving.append(_car(street, along, side * street.half_width_m * 0.4, length, half_width, height, True))
+    return moving
 
 
 def _car(
@@ -238,7 +238,7 @@ def _car(
 
 
 def spots(street: Street, seed: int, density: float) -> list[Spot]:
-    """Return holes in the street and false patches beside it (drives, yards, parts of roofs)."""
+    """Return holes in the mask of the street and false patches beside it (drives, yards, parts of roofs)."""
     rng = generator(seed, "spots", *street.key)
     length = street.end - street.start
     holes = rng.poisson(density * length / 90)

@@ -1,4 +1,4 @@
-"""What a made world is made of."""
+"""Options of a synthetic world."""
 
 from __future__ import annotations
 
@@ -8,55 +8,65 @@ from flexroad.tasks.options import Options
 
 
 class SceneOptions(Options):
-    """How the made world looks; what has a default of 0 is not there unless asked for."""
+    """Contents of the synthetic world; objects with a default of 0 are absent by default."""
 
     block_m: float = Field(100.0, ge=20, description="mean distance of parallel streets (m)")
     turn_deg: float | None = Field(
         None, ge=0, le=90, description="direction of the streets' lattice; null: drawn from the seed"
     )
     slope: float = Field(0.05, ge=0, le=0.25, description="root mean square slope of the hills")
-    roughness_m: float = Field(0.6, ge=0, description="root mean square height of the terrain's humps (m)")
+    roughness_m: float = Field(
+        0.6, ge=0, description="root mean square height of the terrain's small humps (m)"
+    )
     datum_m: float = Field(160.0, ge=-400, le=8000, description="mean height of the world (m)")
     stream_share: float = Field(
-        0.12, ge=0, le=1, description="part of the gaps between streets with a stream"
+        0.12, ge=0, le=1, description="fraction of the gaps between streets with a stream"
     )
-    density: float = Field(1.0, ge=0, le=1, description="part of houses, trees and cars that is there")
-    mask_errors: float = Field(1.0, ge=0, description="size of the road mask's errors; 0 is a perfect mask")
-    wobble_m: float = Field(0.5, ge=0, description="root mean square offset of the mask's edges (m)")
+    density: float = Field(1.0, ge=0, le=1, description="fraction of houses, trees and cars that exist")
+    mask_errors: float = Field(1.0, ge=0, description="size of the road mask's errors; 0: a perfect mask")
+    wobble_m: float = Field(0.5, ge=0, description="root mean square offset of the road mask's edges (m)")
     dsm_noise_m: tuple[float, float] = Field(
-        (0.03, 0.1), description="least and greatest noise (standard deviation) of a tile's DSM (m)"
+        (0.03, 0.1), description="least and greatest noise of a tile's DSM (standard deviation, m)"
     )
-    dtm_noise_m: float = Field(0.04, ge=0, description="noise (standard deviation) of the DTM (m)")
+    dtm_noise_m: float = Field(0.04, ge=0, description="noise of the DTM (standard deviation, m)")
 
     embankment_m: float = Field(
-        0.0, ge=0, le=5, description="root mean square height of streets over or under the hills (m)"
+        0.0, ge=0, le=5, description="root mean square height of streets above or below the hills (m)"
     )
-    cross_slope: float = Field(0.0, ge=0, le=0.08, description="greatest one-sided fall of a street")
+    cross_slope: float = Field(0.0, ge=0, le=0.08, description="greatest one-sided slope of a street")
     curb_m: float = Field(0.0, ge=0, le=0.3, description="height of pavements over the carriageway (m)")
-    medians: float = Field(0.0, ge=0, le=1, description="part of the main streets that are dual carriageways")
+    medians: float = Field(
+        0.0, ge=0, le=1, description="fraction of the main streets that are dual carriageways"
+    )
     roundabouts: float = Field(
-        0.0, ge=0, le=1, description="part of the crossings of main streets that are roundabouts"
+        0.0, ge=0, le=1, description="fraction of the crossings of main streets that are roundabouts"
     )
     sunken_share: float = Field(
-        0.0, ge=0, le=1, description="part of the other gaps with a sunken road under bridges"
+        0.0, ge=0, le=1, description="fraction of the other gaps with a sunken road under bridges"
     )
 
-    built: float = Field(1.0, ge=0, le=1, description="part of a stratum's houses that is there")
-    storeys: float = Field(1.0, gt=0, le=3, description="height of the eaves, of the stratum's")
+    built: float = Field(1.0, ge=0, le=1, description="fraction of the stratum's houses that exist")
+    storeys: float = Field(1.0, gt=0, le=3, description="height of the eaves, as a factor on the stratum's")
     towers: float = Field(0.0, ge=0, le=2, description="towers, chimneys and high-rises per street")
     overhang_m: float = Field(0.0, ge=0, le=1.5, description="how far roofs reach beyond the walls (m)")
-    trees: float = Field(1.0, ge=0, le=20, description="number of trees away from the kerb, of the stratum's")
+    trees: float = Field(
+        1.0, ge=0, le=20, description="number of trees away from the kerb, as a factor on the stratum's"
+    )
     growth_m: float = Field(0.0, ge=0, le=2, description="mean height of hedges, brambles and crops (m)")
-    rails: float = Field(0.0, ge=0, le=1, description="part of the street sides with a guard rail")
-    wires: float = Field(0.0, ge=0, le=1, description="part of the streets with an overhead line")
+    rails: float = Field(0.0, ge=0, le=1, description="fraction of the street sides with a guard rail")
+    wires: float = Field(0.0, ge=0, le=1, description="fraction of the streets with an overhead line")
     mixed: float = Field(
-        0.0, ge=0, le=1, description="part of the cells at walls that lie between top and foot"
+        0.0, ge=0, le=1, description="fraction of the cells at walls whose height lies between top and foot"
     )
 
     car_parks: float = Field(0.0, ge=0, le=5, description="car parks per street")
-    fields: float = Field(0.0, ge=0, le=5, description="bare fields per street that may pass for road")
-    false_roofs: float = Field(0.0, ge=0, le=1, description="part of the roofs taken for road")
-    scars_m: float = Field(0.0, ge=0, le=2, description="depth of the DTM's scars under houses (m)")
+    fields: float = Field(
+        0.0, ge=0, le=5, description="bare fields per street that the mask may show as road"
+    )
+    false_roofs: float = Field(
+        0.0, ge=0, le=1, description="fraction of the roofs that the mask shows as road"
+    )
+    scars_m: float = Field(0.0, ge=0, le=2, description="depth of the DTM's errors under houses (m)")
 
 
 DEFAULTS = SceneOptions()

@@ -1,4 +1,4 @@
-"""A scene as photogrammetry delivers it: a textured mesh with faults, and the truth behind it."""
+"""A scene as delivered by photogrammetry: a textured mesh with faults, and the true ground and roads."""
 
 from __future__ import annotations
 
@@ -19,65 +19,66 @@ from flexroad.tasks.synthetic.triangles import Faces, fragments, lattice, simpli
 from flexroad.tasks.types import Floats
 
 NODE_M = 0.5
-"""Spacing of the lattice that is simplified: 300 x 300 quads, 180,000 triangles."""
+"""Node spacing of the lattice before simplification (m): 300 x 300 quads, 180,000 triangles."""
 GSD_M = 0.25
-"""Pixel of the texture."""
+"""Pixel size of the texture (m)."""
 FLOATING_M = (2.0, 9.0)
-"""Of fragments, over the surface."""
+"""Range of the height of floating fragments over the surface (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotogrammetryScene:
-    """One made scene, as it is and as photographs show it."""
+    """One synthetic scene: its true surface and its photogrammetric mesh."""
 
     name: str
     mesh: TexturedMesh
-    """One texture, seen from straight above; walls are smeared with it."""
+    """One texture, an orthophoto; it is stretched along walls."""
     truth: Scene
-    """The scene in cells of a metre, without noise: ``reference`` is the true ground incl. decks,
-    ``reference_road`` the true roads, ``road_mask`` roads as a segmentation would find them."""
+    """The scene with cells of 1 m, without noise: ``reference`` is the true ground with bridges,
+    ``reference_road`` the true roads, ``road_mask`` the roads with the errors of a segmentation."""
     surface: Scene
-    """The same at the mesh's nodes: what was photographed."""
+    """The scene at the nodes of the lattice, before reconstruction."""
     reconstruction: Reconstruction
-    """The surface that the mesh was simplified from."""
+    """The reconstructed surface, before simplification."""
 
 
 def photogrammetry(place: Place, seed: int) -> PhotogrammetryScene:
-    """Make one of the stand-in's scenes.
+    """Make one scene of the stand-in for DSC3D.
 
     Parameters
     ----------
     place : Place
-        One of `tasks.synthetic.dsc3d.survey`.
+        A place from `tasks.synthetic.dsc3d.survey`.
     seed : int
-        The same as the survey's.
+        Seed of the survey.
 
     Returns
     -------
     PhotogrammetryScene
-        Equal input gives equal scenes. The mesh fills the place's square, but for open holes.
+        Equal input gives equal scenes. The mesh fills the square of the place, except for open holes.
     """
     site, grid = place.site, place.grid
     truth = make_scene(grid, seed, site.stratum, place.options)
     surface = make_scene(_nodes(grid), seed, site.stratum, place.options)
-    made = reconstruct(surface, seed, site.faults)
-    origin = np.array([grid.west, grid.south, math.floor(made.height.min())])
+    reconstruction = reconstruct(surface, seed, site.faults)
+    origin = np.array([grid.west, grid.south, math.floor(reconstruction.height.min())])
     rng = generator(seed, "fragments", *map(int, grid.origin))
-    floating, pieces = fragments(_above(made, site.faults.fragments, origin, grid, rng), rng)
-    vertices, faces = _mesh(made, site.triangles - len(pieces), origin)
+    centres = _fragment_centres(reconstruction, site.faults.fragments, origin, grid, rng)
+    floating, pieces = fragments(centres, rng)
+    vertices, faces = _mesh(reconstruction, site.triangles - len(pieces), origin)
     faces = np.concatenate([faces, pieces + np.int32(len(vertices))])
-    vertices = _inside(np.concatenate([vertices, floating]), grid)
+    vertices = _clip(np.concatenate([vertices, floating]), grid)
     texture = orthophoto(grid, seed, site.stratum, place.options, GSD_M).transpose(1, 2, 0)
     return PhotogrammetryScene(
-        site.name, _textured(vertices, faces, texture, origin, grid), truth, surface, made
+        site.name, _textured(vertices, faces, texture, origin, grid), truth, surface, reconstruction
     )
 
 
 def _nodes(grid: Grid) -> Grid:
-    """Return the lattice whose cell centres span a grid from edge to edge."""
-    wide = Grid.covering(grid.crs, grid.bounds, NODE_M)
+    """Return the lattice whose outermost cell centres lie on the edges of a grid."""
+    cells = Grid.covering(grid.crs, grid.bounds, NODE_M)
     west, north = grid.west - NODE_M / 2, grid.north + NODE_M / 2
-    return Grid(grid.crs, west, north, NODE_M, wide.width + 1, wide.height + 1)
+    return Grid(grid.crs, west, north, NODE_M, cells.width + 1, cells.height + 1)
 
 
 def _mesh(made: Reconstruction, triangles: int, origin: Floats) -> tuple[Floats, Faces]:
@@ -85,15 +86,17 @@ def _mesh(made: Reconstruction, triangles: int, origin: Floats) -> tuple[Floats,
     return simplified(*lattice(east, north, made.height - origin[2], made.open), triangles)
 
 
-def _above(made: Reconstruction, count: int, origin: Floats, grid: Grid, rng: np.random.Generator) -> Floats:
-    """Return points ``(count, 3)`` over the surface, from the origin."""
+def _fragment_centres(
+    made: Reconstruction, count: int, origin: Floats, grid: Grid, rng: np.random.Generator
+) -> Floats:
+    """Return random points above the surface, relative to the origin, ``(count, 3)``."""
     x, y = rng.uniform(0, grid.width * grid.cell, (2, count))
     height = made.height[made.grid.cells(x + origin[0], y + origin[1])]
     return np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, count)])
 
 
-def _inside(vertices: Floats, grid: Grid) -> Floats:
-    """Return vertices with those a little outside the square pulled onto its edge."""
+def _clip(vertices: Floats, grid: Grid) -> Floats:
+    """Return the vertices, clipped to the square in x and y."""
     side = np.array([grid.width, grid.height]) * grid.cell
     return np.column_stack([np.clip(vertices[:, :2], 0, side), vertices[:, 2]])
 
@@ -101,7 +104,7 @@ def _inside(vertices: Floats, grid: Grid) -> Floats:
 def _textured(
     vertices: Floats, faces: Faces, texture: NDArray[np.uint8], origin: Floats, grid: Grid
 ) -> TexturedMesh:
-    # v counts from below, as northings do.
+    # v increases northwards.
     uv = vertices[:, :2] / (np.array([grid.width, grid.height]) * grid.cell)
     return TexturedMesh(
         crs=grid.crs,

@@ -1,4 +1,4 @@
-"""Low growth off the road: hedges, brambles and crops, which no scan sees through."""
+"""Low vegetation off the road: hedges, brambles and crops, which a scan does not penetrate."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from flexroad.tasks.synthetic.noise import generator, waves
 from flexroad.tasks.types import Bools, Floats
 
 THICKET_M = (6.0, 60.0)
-"""Shortest and longest wave of the thickets."""
+"""Shortest and longest wave of the thickets (m)."""
 CLEAR_M = 1.5
-"""Beside a carriageway nothing is let grow."""
+"""Width of the strip beside a carriageway without vegetation (m)."""
 
 
 def growth(
     seed: int, x: Floats, y: Floats, edge: Floats, height_m: float, rng: np.random.Generator
 ) -> Floats:
-    """Return the height of low growth (m), 0 where there is none.
+    """Return the height of low vegetation, ``(H, W)``, m; 0 where there is none.
 
     Parameters
     ----------
     seed : int
-        The world.
+        Seed of the world.
     x, y, edge : (H, W) array
-        Places in the plan's frame, and their distance to the nearest carriageway (m).
+        Coordinates in the plan's frame, and distance to the nearest carriageway (m).
     height_m : float
         Mean height inside a thicket (m).
     rng : numpy.random.Generator
-        Draws where in a cell the highest leaf is.
+        Draws the height of each cell relative to the mean.
     """
     lengths = np.geomspace(*THICKET_M, 18)
     thick = waves(generator(seed, "thickets"), lengths, np.sqrt(2 / lengths.size))(x, y)
-    here: Bools = (thick > 0) & (edge > CLEAR_M)
-    # Half the cells' highest leaf is below the mean, a few are far above it: growth is ragged.
+    covered: Bools = (thick > 0) & (edge > CLEAR_M)
+    # A skewed distribution of mean 1: most cells are lower than the mean, a few are far higher.
     ragged: Floats = rng.gamma(2.0, 0.5, x.shape)
-    return np.where(here, height_m * np.minimum(thick, 1) * ragged, 0.0)
+    return np.where(covered, height_m * np.minimum(thick, 1) * ragged, 0.0)

@@ -1,4 +1,4 @@
-"""Everything that stands between a survey and the truth, near one tile."""
+"""All objects and mask errors near one tile."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from flexroad.tasks.synthetic.objects import Car, Crown, GroundAt, House, Spot, 
 from flexroad.tasks.synthetic.options import SceneOptions
 from flexroad.tasks.synthetic.towers import towers
 
-UNDER_WAY_M = 2.5
-"""A car parked farther than this from the kerb stands in a roundabout's lane."""
+KERB_REACH_M = 2.5
+"""Greatest distance of a parked car's centre from the kerb (m); farther ones are in a roundabout's lane."""
 
 
 @dataclass(frozen=True)
 class Objects:
-    """What there is, each thing the same for all tiles it reaches into."""
+    """The objects near a tile; an object in several tiles is the same in each."""
 
     houses: tuple[House, ...]
     crowns: tuple[Crown, ...]
@@ -31,7 +31,7 @@ class Objects:
     car_parks: tuple[Area, ...]
     fields: tuple[Area, ...]
     false_roofs: tuple[Area, ...]
-    """Roofs, or parts of them, that the segmentation takes for road."""
+    """Roofs, or parts of them, that the segmentation mistakes for road."""
     rails: Trace
     wires: Trace
 
@@ -48,31 +48,31 @@ def populate(
     Parameters
     ----------
     streets : sequence of Street
-        Whose objects are wanted.
+        Streets whose objects are returned.
     farther : sequence of Street
-        These and more, whose areas houses keep off.
+        These and more streets; houses do not stand on their car parks and fields.
     seed : int
-        The world.
+        Seed of the world.
     ground_at : callable
-        The ground with all streets that are near.
+        Returns the ground at points, with all streets nearby.
     options : SceneOptions
-        How much of each there is.
+        Amounts of each kind of object.
     """
     density, errors = options.density, options.mask_errors
     car_parks = areas.car_parks(farther, seed, ground_at, options.car_parks * density)
     bare = areas.fields(farther, seed, ground_at, options.fields * errors)
     built = houses(streets, seed, ground_at, density * options.built, options.storeys)
     built += towers(streets, seed, ground_at, options.towers * density)
-    built = areas.off(built, (*car_parks, *bare))
-    grown = crowns(streets, seed, ground_at, built, density, options.trees)
-    driven = [car for street in streets for car in cars(street, seed, density)]
+    built = areas.houses_off(built, (*car_parks, *bare))
+    trees = crowns(streets, seed, ground_at, built, density, options.trees)
+    vehicles = [car for street in streets for car in cars(street, seed, density)]
     if options.roundabouts:
-        driven = _clear(driven, ground_at)
-    driven += [car for park in car_parks for car in areas.parked(park, seed)]
+        vehicles = _off_roundabouts(vehicles, ground_at)
+    vehicles += [car for park in car_parks for car in areas.parked(park, seed)]
     return Objects(
         built,
-        grown,
-        tuple(driven),
+        trees,
+        tuple(vehicles),
         tuple(spot for street in streets for spot in spots(street, seed, errors)),
         car_parks,
         bare,
@@ -82,23 +82,23 @@ def populate(
     )
 
 
-def _clear(driven: Sequence[Car], ground_at: GroundAt) -> list[Car]:
-    """Leave out the cars that a roundabout has put into its lanes or onto its island."""
-    if not driven:
+def _off_roundabouts(vehicles: Sequence[Car], ground_at: GroundAt) -> list[Car]:
+    """Return the cars without those parked in a roundabout's lanes or standing on its island."""
+    if not vehicles:
         return []
-    under = ground_at(np.array([car.x for car in driven]), np.array([car.y for car in driven]))
+    under = ground_at(np.array([car.x for car in vehicles]), np.array([car.y for car in vehicles]))
     fits = [
-        (edge < 0) & (car.moving | (edge > -UNDER_WAY_M))
-        for car, edge in zip(driven, under.edge, strict=True)
+        (edge < 0) & (car.moving | (edge > -KERB_REACH_M))
+        for car, edge in zip(vehicles, under.edge, strict=True)
     ]
-    return [car for car, fit in zip(driven, fits, strict=True) if fit]
+    return [car for car, fit in zip(vehicles, fits, strict=True) if fit]
 
 
 def _false_roofs(built: Sequence[House], seed: int, share: float) -> tuple[Area, ...]:
-    found = []
+    roofs = []
     for house in built if share > 0 else ():
         rng = generator(seed, "roof", int(house.x // 1), int(house.y // 1))
         if rng.random() < share:
             length = house.half_length * rng.uniform(0.4, 1)
-            found.append(Area(house.x, house.y, house.heading, length, house.half_depth, as_road=True))
-    return tuple(found)
+            roofs.append(Area(house.x, house.y, house.heading, length, house.half_depth, as_road=True))
+    return tuple(roofs)

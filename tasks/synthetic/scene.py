@@ -1,4 +1,4 @@
-"""A scene: the rasters a survey would deliver of one tile, and the truth behind them."""
+"""A scene: the rasters that a survey would deliver for one tile, and the true ground and roads."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from flexroad.tasks.synthetic.plants import growth
 from flexroad.tasks.synthetic.population import Objects, populate
 from flexroad.tasks.synthetic.scars import scars
 from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, segmentation, surface_model
-from flexroad.tasks.synthetic.strata import named
+from flexroad.tasks.synthetic.strata import find_stratum
 from flexroad.tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
 from flexroad.tasks.types import Bools, Floats
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
 
 OBJECT_REACH_M = 45.0
-"""No house, crown, car or patch lies farther than this from its street's centre line."""
+"""Greatest distance of a house, crown, car or patch from its street's centre line (m)."""
 DTM_BLUR_M = 1.0
-"""Gaussian smoothing of a terrain model by its interpolation."""
+"""Standard deviation of the Gaussian that models the DTM's smoothing by interpolation (m)."""
 DTM_GRAIN_M = 3.0
-"""Correlation length of a terrain model's noise."""
+"""Correlation length of the DTM's noise (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One tile of a made world."""
+    """One tile of a synthetic world."""
 
     grid: Grid
     stratum: str
@@ -46,17 +46,17 @@ class Scene:
     dtm: Floats
     """Terrain model without bridges, smoothed and noisy, ``(H, W)``, m."""
     road_mask: Bools
-    """Road as a segmentation would find it, with errors, ``(H, W)``."""
+    """Road with the errors of a segmentation, ``(H, W)``."""
     reference: Floats
     """True height of road and terrain with bridges, ``(H, W)``, m."""
     reference_road: Bools
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
-    """What the surface model shows, a `Kind` per cell, ``(H, W)``."""
+    """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
 
     @property
     def layers(self) -> Mapping[str, NDArray[np.generic]]:
-        """The rasters by the catalog's layer names."""
+        """The rasters, by the catalog's layer names."""
         return {
             "dsm": self.dsm,
             "dtm": self.dtm,
@@ -69,19 +69,19 @@ class Scene:
 def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: SceneOptions = DEFAULTS) -> Scene:
     """Make one tile of the world of a seed.
 
-    Ground, streets, objects and the mask's errors are functions of seed and absolute coordinates: tiles
-    of one seed join. Noise of the heights is drawn per tile.
+    Ground, streets, objects and errors of the mask are functions of seed and absolute coordinates, so tiles
+    of one seed join without a step. The noise of the heights is drawn per tile.
 
     Parameters
     ----------
     grid : Grid
         The tile's cells.
     seed : int
-        The world; 0 or more.
+        Seed of the world, 0 or more.
     stratum : str, optional
-        Make the whole world ``urban``, ``suburban`` or ``rural``; by default its districts are mixed.
+        Stratum of the whole world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
     options : SceneOptions
-        How the world looks.
+        Contents of the world.
 
     Raises
     ------
@@ -91,9 +91,9 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     if seed < 0:
         raise TaskError(f"a seed is 0 or more, not {seed}")
     if stratum is not None:
-        named(stratum)
+        find_stratum(stratum)
     plan = plan_of(seed, stratum, options)
-    # The terrain model is smoothed; the margin keeps the tile's border from showing.
+    # A margin, so that the smoothing of the terrain model has no edge effect on the tile.
     wide = grid.buffered(4 * DTM_BLUR_M)
     canvas, inner = Canvas.of(wide, plan), wide.window(grid)
     ground_at = _ground_near(canvas, options)
@@ -151,26 +151,26 @@ def _survey(
 
 
 def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
-    """Return the ground as a function of points on and a little beyond the canvas."""
+    """Return the function that gives the ground at points on the canvas and near it."""
     plan = canvas.plan
     land = relief(plan.seed, options.slope, options.roughness_m, options.datum_m, options.embankment_m)
-    # Objects may lie beyond the tile, and the streets that lift their ground farther still.
+    # Objects may lie beyond the tile, and the streets that shape their ground even farther.
     box = _box(canvas, 2 * OBJECT_REACH_M)
     circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
     return partial(ground, land, Ways(plan.streets(box), tuple(plan.streams(box)), circles, options.curb_m))
 
 
 def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
-    """Return the bare ground as interpolation between ground points leaves it."""
+    """Return the bare ground, smoothed and with correlated noise, as interpolated from ground points."""
     grain = gaussian_filter(rng.standard_normal(bare.shape), DTM_GRAIN_M / cell)
-    # White noise keeps 1 / (2 sigma sqrt(pi)) of its deviation under a Gaussian of sigma cells.
+    # A Gaussian of sigma cells reduces the deviation of white noise to 1 / (2 sigma sqrt(pi)).
     gain = max(2 * np.sqrt(np.pi) * DTM_GRAIN_M / cell, 1.0)
     smooth: Floats = gaussian_filter(bare, DTM_BLUR_M / cell, mode="nearest") + noise_m * gain * grain
     return smooth
 
 
 def _wobble(seed: int, rms_m: float) -> Waves:
-    """Return the offset of the mask's edges: some metres long, as labels of image patches are."""
+    """Return the offset of the mask's edges; its waves are 5 to 40 m long, like errors of image patches."""
     lengths = np.geomspace(5, 40, 12)
     return waves(generator(seed, "wobble"), lengths, rms_m * np.sqrt(2 / lengths.size))
 

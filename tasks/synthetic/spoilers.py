@@ -1,4 +1,4 @@
-"""What a survey sees instead of the ground: a surface model with objects on it and a mask with errors."""
+"""Survey rasters with objects and errors ("spoilers"): the surface model and the road mask."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexroad.tasks.types import Bools, Floats
 
 
 class Kind(IntEnum):
-    """What the surface model shows in a cell."""
+    """Object that the surface model shows in a cell."""
 
     GROUND = 0
     DECK = 1
@@ -31,24 +31,24 @@ class Kind(IntEnum):
     RAIL = 7
     WIRE = 8
     MIXED = 9
-    """Ground beside a wall, at a height that is neither's."""
+    """Cell at a wall, with a height between ground and top."""
     PAVED = 10
-    """A car park's ground."""
+    """Ground of a car park."""
     FIELD = 11
-    """Bare ground that looks like a road from above."""
+    """Bare ground that looks like road from above."""
 
 
 BARE = (Kind.GROUND, Kind.DECK, Kind.PAVED, Kind.FIELD)
-"""What the surface model shows at its true height."""
+"""Kinds without an object: the surface model has the height of the true ground."""
 GAPS_IN_CROWNS = 0.06
-"""Part of a crown's cells through which the scan reaches what is below."""
+"""Fraction of a crown's cells in which the scan shows the surface below."""
 RAIL_ECHOES, WIRE_ECHOES = 0.3, 0.06
-"""Part of the points along a rail and a wire that give the cell its height."""
+"""Fraction of the points along a rail and a wire that set the height of their cell."""
 
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """The cells of a tile with their centres in the plan's frame."""
+    """The cells of a tile, with their centres in the plan's frame, ``(H, W)`` (m)."""
 
     grid: Grid
     plan: Plan
@@ -57,12 +57,12 @@ class Canvas:
 
     @classmethod
     def of(cls, grid: Grid, plan: Plan) -> Canvas:
-        """Lay a tile's cells on the plan."""
+        """Return the canvas of a grid on a plan."""
         easting, northing = np.meshgrid(grid.eastings, grid.northings)
         return cls(grid, plan, *plan.from_map(easting, northing))
 
     def around(self, x: float, y: float, reach_m: float) -> tuple[slice, slice]:
-        """Return the (row, col) window of the cells within reach of a point; empty beyond the tile."""
+        """Return the (row, col) window of the cells within a distance of a point; empty beyond the tile."""
         grid = self.grid
         easting, northing = self.plan.to_map(x, y)
         n = int(np.ceil(reach_m / grid.cell)) + 1
@@ -71,7 +71,7 @@ class Canvas:
         return slice(max(row - n, 0), max(row + n + 1, 0)), slice(max(col - n, 0), max(col + n + 1, 0))
 
     def local(self, window: tuple[slice, slice], x: float, y: float, heading: float) -> tuple[Floats, Floats]:
-        """Return the cells' coordinates along and across an object."""
+        """Return the coordinates of a window's cells along and across an object (m)."""
         dx, dy = self.x[window] - x, self.y[window] - y
         cos, sin = np.cos(heading), np.sin(heading)
         return cos * dx + sin * dy, cos * dy - sin * dx
@@ -85,28 +85,28 @@ def surface_model(
     overhang_m: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Return what a scan sees from above (m, without noise) and the `Kind` of each cell.
+    """Return the surface model of a scan (m, without noise) and the `Kind` of each cell, ``(H, W)``.
 
-    Low growth and mixed cells come later; roofs reach ``overhang_m`` beyond the walls.
+    Low vegetation and mixed cells are added later. Roofs reach ``overhang_m`` beyond the walls.
     """
     dsm, kind = truth.copy(), np.where(deck, Kind.DECK, Kind.GROUND).astype(np.uint8)
-    for area, what in [(a, Kind.PAVED) for a in objects.car_parks] + [
+    for area, area_kind in [(a, Kind.PAVED) for a in objects.car_parks] + [
         (a, Kind.FIELD) for a in objects.fields
     ]:
         window, inside = _covered(canvas, area, np.zeros(truth.shape))
-        kind[window][inside] = what
+        kind[window][inside] = area_kind
     for house in objects.houses:
         window, z = _roof(canvas, house, overhang_m)
         _raise(dsm[window], kind[window], z, Kind.BUILDING)
     for car in objects.cars:
         window, z = _bodywork(canvas, car)
-        what = Kind.MOVING_CAR if car.moving else Kind.PARKED_CAR
-        _raise(dsm[window], kind[window], truth[window] + z, what)
-    seen = rng.random(truth.shape) >= GAPS_IN_CROWNS
+        car_kind = Kind.MOVING_CAR if car.moving else Kind.PARKED_CAR
+        _raise(dsm[window], kind[window], truth[window] + z, car_kind)
+    leafy = rng.random(truth.shape) >= GAPS_IN_CROWNS
     ragged = rng.normal(0, 0.3, truth.shape)
     for crown in objects.crowns:
         window, z = _foliage(canvas, crown)
-        z = np.where(seen[window], z + ragged[window], -np.inf)
+        z = np.where(leafy[window], z + ragged[window], -np.inf)
         _raise(dsm[window], kind[window], z, Kind.CROWN)
     _trace(canvas, dsm, kind, objects.rails, Kind.RAIL, rng)
     _trace(canvas, dsm, kind, objects.wires, Kind.WIRE, rng)
@@ -118,35 +118,35 @@ def _trace(
     dsm: Floats,
     kind: NDArray[np.uint8],
     trace: Trace,
-    what: Kind,
+    new_kind: Kind,
     rng: np.random.Generator,
 ) -> None:
-    """Lift the cells under some points of a thin line, in place; a part of the pulses meets it."""
-    share = RAIL_ECHOES if what == Kind.RAIL else WIRE_ECHOES
+    """Raise cells along a thin line, in place; only a fraction of the pulses hits it."""
+    share = RAIL_ECHOES if new_kind == Kind.RAIL else WIRE_ECHOES
     west, south, east, north = canvas.grid.bounds
     easting, northing = canvas.plan.to_map(trace.x, trace.y)
     inside = (easting > west) & (easting < east) & (northing > south) & (northing < north)
-    met = inside & (rng.random(inside.size) < share)
-    row, col = canvas.grid.cells(easting[met], northing[met])
-    z = trace.z[met]
+    hit = inside & (rng.random(inside.size) < share)
+    row, col = canvas.grid.cells(easting[hit], northing[hit])
+    z = trace.z[hit]
     higher = z > dsm[row, col]
     row, col, z = row[higher], col[higher], z[higher]
     np.maximum.at(dsm, (row, col), z)
-    kind[row, col] = what
+    kind[row, col] = new_kind
 
 
-def _raise(dsm: Floats, kind: NDArray[np.uint8], z: Floats, what: Kind) -> None:
-    """Lift a window of the model, in place, to ``z`` where that is higher."""
+def _raise(dsm: Floats, kind: NDArray[np.uint8], z: Floats, new_kind: Kind) -> None:
+    """Raise a window of the model to ``z``, in place, where ``z`` is higher."""
     higher = z > dsm
     dsm[higher] = z[higher]
-    kind[higher] = what
+    kind[higher] = new_kind
 
 
 def _roof(canvas: Canvas, house: House, overhang_m: float) -> tuple[tuple[slice, slice], Floats]:
     reach = float(np.hypot(house.half_length, house.half_depth)) + 2 * overhang_m
     window = canvas.around(house.x, house.y, reach)
     u, v = canvas.local(window, house.x, house.y, house.heading)
-    # The highest point of a cell counts: roofs reach into cells they cover in part.
+    # A cell has the height of its highest point, so roofs include cells that they cover partly.
     grown = canvas.grid.cell / 4 + overhang_m
     inside = (np.abs(u) <= house.half_length + grown) & (np.abs(v) <= house.half_depth + grown)
     ridge = np.clip(1 - np.abs(v) / house.half_depth, 0, 1)
@@ -164,26 +164,26 @@ def _bodywork(canvas: Canvas, car: Car) -> tuple[tuple[slice, slice], Floats]:
 def _foliage(canvas: Canvas, crown: Crown) -> tuple[tuple[slice, slice], Floats]:
     window = canvas.around(crown.x, crown.y, crown.radius)
     out = np.hypot(canvas.x[window] - crown.x, canvas.y[window] - crown.y) / crown.radius
-    # Round on top and down to low branches at the rim: a staircase to the road, as scans show it.
+    # Round on top, low branches at the rim: steps down to the road, as in real scans.
     fall = 0.85 * crown.height * (1 - np.sqrt(np.clip(1 - out**2, 0, 1)))
     return window, np.where(out <= 1, crown.top - fall, -np.inf)
 
 
 def segmentation(canvas: Canvas, edge: Floats, objects: Objects, wobble: Waves, scale: float) -> Bools:
-    """Return the road mask a segmentation would give.
+    """Return the road mask with the errors of a segmentation, ``(H, W)``.
 
     Parameters
     ----------
     canvas : Canvas
-        The cells.
+        The tile's cells.
     edge : (H, W) array
         Distance to the nearest carriageway's edge, negative on the road (m).
     objects : Objects
-        Of these, crowns hide the road, and spots are taken for what they are not.
+        Objects: crowns hide the road; spots, and some areas and roofs, are classified wrongly.
     wobble : Waves
-        By how much the mask's edge is off (m).
+        Offset of the mask's edges (m).
     scale : float
-        0 for a perfect mask, 1 for errors of the usual size.
+        Factor on the size of the errors: 0 for a perfect mask, 1 for the usual size.
     """
     error = scale * wobble(canvas.x, canvas.y)
     mask: Bools = edge + error <= 0
@@ -193,15 +193,15 @@ def segmentation(canvas: Canvas, edge: Floats, objects: Objects, wobble: Waves, 
         window = canvas.around(x, y, radius + 2)
         away = np.hypot(canvas.x[window] - x, canvas.y[window] - y)
         mask[window][away + error[window] < radius] = road
-    taken = [a for a in (*objects.car_parks, *objects.fields, *objects.false_roofs) if a.as_road]
-    for area in taken if scale > 0 else ():
+    mistaken = [a for a in (*objects.car_parks, *objects.fields, *objects.false_roofs) if a.as_road]
+    for area in mistaken if scale > 0 else ():
         window, inside = _covered(canvas, area, error)
         mask[window][inside] = True
     return mask
 
 
 def _covered(canvas: Canvas, area: Area, error: Floats) -> tuple[tuple[slice, slice], Bools]:
-    """Return the cells of an area whose edge is off by ``error`` (m)."""
+    """Return the window and the cells of an area whose edge is shifted by ``error`` (m)."""
     window = canvas.around(area.x, area.y, float(np.hypot(area.half_length, area.half_width)) + 2)
     u, v = canvas.local(window, area.x, area.y, area.heading)
     beyond = np.maximum(np.abs(u) - area.half_length, np.abs(v) - area.half_width)

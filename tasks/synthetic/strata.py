@@ -1,4 +1,4 @@
-"""What makes a place urban, suburban or rural."""
+"""The strata urban, suburban and rural, and the districts they are assigned to."""
 
 from __future__ import annotations
 
@@ -13,38 +13,39 @@ from flexroad.tasks.synthetic.noise import generator
 Range = tuple[float, float]
 
 DISTRICT_M = 250
-"""Side of the squares of one stratum (m): a tile of the usual size has one."""
+"""Side of a district, a square of one stratum (m): a tile of the usual size lies in one."""
 
 
 @dataclass(frozen=True)
 class Stratum:
-    """How densely an area is built, driven and planted."""
+    """Density of buildings, traffic and vegetation in an area."""
 
     name: str
     share: float
-    """Part of the districts."""
+    """Fraction of the districts."""
     side_streets: float
-    """Part of the possible side streets that exist; main streets always do."""
+    """Fraction of the possible side streets that exist; main streets always exist."""
     main_width_m: Range
     side_width_m: Range
     lot_m: Range
-    """Street front of a lot."""
+    """Street front of a lot (m)."""
     built: float
-    """Part of the lots with a house."""
+    """Fraction of the lots with a house."""
     gap_m: Range
-    """Free front beside a house; none in a terrace."""
+    """Gap between neighbouring houses (m); 0 for terraced houses."""
     setback_m: Range
-    """From the carriageway's edge to the facade."""
+    """Distance from the carriageway's edge to the facade (m)."""
     depth_m: Range
     eaves_m: Range
-    """Height of the eaves over the ground."""
+    """Height of the eaves over the ground (m)."""
     flat_roofs: float
+    """Fraction of the houses with a flat roof."""
     parked: float
-    """Part of the kerb-side slots with a car."""
+    """Fraction of the parking slots with a car."""
     moving: float
-    """Cars on the move per street."""
+    """Moving cars per street."""
     avenues: float
-    """Part of the street sides lined with trees."""
+    """Fraction of the street sides with a row of trees."""
     garden_trees: float
     """Trees per street away from the kerb."""
 
@@ -60,19 +61,19 @@ STRATA = {
                 0.05, 0.02, 0.4, 0.4, 6),
     )
 }  # fmt: skip
-"""By name; the shares are those of the paper's 168, 23 and 49 tiles."""
+"""Strata by name; the fractions are those of the paper's 168, 23 and 49 tiles."""
 
 
-def named(name: str) -> Stratum:
-    """Return the stratum of that name.
+def find_stratum(name: str) -> Stratum:
+    """Return the stratum with a name.
 
     Raises
     ------
     TaskError
-        If there is none.
+        If the name is unknown.
     """
     if name not in STRATA:
-        raise TaskError(f"no stratum {name!r}; known are {', '.join(STRATA)}")
+        raise TaskError(f"no stratum {name!r}; there are {', '.join(STRATA)}")
     return STRATA[name]
 
 

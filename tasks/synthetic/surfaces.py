@@ -1,4 +1,4 @@
-"""The ground: relief, streets graded into it, and streams they cross on bridges."""
+"""The ground: relief, streets graded into it, and streams that streets cross on bridges."""
 
 from __future__ import annotations
 
@@ -13,35 +13,36 @@ from flexroad.tasks.synthetic.noise import Waves, generator, waves
 from flexroad.tasks.types import Bools, Floats
 
 CROSSFALL = 0.025
-"""Mean fall from a street's middle to its edge."""
+"""Mean cross slope from a street's middle to its edge."""
 SHOULDER_M = 2.0
-"""Strip beside the carriageway that is graded with it."""
+"""Width of the strip beside the carriageway that is graded with it (m)."""
 SLOPE_M = 9.0
-"""Over which embankments and cuttings run out into the terrain."""
+"""Width over which embankments and cuttings blend into the terrain (m)."""
 REACH_M = SHOULDER_M + SLOPE_M
+"""Distance from the carriageway over which a street changes the terrain (m)."""
 STREAM_DEPTH_M = 5.0
 BED_M = 4.0
-"""Half width of a stream's flat bed."""
+"""Half width of a stream's flat bed (m)."""
 BANK_M = 8.0
-"""Width of each bank."""
+"""Width of each bank (m)."""
 SUNKEN_M = 3.6
-"""Half width of a sunken road."""
+"""Half width of a sunken road (m)."""
 CIRCLE_M, ISLAND_M = 15.0, 7.0
-"""Radius of a roundabout and of its island."""
+"""Radius of a roundabout and of its island (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """Terrain before anything was built."""
+    """The terrain without streets."""
 
     large: Waves
-    """Hills and valleys; street profiles follow these alone and are smooth therefore."""
+    """Hills and valleys (m). Street profiles follow only these, so they are smooth."""
     small: Waves
-    """Humps and hollows that streets are cut through."""
+    """Small humps and hollows (m), which streets cut through."""
     datum_m: float
     """Mean height of the world (m)."""
     grading: Waves
-    """By how much streets lie above or below the hills (m): embankments and cuttings."""
+    """Height of streets above or below the hills (m): embankments and cuttings."""
 
 
 def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankment_m: float = 0.0) -> Relief:
@@ -50,7 +51,7 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankme
     Parameters
     ----------
     seed : int
-        The world.
+        Seed of the world.
     slope : float
         Root mean square slope of the hills.
     roughness_m : float
@@ -58,14 +59,14 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankme
     datum_m : float
         Mean height of the world (m).
     embankment_m : float
-        Root mean square height of streets over or under the hills (m).
+        Root mean square height of streets above or below the hills (m).
     """
     rng = generator(seed, "relief")
     hills, humps = np.geomspace(320, 2400, 9), np.geomspace(25, 140, 10)
-    # All hills are equally steep, so the long ones are the high ones.
+    # All waves of the hills are equally steep, so amplitude is proportional to wavelength.
     heights = slope * hills / (2 * np.pi) * np.sqrt(2 / hills.size)
-    long_is_high = humps / np.sqrt(np.mean(humps**2))
-    bumps = roughness_m * long_is_high * np.sqrt(2 / humps.size)
+    relative = humps / np.sqrt(np.mean(humps**2))
+    bumps = roughness_m * relative * np.sqrt(2 / humps.size)
     shifts = np.geomspace(160, 500, 5)
     grading = waves(generator(seed, "grading"), shifts, embankment_m * np.sqrt(2 / shifts.size))
     return Relief(waves(rng, hills, heights), waves(rng, humps, bumps), datum_m, grading)
@@ -76,13 +77,13 @@ class Ground:
     """The noise-free ground at some points."""
 
     graded: Floats
-    """Height (m) of terrain and streets as if no stream had ever cut into them."""
+    """Height of terrain and streets without the cuts of streams (m)."""
     trough: Floats
-    """How deep a stream has cut into it (m)."""
+    """Depth of the cut of a stream or sunken road (m)."""
     edge: Floats
-    """Distance (m) to the nearest carriageway's edge, negative on the road, infinite far away."""
+    """Distance to the nearest carriageway's edge (m), negative on the road, infinite far away."""
     over: Floats
-    """The same without the sunken roads: what may lie on a bridge (m)."""
+    """Like ``edge``, without sunken roads (m): only these carriageways may lie on a bridge."""
 
     @property
     def bare(self) -> Floats:
@@ -91,12 +92,12 @@ class Ground:
 
     @property
     def deck(self) -> Bools:
-        """Where a bridge carries road and shoulder over a stream or a sunken road."""
+        """Cells of bridges, where road and shoulder cross a stream or a sunken road."""
         return (self.over < SHOULDER_M / 2) & (self.trough > 0)
 
     @property
     def height(self) -> Floats:
-        """Height of road and terrain with bridges (m): the truth."""
+        """True height of road and terrain with bridges (m)."""
         return np.where(self.deck, self.graded, self.bare)
 
     @property
@@ -107,29 +108,29 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Ways:
-    """What is cut into the terrain near some points."""
+    """Streets, streams and roundabouts near some points."""
 
     streets: Sequence[Street]
     streams: Sequence[Stream]
     circles: Sequence[tuple[float, float]] = ()
-    """Centres of roundabouts."""
+    """Centres of roundabouts in the plan's frame."""
     curb_m: float = 0.0
-    """Height of the pavement over the carriageway's edge."""
+    """Height of the pavement over the carriageway's edge (m)."""
 
 
 def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
     """Return the ground at points given in the plan's frame, in their shape.
 
-    A street lies at the height of the hills under its centre line, with a rounded crossfall. Near
-    streets weigh more than terrain, and where streets meet their heights are averaged with weights that
-    fade in, so neither kerb nor crossing makes a step.
+    A street has the height of the hills under its centre line, with a rounded crossfall. Its weight falls
+    smoothly from its edge into the terrain. Where streets meet, the weighted mean of their heights is used,
+    so there is no step at kerbs and crossings.
     """
     hills = land.large(x, y)
     blend = _Blend.of(hills)
     for street in ways.streets:
         near = _near(street, x, y)
         if near.any():
-            lift, beyond, edge = _levelled(street, land, x[near], y[near])
+            lift, beyond, edge = _street_lift(street, land, x[near], y[near])
             blend.add(near, hills[near] + lift, beyond, edge)
     for centre in ways.circles:
         away = np.hypot(x - centre[0], y - centre[1])
@@ -139,7 +140,7 @@ def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
     for stream in ways.streams:
         if stream.paved:
             beyond = stream.distance(x, y) - SUNKEN_M
-            # Streets pass over it on their own level.
+            # Streets cross the sunken road at their own height.
             blend.add(..., hills, beyond, beyond, 1 - blend.heaviest)
     graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
     if ways.curb_m:
@@ -149,7 +150,7 @@ def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
 
 @dataclass(frozen=True, eq=False)
 class _Blend:
-    """Heights of streets, weighted by how near they are; filled in place."""
+    """Sums of street heights weighted by proximity; updated in place."""
 
     total: Floats
     weights: Floats
@@ -175,16 +176,16 @@ class _Blend:
         self.edge[where] = np.minimum(self.edge[where], edge)
 
     def with_terrain(self, terrain: Floats) -> Floats:
-        wild = 1 - self.heaviest
-        blended: Floats = (self.total + wild * terrain) / (self.weights + wild)
+        rest = 1 - self.heaviest
+        blended: Floats = (self.total + rest * terrain) / (self.weights + rest)
         return blended
 
 
-def _levelled(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return by how much the street lifts the hills and the distances from its outer and any edge (m).
+def _street_lift(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return by how much a street raises the hills, and the distances to its outer and nearest edge (m).
 
-    Beyond the edge the lift stays that of the edge: were it level there too, a street that climbs away
-    from a crossing would first be pulled down to it.
+    Beyond the edge the height difference of the edge is kept. A level continuation would pull a street that
+    climbs away from a crossing down to the crossing's height.
     """
     along, distance = street.foot(x, y)
     beyond = distance - street.half_width_m
@@ -202,7 +203,7 @@ def _levelled(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Float
 
 
 def _pavement(edge: Floats) -> Floats:
-    """Return the curb's profile beside an edge: up at once, level, and out into the terrain."""
+    """Return the pavement's profile beside an edge, 0 to 1: a step up, level, then a slope down."""
     up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
     return up - down
 

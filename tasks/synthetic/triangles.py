@@ -1,4 +1,4 @@
-"""From a lattice of heights to the light mesh that photogrammetry delivers."""
+"""Triangle meshes: from a lattice of heights to a simplified mesh with floating fragments."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from flexroad.tasks.types import Bools, Floats
 
 Faces = NDArray[np.int32]
 FRAGMENT_M = (0.4, 1.5)
-"""Least and greatest radius of a floating piece."""
+"""Least and greatest radius of a floating fragment (m)."""
 RIM = 7
-"""Corners of a floating piece."""
+"""Number of corners of a floating fragment."""
 
 
 def lattice(eastings: Floats, northings: Floats, height: Floats, gap: Bools) -> tuple[Floats, Faces]:
-    """Return vertices ``(V, 3)`` and faces ``(F, 3)``, two a quad, counter-clockwise from above.
+    """Return vertices ``(V, 3)`` and faces ``(F, 3)``, two per quad, counter-clockwise from above.
 
     Parameters
     ----------
     eastings, northings : (W,) and (H,) array
-        Of the nodes; northings descend.
+        Coordinates of the nodes (m); northings descend.
     height, gap : (H, W) array
-        Of the nodes (m); quads with a node in a gap are left out.
+        Heights of the nodes (m), and nodes in gaps; quads with a node in a gap are left out.
     """
     x, y = np.meshgrid(eastings, northings)
     node = np.arange(height.size, dtype=np.int32).reshape(height.shape)
     nw, sw, se, ne = node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]
     quads = np.stack([nw, sw, se, nw, se, ne], axis=-1).reshape(-1, 2, 3)
-    there = ~gap.ravel()[quads].any(axis=(1, 2))
-    return np.column_stack([x.ravel(), y.ravel(), height.ravel()]), quads[there].reshape(-1, 3)
+    complete = ~gap.ravel()[quads].any(axis=(1, 2))
+    return np.column_stack([x.ravel(), y.ravel(), height.ravel()]), quads[complete].reshape(-1, 3)
 
 
 def simplified(vertices: Floats, faces: Faces, triangles: int) -> tuple[Floats, Faces]:
-    """Return a mesh with about as many triangles as asked for, large where the surface is plain.
+    """Return a mesh with about ``triangles`` triangles, large where the surface is flat.
 
-    Edges collapse in the order of the error they make (quadrics), as photogrammetry's programs do it.
-    Coordinates should be small: they become float32 on the way.
+    Edges are collapsed in the order of their error (quadrics), as in photogrammetry software. Coordinates
+    should be small, because they are converted to float32.
     """
     import pyvista as pv
 
@@ -47,7 +47,7 @@ def simplified(vertices: Floats, faces: Faces, triangles: int) -> tuple[Floats, 
 
 
 def fragments(centres: Floats, rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """Return small ragged pieces of surface around points ``(n, 3)``, seen from above."""
+    """Return small irregular pieces of surface around points ``(n, 3)``, facing up."""
     n = len(centres)
     radius = rng.uniform(*FRAGMENT_M, (n, 1)) * rng.uniform(0.6, 1.4, (n, RIM))
     turn = np.linspace(0, 2 * np.pi, RIM, endpoint=False) + rng.uniform(0, 2 * np.pi, (n, 1))

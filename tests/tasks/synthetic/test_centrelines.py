@@ -18,10 +18,10 @@ GRID = Grid("EPSG:25832", 295500, 5629500, 1.0, 200, 200)
         ("rural", SceneOptions(sunken_share=1.0, stream_share=0.0)),
     ],
 )
-def test_lines_as_wide_as_told_are_the_true_roads(stratum, options):
+def test_centre_lines_buffered_by_width_cover_true_roads(stratum, options):
     lines = centre_lines(GRID, 3, stratum, options)
     half = np.array([line.width_m for line in lines]) / 2
     road = cells(shapely.buffer([shapely.LineString(line.points) for line in lines], half), GRID)
     truth = make_scene(GRID, 3, stratum, options).reference_road
-    # Noses of medians and islands that streets run into are not told.
+    # The ends of medians and the islands of roundabouts are not represented.
     assert (road & truth).sum() / (road | truth).sum() > 0.93

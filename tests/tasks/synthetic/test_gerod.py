@@ -9,7 +9,7 @@ from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.synthetic.gerod import APART_M, PRESET, STRATA, survey
 
 
-def test_the_whole_survey_has_the_paper_s_strata():
+def test_survey_default_has_strata_of_paper():
     places = survey(seed=1)
     assert (
         Counter(stratum for _, _, stratum, _ in places)
@@ -19,13 +19,13 @@ def test_the_whole_survey_has_the_paper_s_strata():
     assert len({tile_id for tile_id, *_ in places}) == 240
 
 
-def test_a_quarter_hour_s_subset_is_stratified():
+def test_survey_24_tiles_is_stratified():
     assert Counter(stratum for _, _, stratum, _ in survey(24)) == {"urban": 17, "suburban": 2, "rural": 5}
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 300), st.integers(0, 5))
-def test_any_number_of_tiles_comes_in_the_paper_s_shares(tiles, seed):
+def test_survey_any_size_has_shares_of_paper(tiles, seed):
     places = survey(tiles, seed)
     assert len(places) == tiles
     counts = Counter(stratum for _, _, stratum, _ in places)
@@ -33,23 +33,23 @@ def test_any_number_of_tiles_comes_in_the_paper_s_shares(tiles, seed):
         assert abs(counts[stratum] - tiles * share / 240) < 1
 
 
-def test_a_subset_s_tiles_are_those_of_the_whole():
+def test_survey_smaller_is_subset_of_larger():
     whole = {tile_id: (grid, stratum, options) for tile_id, grid, stratum, options in survey(240, 3)}
     for tile_id, *rest in survey(24, 3):
         assert whole[tile_id] == tuple(rest)
     assert survey(24, 4)[0][3] != survey(24, 3)[0][3]
 
 
-def test_tiles_lie_on_the_absolute_grid_and_apart():
+def test_survey_tiles_lie_on_absolute_grid_and_apart():
     places = survey(240)
     corners = np.array([(grid.west, grid.south) for _, grid, _, _ in places])
     assert not (corners % 250).any()
     assert [tile_id for tile_id, *_ in places] == [f"{w:.0f}_{s:.0f}" for w, s in corners]
-    away = np.hypot(*(corners[:, None] - corners[None]).transpose(2, 0, 1))
-    assert away[away > 0].min() == APART_M
+    distance = np.hypot(*(corners[:, None] - corners[None]).transpose(2, 0, 1))
+    assert distance[distance > 0].min() == APART_M
 
 
-def test_tiles_differ_as_their_stratum_says():
+def test_survey_options_vary_around_those_of_stratum():
     for _, _, stratum, options in survey(240, 2):
         assert 0.8 * PRESET[stratum].block_m <= options.block_m <= 1.2 * PRESET[stratum].block_m
         assert options.mask_errors == PRESET[stratum].mask_errors
@@ -58,13 +58,13 @@ def test_tiles_differ_as_their_stratum_says():
 
 
 @pytest.mark.parametrize("stratum", STRATA)
-def test_every_stratum_has_what_its_tiles_are_known_for(stratum):
+def test_survey_scenes_have_plausible_road_share_and_height(stratum):
     tiles = [place for place in survey(60) if place[2] == stratum][:5]
-    made = [make_scene(grid, 0, name, options) for _, grid, name, options in tiles]
+    scenes = [make_scene(grid, 0, name, options) for _, grid, name, options in tiles]
     least, most = {"urban": (0.12, 0.35), "suburban": (0.08, 0.3), "rural": (0.03, 0.2)}[stratum]
-    for scene in made:
+    for scene in scenes:
         assert scene.stratum == stratum
         assert least < scene.reference_road.mean() < most
         assert np.isfinite(scene.dsm).all()
-    raised = np.mean([np.mean((s.dsm - s.reference)[~s.reference_road]) for s in made])
+    raised = np.mean([np.mean((s.dsm - s.reference)[~s.reference_road]) for s in scenes])
     assert {"urban": 1.2, "suburban": 0.8, "rural": 0.3}[stratum] < raised < 4

@@ -1,11 +1,11 @@
-"""The stand-in for DSC3D: its meshes show the scene, with the faults they say they have."""
+"""The stand-in for DSC3D: its meshes represent the scene with the configured faults."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.mesh.sample import orthophoto as seen_from_above
+from flexroad.tasks.acquire.mesh.sample import orthophoto as mesh_orthophoto
 from flexroad.tasks.acquire.mesh.sample import surface_heights
 from flexroad.tasks.synthetic import Kind
 from flexroad.tasks.synthetic.dsc3d import SITES, SIZE_M, survey
@@ -31,14 +31,14 @@ def height(scene):
     return surface_heights(scene.mesh, scene.surface.grid)
 
 
-def test_the_sites_span_what_the_paper_tells():
+def test_sites_span_ranges_of_paper():
     assert (min(s.triangles for s in SITES), max(s.triangles for s in SITES)) == (35_000, 101_000)
     assert (min(s.rise_m for s in SITES), max(s.rise_m for s in SITES)) == (4.5, 33.9)
     assert len({s.name for s in SITES}) == 5
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_scenes_rise_as_their_site_says(seed):
+def test_survey_scenes_have_rise_of_site(seed):
     from flexroad.tasks.synthetic import make_scene
 
     places = survey(seed=seed)
@@ -50,48 +50,48 @@ def test_scenes_rise_as_their_site_says(seed):
 
 
 @pytest.mark.slow
-def test_the_mesh_fills_its_square_with_so_many_triangles(scene, place):
+def test_mesh_fills_square_with_requested_triangles(scene, place):
     assert scene.mesh.bounds == pytest.approx(place.grid.bounds, abs=1e-6)
     assert place.grid.bounds[2] - place.grid.bounds[0] == SIZE_M
     assert 0.99 * place.site.triangles < len(scene.mesh.faces) <= place.site.triangles
 
 
 @pytest.mark.slow
-def test_away_from_faults_the_mesh_is_the_surface_but_for_bumps(scene, place, height):
+def test_mesh_away_from_faults_is_surface_plus_bumps(scene, place, height):
     faults, surface, made = place.site.faults, scene.surface.dsm, scene.reconstruction
     far = round(4 * faults.melt_m / scene.surface.grid.cell)
     free = ndimage.maximum_filter(surface - scene.surface.reference, 2 * far + 1) < 0.05
-    sound = free & ~ndimage.binary_dilation(made.open | made.bridged, iterations=far)
-    off = (height - surface)[sound & np.isfinite(height)]
-    assert off.size > 5_000
-    # Nine in ten: a few fragments float above.
-    kept = np.sort(np.abs(off))[: int(0.9 * off.size)]
+    intact = free & ~ndimage.binary_dilation(made.open | made.bridged, iterations=far)
+    error = (height - surface)[intact & np.isfinite(height)]
+    assert error.size > 5_000
+    # The best 90%: a few fragments float above.
+    kept = np.sort(np.abs(error))[: int(0.9 * error.size)]
     assert 0.3 * faults.bumps_m < np.sqrt(np.mean(kept**2)) < 1.2 * faults.bumps_m
-    assert abs(np.median(off)) < 0.02
+    assert abs(np.median(error)) < 0.02
     # Bumps are longer than a cell, unlike noise.
-    bumps = np.where(sound, made.height - surface, 0.0)
-    both = sound[:, 1:] & sound[:, :-1]
+    bumps = np.where(intact, made.height - surface, 0.0)
+    both = intact[:, 1:] & intact[:, :-1]
     assert np.corrcoef(bumps[:, 1:][both], bumps[:, :-1][both])[0, 1] > 0.6
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [Kind.BUILDING, Kind.PARKED_CAR, Kind.CROWN])
-def test_things_stand_on_the_ground_like_drops_of_wax(scene, height, kind):
+def test_mesh_objects_keep_height_and_lose_steep_walls(scene, height, kind):
     truth, cell = scene.surface, scene.surface.grid.cell
-    there = (truth.kind == kind) & np.isfinite(height)
-    raised = (height - truth.reference)[there]
-    assert there.sum() > 200
-    assert np.median(raised) > 0.4 * np.median((truth.dsm - truth.reference)[there])
-    # Their walls have become slopes: where it was steepest, it is far less steep.
+    cells = (truth.kind == kind) & np.isfinite(height)
+    raised = (height - truth.reference)[cells]
+    assert cells.sum() > 200
+    assert np.median(raised) > 0.4 * np.median((truth.dsm - truth.reference)[cells])
+    # Walls become slopes: the steepest cells are far less steep.
     before = np.hypot(*np.gradient(truth.dsm, cell))
     after = np.hypot(*np.gradient(scene.reconstruction.height, cell))
-    around = ndimage.binary_dilation(there, iterations=2) & ~scene.reconstruction.bridged
+    around = ndimage.binary_dilation(cells, iterations=2) & ~scene.reconstruction.bridged
     walls = around & (before > np.percentile(before[around], 90))
     assert np.median(after[walls]) < 0.8 * np.median(before[walls])
 
 
 @pytest.mark.slow
-def test_what_moved_leaves_a_ghost(scene):
+def test_reconstruct_moving_cars_lose_height(scene):
     truth, made = scene.surface, scene.reconstruction.height
     moved = truth.kind == Kind.MOVING_CAR
     assert moved.any()
@@ -99,7 +99,7 @@ def test_what_moved_leaves_a_ghost(scene):
 
 
 @pytest.mark.slow
-def test_holes_are_left_open_or_bridged(scene, height):
+def test_reconstruct_holes_are_open_or_bridged(scene, height):
     made = scene.reconstruction
     assert 0.001 < made.open.mean() < 0.1
     assert 0.005 < made.bridged.mean() < 0.15
@@ -111,17 +111,17 @@ def test_holes_are_left_open_or_bridged(scene, height):
     inner = np.s_[1:-1, 1:-1]
     closed = ~ndimage.binary_dilation(made.open, iterations=2)[inner]
     assert np.isfinite(height[inner][closed]).all()
-    # A sheet stays between the heights of its rim.
-    around = np.ones((3, 3))
-    holes, count = ndimage.label(made.bridged, around)
+    # The surface in a hole stays between the heights of its rim.
+    neighbours = np.ones((3, 3))
+    holes, count = ndimage.label(made.bridged, neighbours)
     for hole in range(1, count + 1):
-        rim = ndimage.binary_dilation(holes == hole, around) & ~made.bridged
+        rim = ndimage.binary_dilation(holes == hole, neighbours) & ~made.bridged
         z, low, high = made.height[holes == hole], made.height[rim].min(), made.height[rim].max()
         assert low - 0.01 <= z.min() <= z.max() <= high + 0.01
 
 
 @pytest.mark.slow
-def test_fragments_float_above_the_surface(scene, place):
+def test_mesh_fragments_float_above_surface(scene, place):
     pieces = place.site.faults.fragments
     count = 8 * pieces
     floating = scene.mesh.vertices[-count:].reshape(pieces, 8, 3)
@@ -130,19 +130,19 @@ def test_fragments_float_above_the_surface(scene, place):
 
 
 @pytest.mark.slow
-def test_the_texture_lies_the_right_way_round(scene, place):
-    photo = seen_from_above(scene.mesh, Grid.covering(place.grid.crs, place.grid.bounds, GSD_M))
-    made = orthophoto(place.grid, SEED, place.site.stratum, place.options, GSD_M).astype(float)
-    alike = [
+def test_texture_has_right_orientation(scene, place):
+    photo = mesh_orthophoto(scene.mesh, Grid.covering(place.grid.crs, place.grid.bounds, GSD_M))
+    expected = orthophoto(place.grid, SEED, place.site.stratum, place.options, GSD_M).astype(float)
+    correlations = [
         np.corrcoef(photo.colour[:, photo.known].ravel(), turned[:, photo.known].ravel())[0, 1]
-        for turned in (made, made[:, ::-1], made[:, :, ::-1], made.transpose(0, 2, 1))
+        for turned in (expected, expected[:, ::-1], expected[:, :, ::-1], expected.transpose(0, 2, 1))
     ]
-    assert alike[0] > 0.95
-    assert max(alike[1:]) < 0.7
+    assert correlations[0] > 0.95
+    assert max(correlations[1:]) < 0.7
 
 
 @pytest.mark.slow
-def test_equal_seeds_give_equal_scenes(scene, place):
+def test_photogrammetry_equal_seeds_give_equal_scenes(scene, place):
     again = photogrammetry(place, SEED)
     for name in ("vertices", "faces", "uv"):
         assert np.array_equal(getattr(again.mesh, name), getattr(scene.mesh, name)), name

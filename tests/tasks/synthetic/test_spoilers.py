@@ -1,4 +1,4 @@
-"""What spoils real tiles, one by one: each does what it says, to what it says, and to nothing else."""
+"""Each option of the spoilers changes what it describes, and nothing else."""
 
 from functools import lru_cache
 
@@ -17,27 +17,29 @@ from flexroad.tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M
 GRID = block(1)[0][1]
 QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0}
 INNER = np.s_[25:-25, 25:-25]
-"""Where all that is near is on the tile."""
+"""Cells whose neighbourhood lies on the tile."""
 EMPTY = {**QUIET, "density": 0, "mask_errors": 0, "stream_share": 0}
 
 
 @lru_cache
 def made(base: str = "empty", seed: int = 2, stratum: str = "urban", **options: float) -> Scene:
-    kept = EMPTY if base == "empty" else QUIET
-    return make_scene(GRID, seed, stratum, SceneOptions(**{**kept, **options}))
+    defaults = EMPTY if base == "empty" else QUIET
+    return make_scene(GRID, seed, stratum, SceneOptions(**{**defaults, **options}))
 
 
 @pytest.mark.parametrize("stratum", PRESET)
-def test_with_all_spoilers_the_truth_does_not_depend_on_the_cell_size(stratum):
+def test_all_spoilers_truth_does_not_depend_on_cell_size(stratum):
     fine = Grid(GRID.crs, GRID.west, GRID.north, 1.0, 240, 240)
-    coarse = Grid(GRID.crs, GRID.west, GRID.north, 3.0, 80, 80)  # centres are centres of the fine grid
-    one, three = (make_scene(grid, 3, stratum, PRESET[stratum]) for grid in (fine, coarse))
-    assert np.allclose(one.reference[1::3, 1::3], three.reference, atol=1e-6)
-    assert np.array_equal(one.reference_road[1::3, 1::3], three.reference_road)
+    coarse = Grid(
+        GRID.crs, GRID.west, GRID.north, 3.0, 80, 80
+    )  # its centres are also centres of the fine grid
+    fine_scene, coarse_scene = (make_scene(grid, 3, stratum, PRESET[stratum]) for grid in (fine, coarse))
+    assert np.allclose(fine_scene.reference[1::3, 1::3], coarse_scene.reference, atol=1e-6)
+    assert np.array_equal(fine_scene.reference_road[1::3, 1::3], coarse_scene.reference_road)
 
 
 @pytest.mark.parametrize("stratum", PRESET)
-def test_all_spoilers_together_only_raise_and_are_labelled(stratum):
+def test_all_spoilers_only_raise_and_have_a_kind(stratum):
     options = PRESET[stratum].model_copy(update={**QUIET, "rails": 0.5, "wires": 1, "car_parks": 0.5})
     scene = make_scene(GRID, 5, stratum, options)
     bare = np.isin(scene.kind, BARE)
@@ -46,7 +48,7 @@ def test_all_spoilers_together_only_raise_and_are_labelled(stratum):
     assert {Kind.PLANTS, Kind.WIRE, Kind.RAIL, Kind.MIXED} <= set(np.unique(scene.kind).tolist())
 
 
-def test_tiles_of_the_preset_join():
+def test_preset_neighbouring_tiles_join():
     west, east = GRID, block(2)[1][1]
     both = make_scene(Grid(GRID.crs, GRID.west, GRID.north, 1.0, 500, 250), 4, "urban", PRESET["urban"])
     for half, tile in ((slice(0, 250), west), (slice(250, 500), east)):
@@ -56,7 +58,7 @@ def test_tiles_of_the_preset_join():
         assert np.mean(part.road_mask != both.road_mask[:, half]) < 1e-4
 
 
-def test_curbs_lift_the_pavement_and_leave_the_carriageway():
+def test_curb_raises_pavement_only():
     flat, curbed = made(), made(curb_m=0.12)
     lift = curbed.reference - flat.reference
     away = distance_transform_edt(~flat.reference_road)
@@ -66,7 +68,7 @@ def test_curbs_lift_the_pavement_and_leave_the_carriageway():
     assert np.array_equal(flat.reference_road, curbed.reference_road)
 
 
-def test_embankments_move_streets_and_leave_the_open_land():
+def test_embankment_changes_streets_only():
     level, banked = made(), made(embankment_m=2)
     lift = banked.reference - level.reference
     away = distance_transform_edt(~level.reference_road)
@@ -77,8 +79,8 @@ def test_embankments_move_streets_and_leave_the_open_land():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_cross_slope_makes_no_step(seed):
-    """Neither where streets meet nor where one ends: there its two sides differ most."""
+def test_cross_slope_has_no_step(seed):
+    """No step where streets meet, or at a dead end, where the two sides differ most."""
     level, leaning = (made(seed=seed, stratum="rural", cross_slope=slope) for slope in (0, 0.08))
     lift = leaning.reference - level.reference
     assert np.abs(lift).max() > 0.05
@@ -86,42 +88,42 @@ def test_cross_slope_makes_no_step(seed):
         assert np.abs(np.diff(lift, axis=axis)).max() < 0.25
 
 
-def test_dual_carriageways_have_a_strip_that_is_no_road():
-    one, two = made(), made(medians=1)
-    assert two.reference_road.sum() > one.reference_road.sum()
-    strips = made(medians=1).reference_road < binary_dilation(two.reference_road, iterations=2)
-    inside = strips & (distance_transform_edt(~one.reference_road) == 0)
+def test_median_is_no_road():
+    single, dual = made(), made(medians=1)
+    assert dual.reference_road.sum() > single.reference_road.sum()
+    strips = made(medians=1).reference_road < binary_dilation(dual.reference_road, iterations=2)
+    inside = strips & (distance_transform_edt(~single.reference_road) == 0)
     assert inside.sum() > 200
 
 
-def test_roundabouts_have_a_ring_and_an_island():
+def test_roundabout_has_ring_and_island():
     plan = Plan(2, 100.0, 0.0, "urban", roundabouts=1)
     scene = made(roundabouts=1)
     x, y = plan.from_map(*np.meshgrid(GRID.eastings, GRID.northings))
-    found = 0
+    island_cells = 0
     box = (x.min(), y.min(), x.max(), y.max())
     for cx, cy in plan.circles(box, 0):
         away = np.hypot(x - cx, y - cy)
-        found += (away < ISLAND_M).sum()
+        island_cells += (away < ISLAND_M).sum()
         assert not scene.reference_road[away < ISLAND_M].any()
         assert scene.reference_road[(away > ISLAND_M) & (away < CIRCLE_M)].all()
-    assert found > 100
+    assert island_cells > 100
 
 
-def test_streets_cross_sunken_roads_on_bridges():
+def test_sunken_road_is_crossed_on_bridges():
     scene = made(sunken_share=1)
     deck = scene.kind == Kind.DECK
     over = scene.reference - scene.dtm
     assert deck.sum() > 50
     assert over[deck].max() > 4
-    # The sunken road runs on to both sides of the bridge, 5 m below.
+    # The sunken road continues on both sides of the bridge, 5 m below.
     without = made()
     below = scene.reference_road & ~without.reference_road & ~deck
     assert below.sum() > 200
     assert np.median((without.reference - scene.reference)[below]) > 3.5
 
 
-def test_rails_and_wires_are_thin_and_as_high_as_they_should_be():
+def test_rails_and_wires_are_thin_and_have_their_height():
     railed, wired = made(density=1, rails=1, trees=0), made(density=1, wires=1, trees=0)
     height = railed.dsm - railed.reference
     rail, wire = railed.kind == Kind.RAIL, wired.kind == Kind.WIRE
@@ -133,7 +135,7 @@ def test_rails_and_wires_are_thin_and_as_high_as_they_should_be():
     assert not minimum_filter(rail, 3).any()
 
 
-def test_mixed_cells_lie_between_top_and_foot():
+def test_mixed_cells_lie_between_foot_and_top():
     sharp, mixed = made("quiet"), made("quiet", mixed=0.5)
     changed = sharp.dsm != mixed.dsm
     low, high = minimum_filter(sharp.dsm, 3), maximum_filter(sharp.dsm, 3)
@@ -144,7 +146,7 @@ def test_mixed_cells_lie_between_top_and_foot():
     assert not changed[INNER][(high - low)[INNER] < 1.5].any()
 
 
-def test_low_growth_keeps_off_the_road():
+def test_growth_is_off_the_road():
     scene = made("quiet", stratum="rural", growth_m=0.6)
     plants = scene.kind == Kind.PLANTS
     assert plants.mean() > 0.1
@@ -152,7 +154,7 @@ def test_low_growth_keeps_off_the_road():
     assert 0.1 < np.mean((scene.dsm - scene.reference)[plants]) < 0.6
 
 
-def test_scars_lie_under_houses_only():
+def test_scars_are_under_houses_only():
     whole, scarred = made("quiet"), made("quiet", scars_m=0.5)
     off = np.abs(scarred.dtm - whole.dtm)
     assert np.array_equal(whole.dsm, scarred.dsm)
@@ -161,7 +163,7 @@ def test_scars_lie_under_houses_only():
     assert 0.1 < off[whole.kind == Kind.BUILDING].mean() < 1
 
 
-def test_car_parks_and_fields_are_taken_for_road():
+def test_car_parks_and_fields_are_partly_in_road_mask():
     parks, fields = made("quiet", car_parks=1), made("quiet", stratum="rural", fields=1)
     for scene, kind in ((parks, Kind.PAVED), (fields, Kind.FIELD)):
         area = scene.kind == kind
@@ -171,7 +173,7 @@ def test_car_parks_and_fields_are_taken_for_road():
     assert (parks.kind == Kind.PARKED_CAR).sum() > (made("quiet").kind == Kind.PARKED_CAR).sum()
 
 
-def test_roofs_are_taken_for_road():
+def test_false_roofs_are_in_road_mask():
     right, wrong = made("quiet"), made("quiet", false_roofs=1)
     roofs = right.kind == Kind.BUILDING
     assert right.road_mask[roofs].mean() < 0.1
@@ -179,7 +181,7 @@ def test_roofs_are_taken_for_road():
     assert np.array_equal(right.dsm, wrong.dsm)
 
 
-def test_towers_overhang_and_storeys_change_the_roofs():
+def test_towers_overhang_and_storeys_change_roofs():
     plain = made("quiet", trees=0)
     assert np.max(made("quiet", trees=0, towers=1).dsm - plain.reference) > 25
     eaves = made("quiet", trees=0, overhang_m=1)
@@ -190,11 +192,11 @@ def test_towers_overhang_and_storeys_change_the_roofs():
     assert 0.4 < ratio < 0.75
 
 
-def test_traces_of_nothing_are_nothing():
+def test_rails_and_wires_without_streets_are_empty():
     from flexroad.tasks.synthetic.linework import rails, wires
 
-    def nowhere(x, y):
-        raise AssertionError("no ground is asked for")
+    def unused(x, y):
+        raise AssertionError("the ground is not needed")
 
-    assert rails([], 0, nowhere, 1).x.size == wires([], 0, nowhere, 1).x.size == 0
+    assert rails([], 0, unused, 1).x.size == wires([], 0, unused, 1).x.size == 0
     assert generator(1, "a", 2).random() == generator(1, "a", 2).random()
