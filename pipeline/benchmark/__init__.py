@@ -1,1 +1,1 @@
-"""Made surveys with known truth, written as rasters and a catalog."""
+"""Synthetic surveys with known truth, written as rasters and a catalog."""

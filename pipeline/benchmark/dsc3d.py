@@ -1,8 +1,8 @@
-"""Write the stand-in for DSC3D: made meshes, and what ``prepare mesh`` makes of them, in two catalogs.
+"""Write the stand-in for DSC3D: synthetic meshes and the rasters of ``prepare mesh``, in two catalogs.
 
-A scene's folder holds ``mesh.glb``, what is known of it (``known/<layer>/<scene>.tif``), and the rasters and
-the catalog of its own that ``prepare mesh`` writes. Above them ``catalog.parquet`` lists all scenes with the
-reference that the paper describes, and ``catalog_true.parquet`` the same with the truth.
+The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the rasters
+and catalog that ``prepare mesh`` writes. In the folder above, ``catalog.parquet`` lists all scenes with the
+reference that the paper describes, and ``catalog_true.parquet`` lists them with the true reference.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from flexroad.tasks.synthetic.dsc3d import Place
 from flexroad.tasks.synthetic.photogrammetry import photogrammetry
 
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
-"""The same command gives the same files."""
+"""Date of the data; fixed, so that the same command writes the same files."""
 NAME = "synthetic photogrammetry, stand-in for DSC3D, seed {}"
 TRUE = "true reference"
 KNOWN = "known"
-"""Folder of a scene's truth and of the road mask with the errors of a segmentation."""
+"""Folder of a scene's true layers and of its road mask with the errors of a segmentation."""
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One scene to make."""
+    """One scene to write."""
 
     folder: str
     place: Place
@@ -38,32 +38,34 @@ class _Job:
 
 
 def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Executor | None = None) -> Path:
-    """Make the scenes and their rasters; return the path of the catalog with the paper's reference.
+    """Write the scenes and their rasters; return the path of the catalog with the paper's reference.
 
     Parameters
     ----------
     folder : Path
-        Where they are written.
+        Output folder.
     scenes : int, optional
-        How many; by default all five.
+        Number of scenes; all five if None.
     seed : int
-        The world.
+        Seed of the world.
     executor : Executor, optional
-        Where the scenes are made; by default in this process.
+        Executor of the scenes; this process if None.
 
     Raises
     ------
     ConfigError
-        If there are not so many scenes, one fails, or the folder cannot be written.
+        If ``scenes`` is too large, a scene fails, or the folder cannot be written.
     """
-    most = len(dsc3d.SITES)
-    if scenes is not None and scenes > most:
-        raise ConfigError(f"--tiles {scenes}: dsc3d has {most} scenes; leave it out for all")
-    places = dsc3d.survey(scenes or most, seed)
+    available = len(dsc3d.SITES)
+    if scenes is not None and scenes > available:
+        raise ConfigError(
+            f"--tiles {scenes}: dsc3d has {available} scenes; leave --tiles out for all of them"
+        )
+    places = dsc3d.survey(scenes or available, seed)
     jobs = [_Job(str(folder), place, seed) for place in places]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for error in (executor or SerialExecutor()).map(_write_scene, jobs, _lost):
+        for error in (executor or SerialExecutor()).map(_write_scene, jobs, _failure):
             if error:
                 raise ConfigError(error)
         tiles = [_tile(folder, place) for place in places]
@@ -79,28 +81,28 @@ def _write_scene(job: _Job) -> str:
     from flexroad.pipeline.prepare.options import PrepareOptions
 
     scene = photogrammetry(job.place, job.seed)
-    home = Path(job.folder) / scene.name
+    folder = Path(job.folder) / scene.name
     truth = scene.truth
-    known = {
+    layers = {
         "road_mask": truth.road_mask,
         "reference": truth.reference,
         "reference_road": truth.reference_road,
     }
     name = NAME.format(job.seed)
-    prepared.write_tile(home / KNOWN, scene.name, truth.grid, known, truth.stratum, MADE, name)
-    write(home / "mesh.glb", glb.encode(scene.mesh))
-    roads = home / KNOWN / "road_mask" / f"{scene.name}.tif"
+    prepared.write_tile(folder / KNOWN, scene.name, truth.grid, layers, truth.stratum, MADE, name)
+    write(folder / "mesh.glb", glb.encode(scene.mesh))
+    roads = folder / KNOWN / "road_mask" / f"{scene.name}.tif"
     options = PrepareOptions(roads=roads, date=MADE, dataset=name)
-    prepare_mesh(home / "mesh.glb", home, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
+    prepare_mesh(folder / "mesh.glb", folder, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
     return ""
 
 
-def _lost(job: _Job, why: str) -> str:
-    return f"scene {job.place.site.name}: {why}"
+def _failure(job: _Job, reason: str) -> str:
+    return f"scene {job.place.site.name}: {reason}"
 
 
 def _tile(folder: Path, place: Place) -> Tile:
-    """Return a scene's tile as one of the catalog above its folder."""
+    """Return the tile of a scene with paths relative to the folder above."""
     name = place.site.name
     (tile,) = Catalog.read(folder / name / "catalog.parquet").tiles
     layers = tuple(
@@ -112,7 +114,7 @@ def _tile(folder: Path, place: Place) -> Tile:
 
 
 def _with_truth(tile: Tile, seed: int) -> Tile:
-    """Return the tile with the truth as reference of heights and roads."""
+    """Return the tile with the true heights and roads as reference."""
     layers = tuple(
         Layer(layer.name, (f"{tile.id}/{KNOWN}/{layer.name}/{tile.id}.tif",))
         if layer.name in ("reference", "reference_road")

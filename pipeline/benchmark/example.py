@@ -1,4 +1,4 @@
-"""A small made scene as a Dataset, for examples and first tries."""
+"""A small synthetic scene as a Dataset, for examples."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ WEST_M, SOUTH_M = 500_200, 5_600_000
 
 
 def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
-    """Make the rasters of one area, with streets, houses, trees, cars and known truth.
+    """Return the rasters of a synthetic area with streets, houses, trees, cars and known truth.
 
     Parameters
     ----------
     seed : int
-        The world; 0 or more.
+        Seed of the scene, 0 or more.
     size_m : int
         Side of the area (m), 60 to 1000; cells are 1 m.
 
     Returns
     -------
     xarray.Dataset, (y, x)
-        ``dsm`` and ``dtm`` (m) and ``road_mask`` as a survey delivers them, with noise, holes and errors;
-        ``reference``, the true height of road and terrain (m). ``.rio.crs`` is EPSG:25832.
+        ``dsm`` and ``dtm`` (m) and ``road_mask``, with the noise and errors of a survey; ``reference``, the
+        true height of road and terrain (m). ``.rio.crs`` is EPSG:25832.
 
     Raises
     ------
@@ -45,11 +45,11 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     >>> list(scene.data_vars), dict(scene.sizes)
     (['dsm', 'dtm', 'road_mask', 'reference'], {'y': 60, 'x': 60})
     """
-    import rioxarray  # noqa: F401 (gives datasets their .rio)
+    import rioxarray  # noqa: F401 (adds .rio to datasets)
     import xarray as xr
 
     if seed < 0 or not 60 <= size_m <= 1000:
-        raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 60 to 1000 m")
+        raise ConfigError(f"seed {seed}, size_m {size_m}: the seed must be 0 or more, the size 60 to 1000 m")
     grid = Grid(CRS, WEST_M, SOUTH_M + size_m, 1.0, size_m, size_m)
     layers = make_scene(grid, seed).layers
     scene = xr.Dataset(
@@ -57,5 +57,5 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
         coords={"x": grid.eastings, "y": grid.northings},
         attrs={"title": f"made scene, seed {seed}"},
     )
-    placed: xr.Dataset = scene.rio.write_crs(grid.crs)
-    return placed
+    with_crs: xr.Dataset = scene.rio.write_crs(grid.crs)
+    return with_crs

@@ -1,4 +1,4 @@
-"""Write scenes of known truth as a prepared folder and its catalog."""
+"""Write synthetic scenes with known truth as a prepared folder and its catalog."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_sce
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tasks.synthetic.orthophoto import orthophoto
 
-WORTH_PROCESSES = 12
-"""Tiles from which on starting worker processes pays."""
+PARALLEL_FROM = 12
+"""Number of tiles from which worker processes are started."""
 PRESETS = ("gerod", "dsc3d")
 TILES, SIZE_M = 4, 250
-"""Number and side (m) of the tiles where nothing else is asked for."""
+"""Default number and side (m) of the tiles."""
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
-"""The made worlds' date: the same command gives the same files."""
+"""Date of the data; fixed, so that the same command writes the same files."""
 
 
 @dataclass(frozen=True)
 class SceneJob:
-    """One tile to make."""
+    """One tile to write."""
 
     folder: str
     tile_id: str
@@ -40,8 +40,9 @@ class SceneJob:
     """None for a mix of districts."""
     options: SceneOptions
     name: str
-    """What reports call the data."""
+    """Name of the dataset."""
     dop: bool
+    """Whether to write an orthophoto."""
 
 
 def write_scenes(
@@ -52,22 +53,22 @@ def write_scenes(
     dop: bool = False,
     preset: str | None = None,
 ) -> Path:
-    """Make tiles, a block of neighbours or those of a preset; return the path of their catalog.
+    """Write a block of neighbouring tiles, or the tiles of a preset; return the path of their catalog.
 
     Parameters
     ----------
     folder : Path
-        Where they are written.
+        Output folder.
     tiles : int, optional
-        How many; by default 4, or all of the preset.
+        Number of tiles; if None, 4, or all of the preset.
     seed : int
-        The world.
+        Seed of the world.
     size_m : int, optional
-        Side of a tile (m); 250 by default. A preset's tiles have their own.
+        Side of a tile (m); 250 if None. The size of a preset's tiles is fixed.
     dop : bool
-        Whether orthophotos are made, too; the preset dsc3d always has them.
+        Whether to write orthophotos; the preset dsc3d always has them.
     preset : str, optional
-        One of `PRESETS`.
+        One of `PRESETS`; None for a block of neighbouring tiles.
 
     Raises
     ------
@@ -77,18 +78,17 @@ def write_scenes(
     if preset == "dsc3d" and size_m in (None, dsc3d.SIZE_M):
         return write_stand_in(folder, tiles, seed)
     jobs = _jobs(folder, tiles, seed, size_m, dop, preset)
-    executor: Executor = DaskExecutor() if len(jobs) >= WORTH_PROCESSES else SerialExecutor()
+    executor: Executor = DaskExecutor() if len(jobs) >= PARALLEL_FROM else SerialExecutor()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for error in executor.map(_write_scene, jobs, _lost):
+        for error in executor.map(_write_scene, jobs, _failure):
             if error:
                 raise ConfigError(error)
         path = folder / "catalog.parquet"
-        wanted = {job.tile_id for job in jobs}
-        found = prepared.index(folder)
-        # A folder may hold more tiles than were asked for now.
-        kept = [tile for tile in found if tile.id in wanted]
-        Catalog(_with_roads(folder / "roads.gpkg", jobs, kept)).write(path)
+        written = {job.tile_id for job in jobs}
+        # The folder may also contain tiles of an earlier call.
+        tiles_written = [tile for tile in prepared.index(folder) if tile.id in written]
+        Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written)).write(path)
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
     return path
@@ -98,14 +98,16 @@ def _jobs(
     folder: Path, tiles: int | None, seed: int, size_m: int | None, dop: bool, preset: str | None
 ) -> list[SceneJob]:
     if preset is None:
-        name, plain = f"synthetic, seed {seed}", SceneOptions()
-        places = [(*place, None, plain) for place in block(tiles or TILES, size_m or SIZE_M)]
-        return [SceneJob(str(folder), t, grid, seed, s, o, name, dop) for t, grid, s, o in places]
+        name, options = f"synthetic, seed {seed}", SceneOptions()
+        return [
+            SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop)
+            for tile_id, grid in block(tiles or TILES, size_m or SIZE_M)
+        ]
     if preset not in PRESETS:
-        raise ConfigError(f"--preset {preset}: there is {', '.join(PRESETS)}")
+        raise ConfigError(f"--preset {preset}: unknown, there are {', '.join(PRESETS)}")
     own_m = {"gerod": gerod.SIZE_M, "dsc3d": dsc3d.SIZE_M}[preset]
     if size_m not in (None, own_m):
-        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave it out")
+        raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave --tile-size out")
     name = f"synthetic benchmark {preset}, seed {seed}"
     return [
         SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop)
@@ -114,17 +116,17 @@ def _jobs(
 
 
 def _write_scene(job: SceneJob) -> str:
-    asked = (job.grid, job.seed, job.stratum, job.options)
-    scene = make_scene(*asked)
-    layers = {**scene.layers, **({"dop": orthophoto(*asked)} if job.dop else {})}
+    arguments = (job.grid, job.seed, job.stratum, job.options)
+    scene = make_scene(*arguments)
+    layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
     prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, job.name)
     return ""
 
 
 def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
-    """Write the centre lines of all scenes into one file; return the tiles that name it."""
+    """Write the centre lines of all scenes to one file; return the tiles with it as layer ``roads``."""
     path.unlink(missing_ok=True)
-    # Neighbours of one world share their streets: by their places each line is written once.
+    # Neighbouring tiles share streets; equal lines are written once.
     lines = {
         line.points.tobytes(): line
         for job in jobs
@@ -144,7 +146,7 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
     columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
-        with _dated():
+        with _fixed_date():
             geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs).to_file(temporary, layer="roads")
         temporary.replace(path)
     finally:
@@ -152,8 +154,8 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
 
 
 @contextlib.contextmanager
-def _dated() -> Iterator[None]:
-    """Let GDAL write the made worlds' date instead of now."""
+def _fixed_date() -> Iterator[None]:
+    """Set the date that GDAL writes to `MADE`."""
     import pyogrio
 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{MADE:%Y-%m-%dT%H:%M:%SZ}"})
@@ -163,5 +165,5 @@ def _dated() -> Iterator[None]:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
-def _lost(job: SceneJob, why: str) -> str:
-    return f"scene {job.tile_id}: {why}"
+def _failure(job: SceneJob, reason: str) -> str:
+    return f"scene {job.tile_id}: {reason}"

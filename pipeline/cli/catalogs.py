@@ -14,18 +14,20 @@ from flexroad.pipeline.cli.run import next_run
 if TYPE_CHECKING:
     from flexroad.catalog.tiling import TilingResult
 
-catalogs = typer.Typer(no_args_is_help=True, help="Make and show catalogs: which tiles there are.")
+catalogs = typer.Typer(no_args_is_help=True, help="Make, show and check catalogs of tiles.")
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")]
 RoadValue = Annotated[
-    list[int] | None, typer.Option(help="Values of the mask that mean road; default: all but 0.")
+    list[int] | None, typer.Option(help="Values of the mask that mean road; default: all except 0.")
 ]
 Roads = Annotated[
     str | None, typer.Option(help="Vector files of roads: a file, or a pattern relative to ROOT.")
 ]
 TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
-MinCover = Annotated[float, typer.Option(min=0, max=1, help="Leave out tiles covered less.")]
-Date = Annotated[datetime | None, typer.Option(help="When the data was taken.")]
+MinCover = Annotated[
+    float, typer.Option(min=0, max=1, help="Leave out tiles with less than this fraction of data.")
+]
+Date = Annotated[datetime | None, typer.Option(help="Date of the survey.")]
 
 
 @catalogs.command("rasters", cls=Command)
@@ -38,17 +40,21 @@ def catalog_rasters(
     road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    reference: Annotated[str | None, typer.Option(help="Files of true heights, for the evaluation.")] = None,
-    reference_road: Annotated[str | None, typer.Option(help="Files of the true road mask.")] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="Files of reference heights, for the evaluation.")
+    ] = None,
+    reference_road: Annotated[
+        str | None, typer.Option(help="Files of the reference road mask, for the evaluation.")
+    ] = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = 0.25,
     date: Date = None,
-    crs: Annotated[str | None, typer.Option(help="CRS of files that carry none: EPSG:25832.")] = None,
+    crs: Annotated[str | None, typer.Option(help="CRS of files without one: EPSG:25832.")] = None,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
     from flexroad.catalog.sources import rasters
 
-    asked = {
+    patterns = {
         "dsm": dsm,
         "dtm": dtm,
         "dop": dop,
@@ -57,21 +63,21 @@ def catalog_rasters(
         "reference_road": reference_road,
         "roads": roads,
     }
-    found = rasters.index(
+    result = rasters.index(
         root,
-        {name: pattern for name, pattern in asked.items() if pattern is not None},
+        {name: pattern for name, pattern in patterns.items() if pattern is not None},
         road_values=tuple(road_value or ()),
         tile_size_m=tile_size,
         date=date,
         crs=crs,
         min_cover=min_cover,
     )
-    _write_catalog(found, output)
+    _write_catalog(result, output)
 
 
 @catalogs.command("nrw", cls=Command)
 def catalog_nrw(
-    root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads, under their own names.")],
+    root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads with their original names.")],
     output: Output,
     road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
     road_value: RoadValue = None,
@@ -83,7 +89,7 @@ def catalog_nrw(
     """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
     from flexroad.catalog.sources import nrw
 
-    found = nrw.index(
+    result = nrw.index(
         root,
         road_mask=road_mask,
         road_values=tuple(road_value or ()),
@@ -93,7 +99,7 @@ def catalog_nrw(
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
     )
-    _write_catalog(found, output)
+    _write_catalog(result, output)
 
 
 @catalogs.command("gerod")
@@ -101,7 +107,7 @@ def catalog_gerod(
     root: Annotated[Path, typer.Argument(help="Folder of the paper's GeRoD dataset.")],
     output: Output,
     layout: Annotated[
-        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+        str, typer.Option(help="Configuration whose `dataset` gives the file names.")
     ] = "gerod",
     date: Date = None,
 ) -> None:
@@ -117,7 +123,7 @@ def catalog_dsc3d(
     root: Annotated[Path, typer.Argument(help="Folder of rasters of DSC3D's scenes.")],
     output: Output,
     layout: Annotated[
-        str, typer.Option(help="Configuration whose `dataset` tells the files' names.")
+        str, typer.Option(help="Configuration whose `dataset` gives the file names.")
     ] = "dsc3d",
     date: Date = None,
 ) -> None:
@@ -128,12 +134,12 @@ def catalog_dsc3d(
     _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
 
 
-def _write_catalog(found: TilingResult, output: Path) -> None:
+def _write_catalog(result: TilingResult, output: Path) -> None:
     from flexroad.catalog import Catalog
 
-    for note in found.notes:
+    for note in result.notes:
         typer.echo(f"note: {note}", err=True)
-    catalog = Catalog(found.tiles)
+    catalog = Catalog(result.tiles)
     catalog.write(output)
     typer.echo(f"{len(catalog.tiles)} tiles in {output}")
     typer.echo(f"next: {next_run(output)}")
@@ -145,17 +151,17 @@ def catalog_synthetic(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="gerod: independent tiles like the paper's 240; dsc3d: five meshes; default: neighbours."
+            help="gerod: separate tiles as in the paper; dsc3d: five meshes; default: adjacent tiles."
         ),
     ] = None,
     tiles: Annotated[
         int | None, typer.Option(min=1, help="Number of tiles; default: 4, or all of the preset.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same scenes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the scenes.")] = 0,
     tile_size: Annotated[int | None, typer.Option(min=10, help="Size of a tile in m; default: 250.")] = None,
-    dop: Annotated[bool, typer.Option("--dop", help="Orthophotos of 0.5 m, too.")] = False,
+    dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:
-    """Make scenes with known truth: rasters, truth and a catalog."""
+    """Make synthetic scenes: survey rasters, reference rasters and a catalog."""
     from flexroad.catalog import Catalog
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
@@ -172,16 +178,16 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
     catalog = Catalog.read(path)
     for tile in catalog.tiles:
         layers = " ".join(f"{layer.name}({len(layer.files)})" for layer in tile.layers)
-        when = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
+        date = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
         size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
-        typer.echo(f"{tile.id}  {size}  {when}  {tile.stratum or '-'}  {layers}")
+        typer.echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.tiles})
     typer.echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
 
 
 @catalogs.command("check")
 def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
-    """Look a catalog over: layers, missing files, and how far the photo lies off the heights."""
+    """Check a catalog: layers, missing files, and the shift between photo and heights."""
     from flexroad.catalog import Catalog
     from flexroad.pipeline.inspect.catalog import check
 

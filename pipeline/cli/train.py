@@ -1,4 +1,4 @@
-"""``flexroad train``: the model of a segmenter that learns, from labels of one's own."""
+"""``flexroad train``: train the model of a segmenter on labelled tiles."""
 
 from __future__ import annotations
 
@@ -13,34 +13,37 @@ def train(
     catalog: Annotated[Path, typer.Argument(metavar="CATALOG")],
     method: Annotated[
         Literal["pixels", "dinov2"],
-        typer.Option(help="pixels: trees on cells, in seconds, with or without photo; dinov2: on the photo."),
+        typer.Option(
+            help="pixels: decision trees on heights and, if available, photo; dinov2: on the photo."
+        ),
     ],
     labels: Annotated[
         Literal["mask", "vector"],
-        typer.Option(help="mask: the catalog's true road or road mask; vector: its roads as lines or areas."),
+        typer.Option(help="mask: the catalog's reference road or road mask; vector: its vector roads."),
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="MODEL", help="File to write, its report beside it.")
+        Path,
+        typer.Option("-o", "--output", metavar="MODEL", help="Model file; the report is written beside it."),
     ],
     config: Annotated[
-        str, typer.Option(help="Configuration whose options of load and segment are used.")
+        str, typer.Option(help="Configuration with the options of load and segment.")
     ] = "paper",
     validation: Annotated[
-        float, typer.Option(min=0.05, max=0.9, help="Share of the tiles to judge by: one block apart.")
+        float, typer.Option(min=0.05, max=0.9, help="Fraction of the tiles for validation.")
     ] = 0.3,
     gap_m: Annotated[
-        float, typer.Option("--gap-m", min=0, help="Learn from no cell nearer to those tiles (m).")
+        float, typer.Option("--gap-m", min=0, help="Distance of training cells from validation tiles (m).")
     ] = 50.0,
     ignore_m: Annotated[
-        float, typer.Option("--ignore-m", min=0, help="Learn from no cell nearer to an edge of labels (m).")
+        float, typer.Option("--ignore-m", min=0, help="Distance of training cells from edges of labels (m).")
     ] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same split and model.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the split and of the training.")] = 0,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the method's training; repeatable."),
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of the method's training; repeatable."),
     ] = None,
 ) -> None:
-    """Train a segmenter on labelled tiles and judge it on others: MODEL, MODEL.html, MODEL.json."""
+    """Train a segmenter on labelled tiles and validate it on others; write MODEL, MODEL.html, MODEL.json."""
     from flexroad.catalog import Catalog
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
@@ -49,12 +52,12 @@ def train(
     from flexroad.pipeline.training.train import TrainOptions, train
     from flexroad.tasks.errors import TaskError
 
-    asked = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
-    found, chosen = Catalog.read(catalog), load_config(config)
+    options = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
+    tiles, loaded_config = Catalog.read(catalog), load_config(config)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)
     try:
-        outcome = train(found, chosen, asked, lambda line: typer.echo(line, err=True))
+        outcome = train(tiles, loaded_config, options, lambda line: typer.echo(line, err=True))
         model, page, _ = write_model(outcome, output)
     except TaskError as error:
         raise ConfigError(str(error)) from error
@@ -65,19 +68,19 @@ def train(
     typer.echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
 
 
-def _settings(words: list[str]) -> dict[str, Any]:
-    """Return settings by name; values are read as YAML has them."""
+def _settings(assignments: list[str]) -> dict[str, Any]:
+    """Return the settings by name; values are parsed as YAML."""
     import yaml
 
     from flexroad.pipeline.errors import ConfigError
 
-    found: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
+    parsed: dict[str, Any] = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
         try:
-            found[name] = yaml.safe_load(value)
+            parsed[name] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise ConfigError(f"--set {word}: not readable as NAME=VALUE") from error
+            raise ConfigError(f"--set {assignment}: not readable as NAME=VALUE") from error
         if not equals:
-            raise ConfigError(f"--set {word}: give NAME=VALUE, like --set rounds=100")
-    return found
+            raise ConfigError(f"--set {assignment}: give NAME=VALUE, like --set rounds=100")
+    return parsed

@@ -69,7 +69,7 @@ def _figures(quality: Quality) -> dict[str, float]:
 
 
 def _page(outcome: Outcome, name: str) -> str:
-    asked, split = outcome.asked, outcome.split
+    asked, split = outcome.options, outcome.split
     rows = [("all cells", outcome.quality), (f"{asked.ignore_m:g} m off label edges", outcome.inner)]
     overall = pd.DataFrame([{"cells": what} | _figures(quality) for what, quality in rows])
     per_tile = pd.DataFrame(
@@ -96,7 +96,7 @@ def _page(outcome: Outcome, name: str) -> str:
 
 
 def _lines(outcome: Outcome, count: str) -> list[str]:
-    asked, split = outcome.asked, outcome.split
+    asked, split = outcome.options, outcome.split
     return [
         f"Method {asked.method}, labels: {asked.labels}. Learnt from {count}, judged by "
         f"{len(split.validate)} in one block apart; not learnt from: cells nearer to it than "
@@ -146,8 +146,8 @@ def _pictures(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
 
 
 def _picture(outcome: Outcome, one: Evaluation) -> bytes:
-    seen = outcome.look(one)
-    return found_map(seen.ground, seen.truth, seen.found, seen.grid)
+    preview = outcome.preview(one)
+    return found_map(preview.ground, preview.truth, preview.predicted, preview.grid)
 
 
 def _share(quality: Quality) -> float:
@@ -156,7 +156,7 @@ def _share(quality: Quality) -> float:
 
 
 def _asked(outcome: Outcome) -> dict[str, Any]:
-    return asdict(outcome.asked) | {
+    return asdict(outcome.options) | {
         "learnt from": [piece.tile.id for piece in outcome.split.train],
         "judged by": [piece.tile.id for piece in outcome.split.validate],
     }

@@ -1,1 +1,1 @@
-"""Train a segmenter on the tiles of a catalog, and judge it on tiles kept apart."""
+"""Train a segmenter on tiles of a catalog and validate it on separate tiles."""

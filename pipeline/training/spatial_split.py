@@ -1,7 +1,7 @@
-"""Part tiles into those to learn from and those to judge by: apart in space, not at random.
+"""Split tiles into training and validation tiles, in space, not at random.
 
-Neighbours show the same street twice: judged by tiles among those it learnt from, a model looks better than
-it is. So the land is cut by one straight line, and cells near it are left out of learning.
+Neighbouring tiles show the same streets, so a random split overestimates the quality of a model. Instead one
+straight line divides the tiles, and cells near the validation side are not used for training.
 """
 
 from __future__ import annotations
@@ -17,37 +17,38 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Bools
 
 DIRECTIONS = 8
+"""Number of directions of the line that are tried."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A tile, or a part of it, on one side of the cut."""
+    """A tile, or a part of it, on one side of the line."""
 
     tile: Tile
     bounds: Bounds
-    """Where its labels count."""
+    """Area whose labels are used."""
     road: int
-    """Labelled road cells."""
+    """Number of labelled road cells."""
     ground: int
-    """Labelled cells of no road."""
+    """Number of labelled cells of other ground."""
 
 
 @dataclass(frozen=True)
 class Split:
-    """Both sides of the cut."""
+    """Blocks of the training side and of the validation side."""
 
     train: tuple[Block, ...]
     validate: tuple[Block, ...]
     gap_m: float
-    """Cells nearer than this to the validation side are not learnt from."""
+    """Training cells are at least this far from the validation side (m)."""
 
-    def learnt(self, grid: Grid, bounds: Bounds) -> Bools:
+    def training_cells(self, grid: Grid, bounds: Bounds) -> Bools:
         """Return the cells within the bounds and far enough from the validation side, ``(H, W)``."""
         cells = inside(grid, bounds)
         for piece in self.validate:
             west, south, east, north = piece.bounds
-            wide = (west - self.gap_m, south - self.gap_m, east + self.gap_m, north + self.gap_m)
-            cells &= ~inside(grid, wide)
+            excluded = (west - self.gap_m, south - self.gap_m, east + self.gap_m, north + self.gap_m)
+            cells &= ~inside(grid, excluded)
         return cells
 
 
@@ -60,22 +61,22 @@ def inside(grid: Grid, bounds: Bounds) -> Bools:
 
 
 def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Split:
-    """Cut the land into a part to learn from and one of about ``share`` to judge by.
+    """Split blocks by a straight line into a training side and a validation side.
 
-    Of eight directions, in an order that the seed decides, the first one counts that leaves labels of both
-    kinds on both sides.
+    Eight directions of the line are tried in an order drawn from the seed. The first one with road and other
+    ground on both sides is used.
 
     Parameters
     ----------
-    pieces : sequence of Piece
-        At least two, all in one plane.
+    pieces : sequence of Block
+        At least two, all in one CRS.
     share : float
-        Of the pieces that are for judging, 0 to 1; at least one is, and at least one is not.
+        Fraction of the blocks on the validation side, 0 to 1; each side has at least one block.
 
     Raises
     ------
     ConfigError
-        If no cut leaves road and other ground on both sides.
+        If no direction gives road and other ground on both sides.
     """
     count = min(max(1, round(share * len(pieces))), len(pieces) - 1)
     for turn in np.random.default_rng(seed).permutation(DIRECTIONS):
@@ -84,18 +85,19 @@ def split(pieces: Sequence[Block], share: float, gap_m: float, seed: int) -> Spl
         order = np.argsort(along, kind="stable")
         validate = tuple(pieces[i] for i in sorted(order[-count:]))
         train = tuple(pieces[i] for i in sorted(order[:-count]))
-        if _both(train) and _both(validate):
+        if _has_both(train) and _has_both(validate):
             return Split(train, validate, gap_m)
     raise ConfigError(
-        f"no straight cut leaves road and other ground on both sides of it: {len(pieces)} tiles with labels, "
+        "no straight line splits the tiles into two sides with road and other ground on each: "
+        f"{len(pieces)} tiles with labels, "
         f"{sum(piece.road > 0 for piece in pieces)} of them with road; label more tiles"
     )
 
 
 def split_tile(bounds: Bounds, share: float) -> tuple[Bounds, Bounds]:
-    """Return two parts of one tile's bounds, for a catalog that has a single tile.
+    """Return the bounds of two parts of a tile, for a catalog with a single tile.
 
-    The second, in the east or, of a tall tile, in the south, has ``share`` of the ground.
+    The second part has a fraction ``share`` of the area. It is in the east, or in the south of a tall tile.
     """
     west, south, east, north = bounds
     if east - west >= north - south:
@@ -109,5 +111,5 @@ def _bounds(pieces: Sequence[Block]) -> Iterator[Bounds]:
     return (piece.bounds for piece in pieces)
 
 
-def _both(pieces: Sequence[Block]) -> bool:
+def _has_both(pieces: Sequence[Block]) -> bool:
     return any(piece.road for piece in pieces) and any(piece.ground for piece in pieces)

@@ -1,4 +1,4 @@
-"""Reference lines of an OpenDRIVE map in space: heights that FlexRoad had no part in."""
+"""Reference lines of an OpenDRIVE map in 3-D: road heights that are independent of FlexRoad."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -12,8 +12,8 @@ STEP_M = 0.1
 def reference_lines(path: Path) -> list[NDArray[np.float64]]:
     """Points every `STEP_M` along each road's reference line, ``(n, 3)``: x, y, elevation (m).
 
-    Curvature runs linearly along a piece of the plan (ASAM OpenDRIVE 1.7, chapter 9): it is 0 on a line,
-    constant on an arc. Heading and place are its integrals, taken by the trapezoidal rule.
+    Curvature varies linearly along an element of the plan view (ASAM OpenDRIVE 1.7, chapter 9): it is 0 on a
+    line and constant on an arc. Heading and position are its integrals, by the trapezoidal rule.
     """
     roads = ElementTree.parse(path).getroot().findall("road")
     return [np.vstack([_piece(piece, road) for piece in road.find("planView")]) for road in roads]

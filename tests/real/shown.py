@@ -1,4 +1,4 @@
-"""Commands and tables that a page shows."""
+"""Run the commands of a docs page, and read its tables and those of a report."""
 
 import subprocess
 import sys
@@ -7,21 +7,21 @@ CALL = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main
 
 
 def table_after(text: str, start: str) -> list[tuple[str, list[float]]]:
-    """The first table after a line: method and figures."""
+    """The first table after a string: method and values per row."""
     lines = text[text.index(start) :].splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("| method"))
     rows = []
     for line in lines[first + 2 :]:
         if not line.startswith("|"):
             break
-        name, *figures = [cell.strip() for cell in line.strip("| ").split("|")]
-        rows.append((name, [float(figure.replace(",", "")) for figure in figures]))
+        name, *values = [cell.strip() for cell in line.strip("| ").split("|")]
+        rows.append((name, [float(value.replace(",", "")) for value in values]))
     return rows
 
 
-def flexroad(words, folder) -> None:
-    done = subprocess.run([*CALL, *words], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+def flexroad(arguments, folder) -> None:
+    result = subprocess.run([*CALL, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def measured(run, folder) -> list[tuple[str, list[float]]]:

@@ -1,4 +1,4 @@
-"""Eighteen photographs of a drone against the cloud that other software made of them (about a minute)."""
+"""Eighteen drone photographs, compared with the point cloud of other software (about a minute)."""
 
 import laspy
 import numpy as np
@@ -34,7 +34,7 @@ def published(real_data, tmp_path_factory):
     )
 
 
-def test_all_photographs_are_placed_within_the_accuracy_of_their_receiver(published):
+def test_prepare_photos_places_all_within_gnss_accuracy(published):
     placed = published.notes[0]
     assert placed.startswith("18 of 18 photographs placed")
     words = placed.split()
@@ -42,27 +42,28 @@ def test_all_photographs_are_placed_within_the_accuracy_of_their_receiver(publis
     assert float(words[words.index("and") + 1]) < GNSS_HEIGHT_M
 
 
-def test_the_surface_is_that_of_the_delivered_cloud(published, real_data):
+def test_prepare_photos_surface_agrees_with_delivered_cloud(published, real_data):
     with rasterio.open(published.catalog.parent / "dsm.tif") as raster:
-        ours = raster.read(1).astype(float)
+        dsm = raster.read(1).astype(float)
         grid = Grid("EPSG:32615", raster.bounds.left, raster.bounds.top, 0.5, raster.width, raster.height)
     cloud = laspy.read(real_data / "brighton_beach" / "model.laz")
     x, y, z = (np.asarray(axis) for axis in (cloud.x, cloud.y, cloud.z))
-    on = (x > grid.west) & (x < grid.east) & (y > grid.south) & (y < grid.north)
-    theirs = np.full(grid.shape, -np.inf)
-    np.maximum.at(theirs, grid.cells(x[on], y[on]), z[on])
-    both = np.isfinite(theirs) & np.isfinite(ours)
-    assert both.sum() > 0.8 * np.isfinite(theirs).sum()
-    off = (ours - theirs)[both]
-    # The heights of both are a receiver's, without corrections.
-    assert np.abs(np.median(off)) < GNSS_HEIGHT_M
-    assert _nmad(off) < 0.6
-    # Two calibrations of one lens differ by a bowl: what is left without it is what the stereo does.
+    inside = (x > grid.west) & (x < grid.east) & (y > grid.south) & (y < grid.north)
+    reference = np.full(grid.shape, -np.inf)
+    np.maximum.at(reference, grid.cells(x[inside], y[inside]), z[inside])
+    both = np.isfinite(reference) & np.isfinite(dsm)
+    assert both.sum() > 0.8 * np.isfinite(reference).sum()
+    difference = (dsm - reference)[both]
+    # Both have the absolute height of an uncorrected GNSS receiver.
+    assert np.abs(np.median(difference)) < GNSS_HEIGHT_M
+    assert _nmad(difference) < 0.6
+    # Two calibrations of a lens differ by a quadratic surface; the residual is the error of the stereo.
     row, col = (axis[both] / 100 for axis in np.indices(grid.shape))
-    bowl = np.stack([np.ones(len(off)), col, row, col**2, col * row, row**2], axis=1)
-    flat = np.abs(off - np.median(off)) < 2
-    left = off[flat] - bowl[flat] @ np.linalg.lstsq(bowl[flat], off[flat], rcond=None)[0]
-    assert _nmad(left) < 0.15
+    bowl = np.stack([np.ones(len(difference)), col, row, col**2, col * row, row**2], axis=1)
+    inlier = np.abs(difference - np.median(difference)) < 2
+    fit = np.linalg.lstsq(bowl[inlier], difference[inlier], rcond=None)[0]
+    residual = difference[inlier] - bowl[inlier] @ fit
+    assert _nmad(residual) < 0.15
 
 
 def _nmad(values):

@@ -1,4 +1,4 @@
-"""A genuine download of Geobasis NRW, the paper's own source, by its name."""
+"""An original download of Geobasis NRW, the paper's data source."""
 
 import gzip
 import shutil
@@ -16,25 +16,25 @@ pytestmark = pytest.mark.real
 NAME = "dom1_32_356_5699_1_nw_2020.tif"
 
 
-def test_half_a_kilometre_becomes_eight_tiles(real_data):
-    found = index(real_data / "nrw")
-    assert [tile.id for tile in found.tiles] == [
+def test_index_half_square_kilometre_gives_eight_tiles(real_data):
+    result = index(real_data / "nrw")
+    assert [tile.id for tile in result.tiles] == [
         f"{east}_{north}" for east in (356000, 356250) for north in (5699000, 5699250, 5699500, 5699750)
     ]
-    assert {(tile.dataset, tile.datetime.year, tile.datetime_assumed) for tile in found.tiles} == {
+    assert {(tile.dataset, tile.datetime.year, tile.datetime_assumed) for tile in result.tiles} == {
         ("Geobasis NRW", 2020, False)
     }
-    (note,) = found.notes
+    (note,) = result.notes
     assert note.startswith("no dgm1 file under 356000_5699000")
     with pytest.raises(TaskError, match="the tile has no dtm"):
-        load(found.tiles[0], Options())
+        load(result.tiles[0], Options())
 
 
-def test_the_terrain_model_as_packed_points_lies_cell_by_cell_on_the_surface_model(real_data, tmp_path):
+def test_load_gzipped_xyz_dtm_matches_dsm_cells(real_data, tmp_path):
     shutil.copy(real_data / "nrw" / NAME, tmp_path)
     with rasterio.open(tmp_path / NAME) as src:
         surface = src.read(1)
-    # No terrain model of the place is at hand: 250 m of the surface, 10 m lower, stand in for it.
+    # There is no terrain model of this area; 250 m of the surface model, lowered by 10 m, replace it.
     lower = surface[:250, :250] - 10
     north, west = 5700000, 356000
     lines = (

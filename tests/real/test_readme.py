@@ -1,4 +1,4 @@
-"""The README's tables on real data can be had again by the commands it shows."""
+"""The README's commands on real data give the README's tables."""
 
 import shlex
 import zipfile
@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", ["barbican", "gothenburg"])
-def test_commands_give_the_table(name, real_data, tmp_path):
+def test_commands_give_table_of_readme(name, real_data, tmp_path):
     for archive in ("London_BNG", "Goteborg_SWEREF99_1200"):
         zipfile.ZipFile(real_data / "umep" / f"{archive}.zip").extractall(tmp_path / "umep")
     text = README.read_text()
@@ -23,5 +23,5 @@ def test_commands_give_the_table(name, real_data, tmp_path):
         flexroad(shlex.split(line)[1:], tmp_path)
     shown = table_after(text, commands[1])
     assert [row[0] for row in shown] == ["plane", "rgt", "flexroad"]
-    for (method, want), (_, got) in zip(shown, measured(f"runs/{name}", tmp_path), strict=True):
-        assert got == pytest.approx(want, abs=0.0015, rel=1e-3), method
+    for (method, expected), (_, actual) in zip(shown, measured(f"runs/{name}", tmp_path), strict=True):
+        assert actual == pytest.approx(expected, abs=0.0015, rel=1e-3), method

@@ -1,4 +1,4 @@
-"""Roads of Autzen Stadium's surroundings: centre lines by their width against the roads drawn as polygons."""
+"""Roads around Autzen Stadium: centre lines with a width, compared with roads drawn as polygons."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from flexroad.tasks.types import Source, TileData
 pytestmark = pytest.mark.real
 
 NORTH = Grid.covering("EPSG:2993", (193_500, 259_500, 195_000, 260_250), 1.0)
-"""All of the north, cells of 1 m."""
-SURE = "class = 'road' AND certainty <> 'low'"
+"""The whole northern area, with cells of 1 m."""
+CERTAIN = "class = 'road' AND certainty <> 'low'"
 
 
 @pytest.fixture
@@ -23,21 +23,21 @@ def north(real_data) -> TileData:
 
 
 def iou(data: TileData, **options) -> float:
-    """Of centre lines against polygons; what is uncertain counts in neither."""
-    areas = f"{SURE} AND visible_in <> 'rgb'"
+    """IoU of centre lines and polygons, without the cells of uncertain polygons."""
+    areas = f"{CERTAIN} AND visible_in <> 'rgb'"
     truth = rasterise_roads(data, Options(layer="road_polygons", where=areas))
-    unsure = rasterise_roads(
+    uncertain = rasterise_roads(
         data, Options(layer="road_polygons", where="class = 'road' AND certainty = 'low'")
     )
-    found = vector.segment(data, vector.Options(layer="road_centerlines", where=SURE, **options)).mask
-    return float((found & truth)[~unsure].sum() / (found | truth)[~unsure].sum())
+    mask = vector.segment(data, vector.Options(layer="road_centerlines", where=CERTAIN, **options)).mask
+    return float((mask & truth)[~uncertain].sum() / (mask | truth)[~uncertain].sum())
 
 
-def test_centre_lines_with_their_width_are_the_roads(north):
+def test_segment_centre_lines_with_own_width_match_roads(north):
     assert iou(north) >= 0.85
 
 
-def test_one_width_for_all_is_worse(north):
-    """7.5 m, the lines' median; and 12 m, about their mean by length."""
+def test_segment_single_width_matches_worse(north):
+    """7.5 m is the median width of the lines, 12 m about their mean weighted by length."""
     for width, most in ((7.5, 0.62), (12.0, 0.72)):
         assert iou(north, width_columns=(), class_columns=(), default_width_m=width) < most

@@ -1,4 +1,4 @@
-"""Indexing and loading real surveys: three UMEP cities (1 m, with and without land cover), a state's DSM."""
+"""Indexing and loading real surveys: three UMEP cities (1 m, some with land cover) and a state's DSM."""
 
 import zipfile
 
@@ -23,17 +23,17 @@ def unpack(real_data, tmp_path):
     return unpacked
 
 
-def test_barbican(unpack):
-    """651 x 601 m whose corner is 0.1 mm off the metre: copied, nine tiles, three slivers left out."""
+def test_barbican_corner_off_by_rounding_is_copied(unpack):
+    """651 x 601 m, corner 0.1 mm off the metre: copied, not resampled; nine tiles, three slivers left out."""
     folder = unpack("London_BNG")
     layers = {"dsm": "dsm_barb*.tif", "dtm": "dem_barb*.tif", "road_mask": "landcover*.tif"}
-    found = index(folder, layers, road_values=(1,))
-    assert len(found.tiles) == 9
-    assert found.tiles[4].id == "532250_181500"
-    assert {t.grid.crs for t in found.tiles} == {"EPSG:27700"}
-    assert {t.grid.cell for t in found.tiles} == {1.0}
-    assert found.notes[0].startswith("left out 3 tiles covered less than 25%")
-    data = [load(t, Options()) for t in found.tiles]
+    result = index(folder, layers, road_values=(1,))
+    assert len(result.tiles) == 9
+    assert result.tiles[4].id == "532250_181500"
+    assert {t.grid.crs for t in result.tiles} == {"EPSG:27700"}
+    assert {t.grid.cell for t in result.tiles} == {1.0}
+    assert result.notes[0].startswith("left out 3 tiles covered less than 25%")
+    data = [load(t, Options()) for t in result.tiles]
     assert all(d.notes == () for d in data)
     full = data[4]
     assert np.isfinite(full.dsm).all()
@@ -43,20 +43,20 @@ def test_barbican(unpack):
     roads = [mask.segment(d, mask.Options()) for d in data]
     assert 0.40 < roads[4].mask.mean() < 0.50
     assert not roads[4].outside.any()
-    # The survey ends 40 m short of the northern tiles' edge.
+    # The survey ends 40 m before the northern edge of the tiles.
     assert roads[5].outside.sum() == np.isnan(data[5].dsm).sum() == 40 * 250
     unmatched = sum(np.count_nonzero(r.mask & np.isnan(d.dsm)) for r, d in zip(roads, data, strict=True))
     assert unmatched == 0
 
 
-def test_gothenburg(unpack):
-    """A coordinate system of one city, land cover in float32 and unnamed values, less than one tile."""
+def test_gothenburg_local_crs_and_partial_tile_loads(unpack):
+    """A city's own CRS, land cover as float32 without class names, less than one tile."""
     folder = unpack("Goteborg_SWEREF99_1200")
     layers = {"dsm": "DSM_KRbig.tif", "dtm": "DEM_KRbig.tif", "road_mask": "landcover.tif"}
-    found = index(folder, layers, road_values=(1,))
-    assert [t.id for t in found.tiles] == ["147750_6398500"]
-    assert found.tiles[0].grid.crs == "EPSG:3007"
-    data = load(found.tiles[0], Options())
+    result = index(folder, layers, road_values=(1,))
+    assert [t.id for t in result.tiles] == ["147750_6398500"]
+    assert result.tiles[0].grid.crs == "EPSG:3007"
+    data = load(result.tiles[0], Options())
     # 147720..147954 and 6398557..6398780 overlap the tile by 204 x 193 m.
     assert np.isfinite(data.dsm).sum() == 204 * 193
     assert np.nanmin(np.nanmax(data.dsm) - np.nanmax(data.dtm)) > 0.9
@@ -65,11 +65,11 @@ def test_gothenburg(unpack):
     assert 0.2 < road.mask.mean() < 0.25
 
 
-def test_covent_garden(unpack):
-    """A lattice off the metre is resampled and said so; without land cover there is no mask."""
-    found = index(unpack("DataCoventGarden"), {"dsm": "DSM_CG.tif", "dtm": "DEM_CG.tif"})
-    assert len(found.tiles) == 5
-    tile = next(t for t in found.tiles if t.id == "283250_5711250")
+def test_covent_garden_shifted_lattice_is_resampled_with_note(unpack):
+    """Cells off the whole metre are resampled with a note; without land cover there is no mask."""
+    result = index(unpack("DataCoventGarden"), {"dsm": "DSM_CG.tif", "dtm": "DEM_CG.tif"})
+    assert len(result.tiles) == 5
+    tile = next(t for t in result.tiles if t.id == "283250_5711250")
     data = load(tile, Options())
     assert data.notes == (
         "dsm resampled: its lattice is off by (0.09, 0.31) m",
@@ -81,19 +81,19 @@ def test_covent_garden(unpack):
         mask.segment(data, mask.Options())
 
 
-def test_a_bare_ascii_grid_needs_its_crs_said(unpack):
+def test_index_ascii_grid_uses_given_crs(unpack):
     folder = unpack("Goteborg_SWEREF99_1200")
     (tile,) = index(folder, {"dsm": "CDSM_KRbig.asc"}, crs="EPSG:3007").tiles
     assert tile.layers[0].crs == "EPSG:3007"
 
 
-def test_half_a_kilometre_tile_of_a_state(real_data):
-    """The west half of a 1 km file gives eight tiles of the paper's size."""
-    found = index(real_data / "nrw", {"dsm": "dom1_*.tif", "dtm": "dom1_*.tif"})
-    assert [t.id for t in found.tiles] == [
+def test_index_half_square_kilometre_of_nrw_gives_eight_tiles(real_data):
+    """The western half of a 1 km file gives eight tiles of the paper's size."""
+    result = index(real_data / "nrw", {"dsm": "dom1_*.tif", "dtm": "dom1_*.tif"})
+    assert [t.id for t in result.tiles] == [
         f"{east}_{north}" for east in (356000, 356250) for north in (5699000, 5699250, 5699500, 5699750)
     ]
-    heights = [load(tile, Options()).dsm for tile in found.tiles]
+    heights = [load(tile, Options()).dsm for tile in result.tiles]
     assert all(np.isfinite(h).all() for h in heights)
     assert min(h.min() for h in heights) == pytest.approx(87.29, abs=0.01)
     assert max(h.max() for h in heights) == pytest.approx(167.28, abs=0.01)

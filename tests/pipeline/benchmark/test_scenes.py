@@ -21,17 +21,17 @@ def benchmark(tmp_path_factory):
     return write_scenes(tmp_path_factory.mktemp("gerod"), 5, seed=2, preset="gerod")
 
 
-def test_the_preset_s_tiles_are_in_the_catalog_under_its_name(benchmark):
+def test_write_scenes_preset_catalog_lists_its_tiles(benchmark):
     tiles = {tile.id: tile for tile in Catalog.read(benchmark).tiles}
-    asked = survey(5, 2)
-    assert sorted(tiles) == sorted(tile_id for tile_id, *_ in asked)
-    for tile_id, grid, stratum, _ in asked:
+    expected = survey(5, 2)
+    assert sorted(tiles) == sorted(tile_id for tile_id, *_ in expected)
+    for tile_id, grid, stratum, _ in expected:
         assert tiles[tile_id].grid == grid
         assert tiles[tile_id].stratum == stratum
         assert tiles[tile_id].dataset == "synthetic benchmark gerod, seed 2"
 
 
-def test_the_preset_s_files_hold_its_scenes(benchmark):
+def test_write_scenes_preset_files_contain_its_scenes(benchmark):
     tile_id, grid, stratum, options = survey(5, 2)[-1]
     scene = make_scene(grid, 2, stratum, options)
     for name, layer in scene.layers.items():
@@ -39,7 +39,7 @@ def test_the_preset_s_files_hold_its_scenes(benchmark):
             assert np.array_equal(file.read(1), layer.astype(file.dtypes[0]))
 
 
-def test_the_made_roads_are_a_layer_and_the_same_each_time(benchmark, tmp_path):
+def test_write_scenes_roads_are_true_and_repeatable(benchmark, tmp_path):
     for tile in Catalog.read(benchmark).tiles:
         data = load(tile, Options())
         road = vector.segment(data, vector.Options()).mask
@@ -50,21 +50,21 @@ def test_the_made_roads_are_a_layer_and_the_same_each_time(benchmark, tmp_path):
     assert (again.parent / roads).read_bytes() == (benchmark.parent / roads).read_bytes()
 
 
-def test_what_a_preset_cannot_do_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=re.escape("--preset paper: there is gerod, dsc3d")):
+def test_write_scenes_invalid_preset_options_raise(tmp_path):
+    with pytest.raises(ConfigError, match=re.escape("--preset paper: unknown, there are gerod, dsc3d")):
         write_scenes(tmp_path, 1, seed=0, preset="paper")
-    with pytest.raises(ConfigError, match="--tile-size 60: tiles of gerod have 250 m; leave it out"):
+    with pytest.raises(ConfigError, match="--tile-size 60: tiles of gerod have 250 m; leave --tile-size out"):
         write_scenes(tmp_path, 1, seed=0, size_m=60, preset="gerod")
-    with pytest.raises(ConfigError, match="--tile-size 60: tiles of dsc3d have 150 m; leave it out"):
+    with pytest.raises(ConfigError, match="--tile-size 60: tiles of dsc3d have 150 m; leave --tile-size out"):
         write_scenes(tmp_path, 1, seed=0, size_m=60, preset="dsc3d")
-    with pytest.raises(ConfigError, match="--tiles 6: dsc3d has 5 scenes; leave it out for all"):
+    with pytest.raises(ConfigError, match="--tiles 6: dsc3d has 5 scenes; leave --tiles out for all of them"):
         write_scenes(tmp_path, 6, seed=0, preset="dsc3d")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Catalogs of one scene of the stand-in, by the paper's reference and by the truth."""
+    """Tiles of one scene of the stand-in, with the paper's reference and with the true one."""
     path = write_scenes(tmp_path_factory.mktemp("dsc3d"), 1, seed=4, preset="dsc3d")
     (circular,) = Catalog.read(path).tiles
     (true,) = Catalog.read(path.with_name("catalog_true.parquet")).tiles
@@ -78,20 +78,20 @@ def read(tile, name):
 
 
 @pytest.mark.slow
-def test_a_scene_is_what_prepare_mesh_makes_of_its_mesh(scene):
+def test_stand_in_catalogs_share_layers_of_prepare_mesh(scene):
     circular, true = scene
     assert circular.id == true.id == survey_of_scenes(1, 4)[0].site.name
     assert circular.grid == true.grid == survey_of_scenes(1, 4)[0].grid
     assert {layer.name for layer in circular.layers} == {*HEIGHTS, *MASKS, PHOTO}
-    kind = "synthetic photogrammetry, stand-in for DSC3D, seed 4; "
-    assert circular.dataset == kind + "reference by ECSRC itself (circular)"
-    assert true.dataset == kind + "true reference"
+    prefix = "synthetic photogrammetry, stand-in for DSC3D, seed 4; "
+    assert circular.dataset == prefix + "reference by ECSRC itself (circular)"
+    assert true.dataset == prefix + "true reference"
     for name in ("dsm", "dtm", "dop", "road_mask"):
         assert circular.paths(circular.layer(name)) == true.paths(true.layer(name))
 
 
 @pytest.mark.slow
-def test_both_references_are_what_they_are_called(scene):
+def test_stand_in_references_are_circular_and_true(scene):
     circular, true = scene
     place = survey_of_scenes(1, 4)[0]
     made = make_scene(place.grid, 4, place.site.stratum, place.options)
@@ -104,13 +104,13 @@ def test_both_references_are_what_they_are_called(scene):
     reference, dsm, dtm = (read(circular, name) for name in ("reference", "dsm", "dtm"))
     assert np.array_equal(reference[kept], dsm[kept])
     assert np.array_equal(reference[~kept], dtm[~kept], equal_nan=True)
-    # The DTM is the bare ground, but for what photogrammetry and its filter leave.
+    # The DTM is the bare ground, except for errors of the reconstruction and the ground filter.
     assert np.nanmedian(np.abs(dtm - made.reference)) < 0.3
     assert np.isfinite(dsm).mean() > 0.97
 
 
 @pytest.mark.slow
-def test_a_scene_s_mesh_can_be_prepared_by_hand(scene, tmp_path):
+def test_stand_in_mesh_prepared_again_gives_same_rasters(scene, tmp_path):
     from flexroad.pipeline.execute import SerialExecutor
     from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
     from flexroad.pipeline.prepare.options import PrepareOptions

@@ -1,4 +1,4 @@
-"""Catalogs of known datasets, made by the command line and run as they stand."""
+"""Catalogs of published datasets, made on the command line and run."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from tests.make_rasters import write
 
 
 def flexroad(*words, expect: int = 0) -> tuple[str, str]:
-    said = call(*words).expected(expect)
-    return said.out, said.err
+    result = call(*words).expected(expect)
+    return result.out, result.err
 
 
 def ground(north: float, west: float) -> np.ndarray:
@@ -20,7 +20,7 @@ def ground(north: float, west: float) -> np.ndarray:
     return (100 + (north - rows) % 97 * 0.02 + (west + columns) % 89 * 0.01).astype(np.float32)
 
 
-def test_nrw_downloads_run(tmp_path, quick_config):
+def test_catalog_nrw_can_be_run(tmp_path, quick_config):
     root = tmp_path / "nrw"
     for product in ("dom1", "dgm1"):
         write(root / f"{product}_32_356_5699_1_nw_2020.tif", ground(5700000, 356000), 356000, 5700000)
@@ -29,41 +29,41 @@ def test_nrw_downloads_run(tmp_path, quick_config):
     write(root / "road.tif", road, 356000, 5700000)
     out = tmp_path / "nrw.parquet"
     words = ("--tile-size", 50, "--road-mask", "road.tif", "--road-value", 2, 3, "-o", out)
-    said, noted = flexroad("catalog", "nrw", root, *words)
-    assert f"1 tiles in {out}" in said
-    assert "note: left out 3 tiles covered less than 25%" in noted
+    out_text, err_text = flexroad("catalog", "nrw", root, *words)
+    assert f"1 tiles in {out}" in out_text
+    assert "note: left out 3 tiles covered less than 25%" in err_text
     assert Catalog.read(out).tiles[0].layer("road_mask").values == (2, 3)
     words = ("--config", quick_config, "--catalog", out, "--out", tmp_path / "run", "--executor", "serial")
     assert "1 tiles: 1 done" in flexroad("run", *words)[0]
     assert (tmp_path / "run" / "tiles" / "356000_5699950" / "356000_5699950_flexroad.glb").is_file()
 
 
-def test_published_datasets_run_by_a_layout_of_one_s_own(tmp_path, quick_config):
+def test_catalog_with_own_layout_can_be_run(tmp_path, quick_config):
     root = tmp_path / "data"
     for tile, (west, north) in {"295500_5629440": (295500, 5629500), "600_700": (600, 760)}.items():
         for name in ("dom", "dgm"):
             write(root / name / f"{name}_{tile}.tif", ground(north, west), west, north)
         write(root / "mask" / f"{tile}.tif", np.eye(60, dtype=np.uint8), west, north)
     layers = {"dsm": "dom/dom_{tile}.tif", "dtm": "dgm/dgm_{tile}.tif", "road_mask": "mask/{tile}.tif"}
-    mine = tmp_path / "mine.yaml"
-    mine.write_text(
-        yaml.safe_dump(yaml.safe_load(quick_config.read_text()) | {"dataset": {"layers": layers}})
-    )
+    own = tmp_path / "mine.yaml"
+    own.write_text(yaml.safe_dump(yaml.safe_load(quick_config.read_text()) | {"dataset": {"layers": layers}}))
     for source, notes in (("gerod", "2 of the dataset's 240 tiles"), ("dsc3d", "no reference for")):
         out = tmp_path / f"{source}.json"
-        said, warned = flexroad("catalog", source, root, "-o", out, "--layout", mine)
-        assert f"2 tiles in {out}" in said
-        assert notes in warned
-        words = ("--config", mine, "--catalog", out, "--out", tmp_path / source, "--executor", "serial")
+        out_text, err_text = flexroad("catalog", source, root, "-o", out, "--layout", own)
+        assert f"2 tiles in {out}" in out_text
+        assert notes in err_text
+        words = ("--config", own, "--catalog", out, "--out", tmp_path / source, "--executor", "serial")
         assert "2 tiles: 2 done" in flexroad("run", *words)[0]
 
 
-def test_a_folder_the_shipped_layout_does_not_fit_is_named(tmp_path):
+def test_catalog_folder_not_matching_layout_fails(tmp_path):
     write(tmp_path / "heights.tif", ground(0, 0))
     for source in ("gerod", "dsc3d"):
-        _, why = flexroad("catalog", source, tmp_path, "-o", tmp_path / "c.json", expect=2)
-        assert "there are heights.tif; describe them with --layout" in why
-        assert len(why.splitlines()) == 1
-    _, why = flexroad("catalog", "gerod", tmp_path, "--layout", "paper", "-o", tmp_path / "c.json", expect=2)
-    assert "error: layout: no template for dsm" in why
+        _, error = flexroad("catalog", source, tmp_path, "-o", tmp_path / "c.json", expect=2)
+        assert "there are heights.tif; describe them with --layout" in error
+        assert len(error.splitlines()) == 1
+    _, error = flexroad(
+        "catalog", "gerod", tmp_path, "--layout", "paper", "-o", tmp_path / "c.json", expect=2
+    )
+    assert "error: layout: no template for dsm" in error
     assert not Path(tmp_path / "c.json").exists()

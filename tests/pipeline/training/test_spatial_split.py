@@ -10,7 +10,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.training.spatial_split import Block, inside, split, split_tile
 
 
-def piece(col, row, road=10, ground=10, size=100):
+def make_block(col, row, road=10, ground=10, size=100):
     grid = Grid("EPSG:25832", 500000.0 + col * size, 5600000.0 + row * size, 1.0, size, size)
     tile = Tile(f"{col}_{row}", grid, (), "", datetime(2025, 1, 1, tzinfo=UTC))
     return Block(tile, grid.bounds, road, ground)
@@ -20,43 +20,43 @@ places = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=2, m
 
 
 @given(places, st.floats(0.05, 0.9), st.integers(0, 9))
-def test_a_straight_line_parts_the_two_sides(places, share, seed):
-    found = split([piece(*place) for place in places], share, 0.0, seed)
-    assert len(found.train) + len(found.validate) == len(places)
-    assert len(found.validate) == min(max(1, round(share * len(places))), len(places) - 1)
-    centres = [np.array([piece.bounds[0], piece.bounds[1]]) for piece in (*found.train, *found.validate)]
-    sides = np.array([0] * len(found.train) + [1] * len(found.validate))
+def test_split_sides_are_separated_by_straight_line(places, share, seed):
+    sides = split([make_block(*place) for place in places], share, 0.0, seed)
+    assert len(sides.train) + len(sides.validate) == len(places)
+    assert len(sides.validate) == min(max(1, round(share * len(places))), len(places) - 1)
+    corners = [np.array([block.bounds[0], block.bounds[1]]) for block in (*sides.train, *sides.validate)]
+    side = np.array([0] * len(sides.train) + [1] * len(sides.validate))
     angles = 2 * np.pi * np.arange(8) / 8
-    along = np.array(centres) @ np.array([np.sin(angles), np.cos(angles)])
-    assert any(along[sides == 0, i].max() <= along[sides == 1, i].min() + 1e-6 for i in range(8))
+    along = np.array(corners) @ np.array([np.sin(angles), np.cos(angles)])
+    assert any(along[side == 0, i].max() <= along[side == 1, i].min() + 1e-6 for i in range(8))
 
 
 @given(places, st.sampled_from([0.0, 30.0, 150.0]), st.integers(0, 9))
-def test_what_is_learnt_keeps_its_distance(places, gap, seed):
-    found = split([piece(*place) for place in places], 0.3, gap, seed)
-    judged = [one.bounds for one in found.validate]
-    for one in found.train:
-        grid = one.tile.grid
-        cells = found.learnt(grid, one.bounds)
+def test_training_cells_keep_gap_to_validation_side(places, gap, seed):
+    sides = split([make_block(*place) for place in places], 0.3, gap, seed)
+    validation_bounds = [block.bounds for block in sides.validate]
+    for block in sides.train:
+        grid = block.tile.grid
+        cells = sides.training_cells(grid, block.bounds)
         rows, cols = np.nonzero(cells)
-        for west, south, east, north in judged:
+        for west, south, east, north in validation_bounds:
             x, y = grid.eastings[cols], grid.northings[rows]
-            beside = np.maximum(np.maximum(west - x, x - east), np.maximum(south - y, y - north))
-            assert not cells.any() or beside.min() >= gap
+            distance = np.maximum(np.maximum(west - x, x - east), np.maximum(south - y, y - north))
+            assert not cells.any() or distance.min() >= gap
 
 
-def test_both_sides_have_labels_of_both_kinds():
-    road = {(0, 0), (3, 0)}
-    pieces = [piece(col, 0, road=10 if (col, 0) in road else 0) for col in range(4)]
+def test_split_both_sides_have_labels_of_both_classes():
+    with_road = {(0, 0), (3, 0)}
+    blocks = [make_block(col, 0, road=10 if (col, 0) in with_road else 0) for col in range(4)]
     for seed in range(6):
-        found = split(pieces, 0.25, 0.0, seed)
-        assert found.validate[0].tile.id in {"0_0", "3_0"}
+        sides = split(blocks, 0.25, 0.0, seed)
+        assert sides.validate[0].tile.id in {"0_0", "3_0"}
     with pytest.raises(ConfigError, match="1 of them with road; label more tiles"):
-        split([piece(col, 0, road=10 * (col == 2)) for col in range(4)], 0.25, 0.0, 0)
+        split([make_block(col, 0, road=10 * (col == 2)) for col in range(4)], 0.25, 0.0, 0)
 
 
-def test_a_single_tile_is_parted_along_its_longer_side():
+def test_split_tile_divides_along_longer_side():
     grid = Grid("EPSG:25832", 0.0, 100.0, 1.0, 50, 100)
-    learn, judge = split_tile(grid.bounds, 0.3)
-    assert (inside(grid, learn).sum(), inside(grid, judge).sum()) == (3500, 1500)
-    assert not (inside(grid, learn) & inside(grid, judge)).any()
+    train, validate = split_tile(grid.bounds, 0.3)
+    assert (inside(grid, train).sum(), inside(grid, validate).sum()) == (3500, 1500)
+    assert not (inside(grid, train) & inside(grid, validate)).any()

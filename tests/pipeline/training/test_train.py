@@ -1,4 +1,4 @@
-"""A model trained on made tiles by the command line, and held against what is known of them."""
+"""`flexroad train` on synthetic tiles; its report is compared with their known truth."""
 
 import json
 from dataclasses import replace
@@ -36,10 +36,10 @@ def trained(land, tmp_path_factory):
     return model, json.loads(model.with_name("roads.skops.json").read_text())
 
 
-def spoilt(catalog, **layers):
-    """A catalog with layers taken out, or files of another layer in their place."""
+def with_layers(catalog, **layers):
+    """The catalog with layers removed (None), or with the files of another layer instead (its name)."""
 
-    def of(tile):
+    def changed(tile):
         kept = [layer for layer in tile.layers if layers.get(layer.name, "") is not None]
         return replace(
             tile,
@@ -49,43 +49,43 @@ def spoilt(catalog, **layers):
             ),
         )
 
-    return Catalog(tuple(of(tile) for tile in catalog.tiles))
+    return Catalog(tuple(changed(tile) for tile in catalog.tiles))
 
 
-def test_the_report_tells_what_the_segmenter_does_on_the_judged_tiles(land, trained):
-    model, told = trained
+def test_train_report_equals_segmenter_on_validation_tiles(land, trained):
+    model, report = trained
     right = wrong = missed = 0
     options = segment.Options(model=model, cleanup=NOTHING)
-    for tile in Catalog.read(land).select(told["asked"]["judged by"]).tiles:
+    for tile in Catalog.read(land).select(report["asked"]["judged by"]).tiles:
         data = load.load(tile, load.Options())
-        found = segment.segment(data, options).mask
-        right += (found & data.reference_road).sum()
-        wrong += (found & ~data.reference_road).sum()
-        missed += (~found & data.reference_road).sum()
-    assert told["all"]["iou"] == pytest.approx(right / (right + wrong + missed))
-    assert told["all"]["recall"] == pytest.approx(right / (right + missed))
-    # Chance on these tiles would be their share of road, below a third.
-    assert told["all"]["iou"] > 0.6
-    assert told["off_label_edges"]["iou"] > told["all"]["iou"]
-    assert told["all"]["edge_mean_m"] < 5
-    assert {*told["asked"]["judged by"], *told["asked"]["learnt from"]} == {
+        mask = segment.segment(data, options).mask
+        right += (mask & data.reference_road).sum()
+        wrong += (mask & ~data.reference_road).sum()
+        missed += (~mask & data.reference_road).sum()
+    assert report["all"]["iou"] == pytest.approx(right / (right + wrong + missed))
+    assert report["all"]["recall"] == pytest.approx(right / (right + missed))
+    # A mask that is road everywhere would have their fraction of road as IoU, below a third.
+    assert report["all"]["iou"] > 0.6
+    assert report["off_label_edges"]["iou"] > report["all"]["iou"]
+    assert report["all"]["edge_mean_m"] < 5
+    assert {*report["asked"]["judged by"], *report["asked"]["learnt from"]} == {
         t.id for t in Catalog.read(land).tiles
     }
-    # At most the rounds asked for: how many, strips of the training tiles decide.
-    losses = [entry["train_loss"] for entry in told["history"]]
+    # At most the requested rounds; cross-validation on the training tiles sets the number.
+    losses = [entry["train_loss"] for entry in report["history"]]
     assert 1 < len(losses) <= 15
     assert losses[-1] < losses[0]
 
 
-def test_the_page_stands_alone_and_shows_tiles(trained):
-    model, told = trained
+def test_train_page_is_self_contained_and_shows_tiles(trained):
+    model, report = trained
     page = model.with_name("roads.skops.html").read_text()
     assert 'src="data:image/png' in page
     assert "http" not in page
-    assert all(tile in page for tile in told["asked"]["judged by"])
+    assert all(tile in page for tile in report["asked"]["judged by"])
 
 
-def test_the_model_runs_by_one_line_of_the_configuration(land, trained, quick_config, tmp_path):
+def test_run_with_trained_model_completes(land, trained, quick_config, tmp_path):
     model, _ = trained
     quick = yaml.safe_load(quick_config.read_text()) | {"segment": {"method": "pixels", "model": str(model)}}
     config = tmp_path / "segment.yaml"
@@ -94,35 +94,35 @@ def test_the_model_runs_by_one_line_of_the_configuration(land, trained, quick_co
     assert "4 done" in flexroad("run", *words)
 
 
-def test_cells_to_learn_from_keep_off_edges_and_off_the_judged_tiles(land):
-    ground = LabelledTiles(
+def test_training_samples_keep_off_edges_and_validation_tiles(land):
+    tiles = LabelledTiles(
         TrainOptions("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS
     )
     catalog = Catalog.read(land)
-    pieces = [piece for tile in catalog.tiles for piece in ground.pieces(tile, [tile.grid.bounds])]
-    sides = split(pieces, 0.3, 30.0, 0)
-    for sample in Samples(ground, sides, "train"):
+    blocks = [block for tile in catalog.tiles for block in tiles.blocks(tile, [tile.grid.bounds])]
+    sides = split(blocks, 0.3, 30.0, 0)
+    for sample in Samples(tiles, sides, "train"):
         grid = sample.data.grid
-        assert sample.known.any()
-        assert not (sample.known & ~inside(grid, sample.data.core.bounds)).any()
-        away = np.maximum(
+        assert sample.labelled.any()
+        assert not (sample.labelled & ~inside(grid, sample.data.core.bounds)).any()
+        distance = np.maximum(
             ndimage.distance_transform_edt(sample.road), ndimage.distance_transform_edt(~sample.road)
         )
-        assert away[sample.known].min() > 2.0
+        assert distance[sample.labelled].min() > 2.0
 
 
-def test_a_single_tile_is_parted(land):
+def test_train_single_tile_is_split_in_two(land):
     catalog = Catalog.read(land)
-    one = Catalog(catalog.tiles[:1])
+    single = Catalog(catalog.tiles[:1])
     settings = {"rounds": 5, "cells": 1000}
     outcome = train(
-        one, load_config("paper"), TrainOptions("pixels", "mask", gap_m=10, settings=settings), print
+        single, load_config("paper"), TrainOptions("pixels", "mask", gap_m=10, settings=settings), print
     )
     assert outcome.split.train[0].tile == outcome.split.validate[0].tile
     assert outcome.split.train[0].bounds[2] == outcome.split.validate[0].bounds[0]
 
 
-def test_labels_may_be_vectors(land, tmp_path):
+def test_labelled_reads_vector_labels(land, tmp_path):
     import geopandas
     from shapely.geometry import box
 
@@ -134,35 +134,37 @@ def test_labels_may_be_vectors(land, tmp_path):
     )
     bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
     drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))))
-    ground = LabelledTiles(TrainOptions("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
-    _, road = ground.labelled(drawn)
+    tiles = LabelledTiles(TrainOptions("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
+    _, road = tiles.labelled(drawn)
     assert road[-30:-20].all()
     assert road.sum() == 10 * tile.grid.width
-    assert ground.labelled(bare) is None
+    assert tiles.labelled(bare) is None
 
 
-def refused(catalog, match, **asked):
+def check_refused(catalog, match, **options):
     with pytest.raises(ConfigError, match=match):
         train(
             catalog,
             load_config("paper"),
-            TrainOptions(**{"method": "pixels", "labels": "mask"} | asked),
+            TrainOptions(**{"method": "pixels", "labels": "mask"} | options),
             print,
         )
 
 
-def test_what_cannot_be_learnt_from_is_refused(land):
+def test_train_unusable_labels_or_settings_raise(land):
     catalog = Catalog.read(land)
-    refused(spoilt(catalog, road_mask=None, reference_road=None), "--reference-road or --road-mask")
-    refused(spoilt(catalog, roads=None), "--roads", labels="vector")
-    refused(spoilt(catalog, dop=None), "orthophoto", method="dinov2")
-    refused(spoilt(catalog, reference_road="dsm"), "are road")
-    refused(catalog, "lower --gap-m", gap_m=1000)
-    refused(catalog, "there are dinov2, pixels", method="magic")
-    refused(catalog, "--set leafs.*leaves", settings={"leafs": 3})
+    check_refused(
+        with_layers(catalog, road_mask=None, reference_road=None), "--reference-road or --road-mask"
+    )
+    check_refused(with_layers(catalog, roads=None), "--roads", labels="vector")
+    check_refused(with_layers(catalog, dop=None), "orthophoto", method="dinov2")
+    check_refused(with_layers(catalog, reference_road="dsm"), "are road")
+    check_refused(catalog, "lower --gap-m", gap_m=1000)
+    check_refused(catalog, "there are dinov2, pixels", method="magic")
+    check_refused(catalog, "--set leafs.*leaves", settings={"leafs": 3})
 
 
-def test_a_missing_model_stops_a_run_before_it_begins(land, tmp_path, quick_config):
+def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
     quick = yaml.safe_load(quick_config.read_text()) | {
         "segment": {"method": "pixels", "model": "gone.skops"}
     }
@@ -175,7 +177,7 @@ def test_a_missing_model_stops_a_run_before_it_begins(land, tmp_path, quick_conf
     assert not (tmp_path / "run").exists()
 
 
-def test_help_tells_the_choices():
-    said = flexroad("train", "--help")
+def test_train_help_lists_options():
+    text = flexroad("train", "--help")
     for word in ("--method", "--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
-        assert word in said
+        assert word in text
