@@ -55,7 +55,7 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     scene = xr.Dataset(
         {name: (("y", "x"), layers[name], {} if name == "road_mask" else {"units": "m"}) for name in LAYERS},
         coords={"x": grid.eastings, "y": grid.northings},
-        attrs={"title": f"made scene, seed {seed}"},
+        attrs={"title": f"synthetic scene, seed {seed}"},
     )
     with_crs: xr.Dataset = scene.rio.write_crs(grid.crs)
     return with_crs

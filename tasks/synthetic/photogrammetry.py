@@ -81,17 +81,19 @@ def _nodes(grid: Grid) -> Grid:
     return Grid(grid.crs, west, north, NODE_M, cells.width + 1, cells.height + 1)
 
 
-def _mesh(made: Reconstruction, triangles: int, origin: Floats) -> tuple[Floats, Faces]:
-    east, north = made.grid.eastings - origin[0], made.grid.northings - origin[1]
-    return simplified(*lattice(east, north, made.height - origin[2], made.open), triangles)
+def _mesh(reconstruction: Reconstruction, triangles: int, origin: Floats) -> tuple[Floats, Faces]:
+    east, north = reconstruction.grid.eastings - origin[0], reconstruction.grid.northings - origin[1]
+    return simplified(
+        *lattice(east, north, reconstruction.height - origin[2], reconstruction.open), triangles
+    )
 
 
 def _fragment_centres(
-    made: Reconstruction, count: int, origin: Floats, grid: Grid, rng: np.random.Generator
+    reconstruction: Reconstruction, count: int, origin: Floats, grid: Grid, rng: np.random.Generator
 ) -> Floats:
     """Return random points above the surface, relative to the origin, ``(count, 3)``."""
     x, y = rng.uniform(0, grid.width * grid.cell, (2, count))
-    height = made.height[made.grid.cells(x + origin[0], y + origin[1])]
+    height = reconstruction.height[reconstruction.grid.cells(x + origin[0], y + origin[1])]
     return np.column_stack([x, y, height - origin[2] + rng.uniform(*FLOATING_M, count)])
 
 

@@ -118,9 +118,9 @@ def _textureless(scene: Scene, seed: int, share: float) -> Bools:
 def _hidden(scene: Scene, seed: int, share: float) -> Bools:
     """Return the cells of ground at walls and under eaves that no photograph shows, ``(H, W)``."""
     reach = 2 * round(ALLEY_M / scene.grid.cell) + 1
-    beside = ndimage.maximum_filter(scene.dsm, reach) - scene.dsm > OVERHEAD_M
+    near_wall = ndimage.maximum_filter(scene.dsm, reach) - scene.dsm > OVERHEAD_M
     low = scene.dsm - scene.reference < 1
-    hidden: Bools = beside & low & _patches(scene.grid, seed, "hidden", share)
+    hidden: Bools = near_wall & low & _patches(scene.grid, seed, "hidden", share)
     return hidden
 
 

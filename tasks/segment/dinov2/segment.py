@@ -147,7 +147,7 @@ def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray
     return np.clip(cells, 0, 1)
 
 
-def _notes(known: Bools, shifted: str | None) -> tuple[str, ...]:
-    share = np.count_nonzero(~known) / known.size
+def _notes(covered: Bools, shifted: str | None) -> tuple[str, ...]:
+    share = np.count_nonzero(~covered) / covered.size
     missing = f"dop: {share:.1%} of the cells have no orthophoto and count as no road" if share else None
     return tuple(note for note in (missing, shifted) if note)

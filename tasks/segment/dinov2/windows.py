@@ -64,7 +64,7 @@ def taper(size: int, overlap: int) -> NDArray[np.float32]:
 
 
 def blend(
-    predict: Predict, image: Image, known: Bools, size: int, overlap: int, batch: int = 1
+    predict: Predict, image: Image, valid: Bools, size: int, overlap: int, batch: int = 1
 ) -> NDArray[np.float32]:
     """Return the weighted mean of the windows' predictions, ``(h, w)``.
 
@@ -74,7 +74,7 @@ def blend(
         Called with ``batch`` windows at a time, the last time with fewer.
     image : (bands, h, w) array
         Consists of whole windows, see `cover`.
-    known : (h, w) array
+    valid : (h, w) array
         Pixels with data; windows without any are skipped and count as 0.
     size, overlap : int
         As in `cover` (pixels).
@@ -91,8 +91,8 @@ def blend(
     result = np.zeros(image.shape[1:], np.float32)
     used = [
         (slice(row, row + size), slice(col, col + size))
-        for row, col in corners(known.shape, size, overlap)
-        if known[row : row + size, col : col + size].any()
+        for row, col in corners(valid.shape, size, overlap)
+        if valid[row : row + size, col : col + size].any()
     ]
     for start in range(0, len(used), batch):
         part = used[start : start + batch]

@@ -2,8 +2,8 @@
 
 Road is rare, so half of the cells drawn from a tile are road if it has enough; weights restore the true
 fractions, so that the model predicts probabilities. The number of rounds and the threshold come from
-cross-validation over strips of training tiles. The validation tiles do not influence the model, so metrics on
-them are independent.
+cross-validation over strips of training tiles. The validation tiles do not influence the model, so their
+metrics are independent of it.
 """
 
 from __future__ import annotations

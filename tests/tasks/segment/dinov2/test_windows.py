@@ -73,8 +73,8 @@ def test_blend_different_windows_has_no_step():
         return values + np.zeros(windows[:, 0].shape, np.float32)
 
     image = np.zeros((1, 20, 36), np.float32)
-    known = np.ones(image.shape[1:], bool)
-    row = blend(predict, image, known, 20, 4, batch=9)[10]
+    valid = np.ones(image.shape[1:], bool)
+    row = blend(predict, image, valid, 20, 4, batch=9)[10]
     np.testing.assert_allclose(row[4:16], 0)
     np.testing.assert_allclose(row[16:20], taper(20, 4)[:4], atol=1e-6)
     np.testing.assert_allclose(row[20:32], 1)
@@ -88,9 +88,9 @@ def test_blend_skips_windows_without_data(batch):
         batches.append(len(windows))
         return np.ones(windows[:, 0].shape, np.float32)
 
-    known = np.zeros((40, 60), bool)
-    known[:20, :40] = True
-    result = blend(predict, np.zeros((3, 40, 60), np.float32), known, 20, 0, batch)
-    np.testing.assert_array_equal(result, known)
+    valid = np.zeros((40, 60), bool)
+    valid[:20, :40] = True
+    result = blend(predict, np.zeros((3, 40, 60), np.float32), valid, 20, 0, batch)
+    np.testing.assert_array_equal(result, valid)
     assert sum(batches) == 2
     assert max(batches) <= batch
