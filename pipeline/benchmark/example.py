@@ -49,7 +49,7 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     import xarray as xr
 
     if seed < 0 or not 60 <= size_m <= 1000:
-        raise ConfigError(f"seed {seed}, size_m {size_m}: the seed must be 0 or more, the size 60 to 1000 m")
+        raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 60 to 1000 m")
     grid = Grid(CRS, WEST_M, SOUTH_M + size_m, 1.0, size_m, size_m)
     layers = make_scene(grid, seed).layers
     scene = xr.Dataset(
