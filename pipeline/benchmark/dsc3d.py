@@ -93,7 +93,9 @@ def _write_scene(job: _Job) -> str:
     write(folder / "mesh.glb", glb.encode(scene.mesh))
     roads = folder / KNOWN / "road_mask" / f"{scene.name}.tif"
     options = PrepareOptions(roads=roads, date=MADE, dataset=name)
-    prepare_mesh(folder / "mesh.glb", folder, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None)
+    prepare_mesh(
+        folder / "mesh.glb", folder, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None
+    )
     return ""
 
 
