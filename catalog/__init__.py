@@ -1,4 +1,4 @@
-"""What exists: tiles, where they lie, and where their layers are."""
+"""The catalog of tiles: their ids, grids and the files of their layers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that commands without a catalog start fast."""
+    """Import a public name on first use, so that commands without a catalog start fast."""
     for home, names in _HOMES.items():
         if name in names:
             return getattr(importlib.import_module(f"flexroad.catalog.{home}"), name)

@@ -1,8 +1,8 @@
-"""Which files a catalog may name: those below its own folder, and below what the operator allows besides.
+"""Check of a catalog's files: they must lie below its own folder or below a folder the operator allows.
 
-A catalog is data that may come from anywhere, and what it names is read with the operator's rights. Names
-are judged as they are written, after ``..`` is taken out: a folder of links to data elsewhere stays usable.
-What a file refers to in turn (a VRT) is not looked at.
+A catalog may come from anyone, and its files are read with the operator's rights. The check compares names
+as written, after ``..`` is resolved, and does not follow links: a folder of links to data elsewhere can be
+used. Files that a file refers to (a VRT) are not checked.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from flexroad.catalog.index import Catalog
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 from flexroad.catalog.tile import LAYERS
 
-MOST = 4
-"""Folders to allow that are named one by one; of more, those that they lie in."""
+MAX_FOLDERS = 4
+"""Largest number of folders suggested with --allow; if there are more, parent folders are suggested."""
 ADDRESS = re.compile(r"(?!s3:)[a-zA-Z][a-zA-Z0-9+.-]*:/")
 TOPS = ("/", "s3:/", "s3:")
 
@@ -26,67 +26,67 @@ TOPS = ("/", "s3:/", "s3:")
 def check_allowed(
     catalog: Catalog, folder: Location | str, allowed: Sequence[str] = (), layers: Collection[str] = LAYERS
 ) -> None:
-    """Refuse a catalog that names files elsewhere.
+    """Raise an error if a catalog names files outside the allowed folders.
 
     Parameters
     ----------
-    folder : Place
-        The catalog's own.
+    folder : Location
+        The catalog's own folder.
     allowed : sequence of str
-        Folders or addresses (s3://BUCKET/NAME) below which files may lie besides.
+        Further folders or addresses (s3://BUCKET/NAME) that files may lie below.
     layers : collection of str
-        Those that will be read; what nobody reads may lie anywhere.
+        The layers that will be read; other layers are not checked.
 
     Raises
     ------
     CatalogError
-        The line names the tile, the layer, the file and the option that allows it.
+        Names the tile, the layer, the file and the option that allows it.
     """
     for tile, layer, name in _outside(catalog, folder, allowed, layers):
-        where = f"tile {tile}: {layer} names {name}"
+        subject = f"tile {tile}: {layer} names {name}"
         if ADDRESS.match(name):
-            raise CatalogError(f"{where}; only files on disk and in s3:// are read: fetch it first")
+            raise CatalogError(f"{subject}; only files on disk and in s3:// are read: fetch it first")
         option = f"--allow {shlex.quote(posixpath.dirname(name))}"
-        raise CatalogError(f"{where}, outside the catalog's folder {folder}; if that is meant, add {option}")
+        raise CatalogError(f"{subject}, outside the catalog's folder {folder}; to allow it, add {option}")
 
 
 def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
-    """Return what has to be allowed for a catalog in such a folder if such layers are read: few folders."""
+    """Return the folders that must be allowed to read these layers of a catalog stored in ``folder``."""
     names = (name for *_, name in _outside(catalog, folder, (), layers) if not ADDRESS.match(name))
-    found = _outermost(map(posixpath.dirname, names))
-    while len(found) > MOST:
-        above = _outermost(map(posixpath.dirname, found))
-        if not above.isdisjoint(TOPS):
+    folders = _outermost(map(posixpath.dirname, names))
+    while len(folders) > MAX_FOLDERS:
+        parents = _outermost(map(posixpath.dirname, folders))
+        if not parents.isdisjoint(TOPS):
             break
-        found = above
-    return tuple(sorted(found))
+        folders = parents
+    return tuple(sorted(folders))
 
 
 def _outside(
     catalog: Catalog, folder: Location | str, allowed: Sequence[str], layers: Collection[str]
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield tile, layer and file of all in the layers that lie elsewhere."""
-    # The folder by the name it was given, and as it is without links.
-    grounds = {
+    """Yield tile id, layer and file name of every file outside the allowed folders."""
+    # The folder as given, and with links resolved.
+    roots = {
         normalise(str(folder)),
         normalise(str(absolute(parse_location(folder)))),
         *map(normalise, allowed),
     }
-    starts = tuple(ground.rstrip("/") + "/" for ground in grounds)
+    prefixes = tuple(root.rstrip("/") + "/" for root in roots)
     for tile in catalog.tiles:
         for layer in (layer for layer in tile.layers if layer.name in layers):
             for file in layer.files:
-                named = next((text for text in (file, tile.root) if ADDRESS.match(text)), None)
-                name = named or normalise(join(tile.root, file))
-                if named or not name.startswith(starts):
+                address = next((text for text in (file, tile.root) if ADDRESS.match(text)), None)
+                name = address or normalise(join(tile.root, file))
+                if address or not name.startswith(prefixes):
                     yield tile.id, layer.name, name
 
 
 def _outermost(folders: Iterable[str]) -> set[str]:
     """Return the folders that lie in none of the others."""
-    found: list[str] = []
-    # A folder comes before all that lie in it.
+    outermost: list[str] = []
+    # Sorting puts a folder before its subfolders.
     for folder in sorted(set(folders), key=lambda folder: folder.rstrip("/") + "/"):
-        if not found or not folder.startswith(found[-1].rstrip("/") + "/"):
-            found.append(folder)
-    return set(found)
+        if not outermost or not folder.startswith(outermost[-1].rstrip("/") + "/"):
+            outermost.append(folder)
+    return set(outermost)

@@ -1,6 +1,6 @@
-"""Bridge decks from classified point clouds: what a terrain model lacks of the road.
+"""Heights of bridge decks from classified point clouds; terrain models do not contain bridges.
 
-A cloud is decoded once, in chunks; what is kept of it is a small raster of deck heights, beside the catalog.
+A cloud is decoded once, in chunks, into a small raster of deck heights that is stored beside the catalog.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ CELL_M = 1.0
 
 
 def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
-    """Write the mean height of a cloud's bridge points per cell; tell whether there were any.
+    """Write the mean height of a cloud's bridge points per cell; return whether there are any.
 
-    A target that is newer than the cloud is kept.
+    An existing target that is not older than the cloud is kept.
 
     Parameters
     ----------
     cloud : Path
         LAS or LAZ file, in ``crs`` and metres.
     target : Path
-        GeoTIFF to write: float32, NaN where no bridge is.
+        GeoTIFF to write: float32, NaN where there is no bridge.
     square : Bounds
-        What the raster covers (m); points outside are left out.
+        Bounds of the raster (m); points outside are ignored.
     crs : str
         CRS of the cloud and the raster.
 
     Raises
     ------
     CatalogError
-        If the cloud cannot be read; the line names it.
+        If the cloud cannot be read; names the file.
     """
     if target.exists() and target.stat().st_mtime_ns >= cloud.stat().st_mtime_ns:
         with rasterio.open(target) as raster:

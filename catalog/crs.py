@@ -1,4 +1,7 @@
-"""What a coordinate reference system says of plan and height, by one name for each."""
+"""Coordinate reference systems (CRS): names, units and transformations of their plan and height parts.
+
+"Plan" is the horizontal part, without heights.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,12 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 
 Unit = tuple[str, float]
-"""Name of a unit of length (or angle) and how many metres (or radians) it has."""
+"""Name of a unit of length (or angle) and its size in metres (or radians)."""
 
 
 @lru_cache(maxsize=256)
 def _parts(text: str) -> tuple[CRS, CRS | None]:
-    """Return the CRS in plan and, of a compound one, that of heights."""
+    """Return the horizontal CRS and, of a compound one, the vertical CRS (else None)."""
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
@@ -27,18 +30,18 @@ def _parts(text: str) -> tuple[CRS, CRS | None]:
     if not crs.is_compound:
         return crs.source_crs if crs.is_bound and crs.source_crs else crs, None
     plan, height = crs.sub_crs_list[:2]
-    # Old files wrap their plan in a shift to WGS 84, which hides the code it has.
+    # Old files wrap the horizontal CRS in a bound CRS with a shift to WGS 84, which hides its EPSG code.
     return plan.source_crs if plan.is_bound and plan.source_crs else plan, height
 
 
 @lru_cache(maxsize=256)
 def in_plan(text: str) -> str:
-    """Return the CRS in plan, without heights: ``EPSG:25832``, or WKT where there is no code.
+    """Return the horizontal CRS, without heights: ``EPSG:25832``, or WKT where there is no code.
 
     Raises
     ------
     CatalogError
-        If ``text`` is no CRS.
+        If ``text`` is not a CRS.
     """
     plan, _ = _parts(text)
     code = plan.to_epsg()
@@ -47,7 +50,7 @@ def in_plan(text: str) -> str:
 
 @lru_cache(maxsize=256)
 def same(a: str, b: str) -> bool:
-    """Return whether two CRS are one in plan, whatever order their axes are named in."""
+    """Return whether two CRSs are the same horizontally; the order of axes does not matter."""
     return in_plan(a) == in_plan(b) or _parts(a)[0].equals(_parts(b)[0], ignore_axis_order=True)
 
 
@@ -58,33 +61,33 @@ def plan_unit(text: str) -> Unit:
 
 
 def height_unit(text: str) -> Unit | None:
-    """Return the unit of heights, or None if the CRS says nothing of heights."""
+    """Return the unit of heights, or None if the CRS has no height axis."""
     plan, height = _parts(text)
     axes = plan.axis_info[2:3] if height is None else height.axis_info[:1]
     return (axes[0].unit_name, axes[0].unit_conversion_factor) if axes else None
 
 
 def is_geographic(text: str) -> bool:
-    """Return whether eastings and northings are angles."""
+    """Return whether the horizontal coordinates are angles."""
     return _parts(text)[0].is_geographic
 
 
 def is_projected(text: str) -> bool:
-    """Return whether eastings and northings are lengths in a map's plane."""
+    """Return whether the horizontal coordinates are lengths in a map projection."""
     return _parts(text)[0].is_projected
 
 
 def short(text: str) -> str:
-    """Return the CRS as it reads in one line: its code, or its name where there is no code."""
+    """Return a short name of the CRS for messages: its code, or its name where there is no code."""
     name = in_plan(text)
     return name if name.startswith("EPSG:") else _parts(text)[0].name
 
 
 def utm_of(degrees: Bounds) -> str:
-    """Return the code of the UTM zone (WGS 84) in the middle of west, south, east, north (degrees)."""
+    """Return the code of the UTM zone (WGS 84) at the middle of west, south, east, north (degrees)."""
     east, north = (degrees[0] + degrees[2]) / 2, (degrees[1] + degrees[3]) / 2
-    found = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north))
-    return f"EPSG:{found[0].code}" if found else "EPSG:25832"
+    zones = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north))
+    return f"EPSG:{zones[0].code}" if zones else "EPSG:25832"
 
 
 @lru_cache(maxsize=256)
@@ -96,43 +99,43 @@ def metric_twin(text: str, easting: float, northing: float) -> str:
     text : str
         A projected CRS in any unit.
     easting, northing : float
-        Any place of the data, in units of ``text``: of the many CRSs in the register only those that are
-        made for this place are looked at.
+        Any point of the data, in units of ``text``; only CRSs of the register that are valid at this point
+        are considered.
     """
     plan = _parts(text)[0].to_2d()
     if plan.to_epsg() and plan.axis_info[0].unit_conversion_factor == 1:
         return in_plan(text)
-    described = plan.to_json_dict()
-    described.pop("id", None)
-    for axis in described["coordinate_system"]["axis"]:
+    definition = plan.to_json_dict()
+    definition.pop("id", None)
+    for axis in definition["coordinate_system"]["axis"]:
         axis["unit"] = "metre"
-    for parameter in described["conversion"]["parameters"]:
+    for parameter in definition["conversion"]["parameters"]:
         unit = parameter.get("unit")
         if isinstance(unit, dict) and unit["type"] == "LinearUnit":
             parameter.update(value=parameter["value"] * unit["conversion_factor"], unit="metre")
-    twin = CRS.from_json_dict(described)
+    twin = CRS.from_json_dict(definition)
     return _registered(twin, *degrees(text, easting, northing)) or twin.to_wkt()
 
 
 def _registered(crs: CRS, longitude: float, latitude: float) -> str | None:
-    """Return the code of a projected CRS that is this one in all but name."""
+    """Return the EPSG code of a registered CRS with the same parameters, or None."""
     place = AreaOfInterest(longitude, latitude, longitude, latitude)
     method = crs.coordinate_operation.method_name if crs.coordinate_operation else ""
     for info in query_crs_info("EPSG", PJType.PROJECTED_CRS, area_of_interest=place, contains=True):
         if info.projection_method_name == method:
-            known = CRS.from_epsg(info.code)
-            if known.equals(crs, ignore_axis_order=True):
+            registered = CRS.from_epsg(info.code)
+            if registered.equals(crs, ignore_axis_order=True):
                 return f"EPSG:{info.code}"
     return None
 
 
 def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
-    """Return longitude and latitude (WGS 84) of a place, infinite where the CRS has no such place."""
+    """Return longitude and latitude (WGS 84, degrees) of a point; infinite if it cannot be transformed."""
     longitude, latitude = transformer(text, "EPSG:4326").transform(easting, northing)
     return float(longitude), float(latitude)
 
 
 @lru_cache(maxsize=16)
 def transformer(source: str, target: str) -> Transformer:
-    """Return what takes eastings and northings (or longitudes and latitudes) from one CRS to another."""
+    """Return a transformer of horizontal coordinates from one CRS to another; x is east, y is north."""
     return Transformer.from_crs(_parts(source)[0].to_2d(), _parts(target)[0].to_2d(), always_xy=True)

@@ -1,5 +1,5 @@
-"""The one base of what this package complains about."""
+"""The base class of this package's errors."""
 
 
 class CatalogError(Exception):
-    """A catalog, source folder or tile that cannot be used; one line naming file, value and remedy."""
+    """A catalog, source folder or tile that cannot be used; one line with file, value and remedy."""

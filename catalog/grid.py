@@ -1,4 +1,4 @@
-"""Where the cells of a tile lie: the vocabulary of every array in FlexRoad."""
+"""Grids: the position and size of a tile's cells; every raster array in FlexRoad lies on one."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The catalog: one table of tiles with a fixed schema, kept as STAC items.
+"""The catalog: one table of tiles with a fixed schema, stored as STAC items.
 
-GeoParquet (``.parquet``) or a GeoJSON feature collection (``.json``, ``.geojson``), by file name; QGIS
-opens both. Projection fields follow the STAC projection extension; fields of our own carry the prefix
-``flexroad:``.
+The suffix of the file name selects GeoParquet (``.parquet``) or a GeoJSON feature collection (``.json``,
+``.geojson``); QGIS opens both. Projection fields follow the STAC projection extension; FlexRoad's own fields
+have the prefix ``flexroad:``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ JSON_SUFFIXES = (".json", ".geojson")
 
 @dataclass(frozen=True)
 class Catalog:
-    """The tiles there are, in the order of their ids."""
+    """The tiles of a data set, in the order of their ids."""
 
     tiles: tuple[Tile, ...]
 
@@ -44,18 +44,18 @@ class Catalog:
         ids = [tile.id for tile in self.tiles]
         doubled = sorted({i for i in ids if ids.count(i) > 1}) if len(set(ids)) < len(ids) else []
         if doubled:
-            raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} stand more than once")
+            raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} occur more than once")
 
     @classmethod
     def read(cls, path: Location | str) -> Catalog:
-        """Read a catalog that `write` wrote, on disk or in a bucket.
+        """Read a catalog written by `write`, from disk or a bucket.
 
         Raises
         ------
         CatalogError
-            If the file is missing or is no catalog; the line names the file.
+            If the file is missing or is not a catalog; names the file.
         """
-        path = _at(path)
+        path = _location(path)
         try:
             data = paths.read(path)
         except FileNotFoundError as error:
@@ -80,19 +80,20 @@ class Catalog:
         Parameters
         ----------
         path : Path
-            Its name ends in .parquet, .json or .geojson.
+            File to write; its suffix is .parquet, .json or .geojson.
         movable : bool
-            Name files relative to the catalog's folder where they lie below it, so that both can be moved
-            together; else keep the tiles' roots, so that a copy elsewhere names the same files alike.
+            True: names of files below the catalog's folder are relative to it, so that catalog and data can
+            be moved together. False: the tiles' roots are kept, so that a copy of the catalog in another
+            folder names the same files in the same way.
 
         Raises
         ------
         CatalogError
-            If the name ends neither in .parquet nor in .json or .geojson, or the file cannot be written.
+            If the suffix is not .parquet, .json or .geojson, or the file cannot be written.
         """
-        path = _at(path)
+        path = _location(path)
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
-            raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, unlike {path.name}")
+            raise CatalogError(f"a catalog's name must end in .parquet, .json or .geojson, not {path.name}")
         folder = absolute(path).parent
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
@@ -102,18 +103,24 @@ class Catalog:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 
     def select(self, ids: Sequence[str] = (), bbox: Bounds | None = None) -> Catalog:
-        """Return the tiles named (all if none is) that touch ``bbox`` (m, in the tiles' CRS).
+        """Return the tiles with the given ids (all if ``ids`` is empty) that touch ``bbox``.
+
+        Parameters
+        ----------
+        ids : sequence of str
+        bbox : Bounds, optional
+            West, south, east, north (m, in the tiles' CRS).
 
         Raises
         ------
         CatalogError
-            If an id is unknown (the nearest ones are shown) or nothing is left.
+            If an id is not in the catalog (the message suggests similar ids) or no tile touches ``bbox``.
         """
-        known = {tile.id for tile in self.tiles}
-        for wanted in ids:
-            if wanted not in known:
-                near = difflib.get_close_matches(wanted, known, n=3) or sorted(known)[:3]
-                raise CatalogError(f"no tile {wanted!r} in the catalog; did you mean {', '.join(near)}?")
+        all_ids = {tile.id for tile in self.tiles}
+        for tile_id in ids:
+            if tile_id not in all_ids:
+                near = difflib.get_close_matches(tile_id, all_ids, n=3) or sorted(all_ids)[:3]
+                raise CatalogError(f"no tile {tile_id!r} in the catalog; did you mean {', '.join(near)}?")
         tiles = [tile for tile in self.tiles if not ids or tile.id in set(ids)]
         if bbox is not None:
             tiles = [tile for tile in tiles if _overlap(tile.grid.bounds, bbox)]
@@ -126,7 +133,7 @@ def _overlap(a: Bounds, b: Bounds) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _at(path: Location | str) -> Location:
+def _location(path: Location | str) -> Location:
     try:
         return parse_location(path)
     except OSError as error:
@@ -134,12 +141,12 @@ def _at(path: Location | str) -> Location:
 
 
 def _rooted(tile: Tile, root: Location) -> Tile:
-    """Return the tile with its files relative to ``root`` where they lie below it, else absolute."""
-    above = str(root).rstrip("/") + "/"
+    """Return the tile with file names relative to ``root`` where they lie below it, else absolute."""
+    prefix = str(root).rstrip("/") + "/"
     layers = tuple(
-        # A folder of links should stay a folder of links.
+        # Links are not resolved: a folder of links stays one.
         replace(
-            layer, files=tuple(normalise(join(tile.root, file)).removeprefix(above) for file in layer.files)
+            layer, files=tuple(normalise(join(tile.root, file)).removeprefix(prefix) for file in layer.files)
         )
         for layer in tile.layers
     )
@@ -160,9 +167,9 @@ def item(tile: Tile, root: str = "") -> Item:
     Parameters
     ----------
     tile : Tile
-        Its files are named as they stand in its layers.
+        File names are written as they are in its layers.
     root : str
-        Folder they are relative to; empty: that of the file the item is written to.
+        Folder that file names are relative to; empty: the folder of the file that the item is written to.
     """
     grid = tile.grid
     west, south, east, north = grid.bounds
@@ -216,10 +223,10 @@ def _tile(item: Item, folder: str) -> Tile:
         grid=Grid(crs, west, north, cell, int(width), int(height)),
         layers=tuple(_layer(name, assets[name]) for name in LAYERS if assets.get(name)),
         root=properties["flexroad:root"] or folder,
-        datetime=_when(properties["datetime"]),
+        datetime=_datetime(properties["datetime"]),
         datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
         stratum=properties["flexroad:stratum"],
-        # Catalogs written before reports named their data lack it.
+        # Older catalogs do not have this field.
         dataset=properties.get("flexroad:dataset") or "",
     )
 
@@ -233,8 +240,8 @@ def _layer(name: str, asset: Item) -> Layer:
     )
 
 
-def _when(told: str | datetime) -> datetime:
-    return told if isinstance(told, datetime) else datetime.fromisoformat(told)
+def _datetime(value: str | datetime) -> datetime:
+    return value if isinstance(value, datetime) else datetime.fromisoformat(value)
 
 
 def _from_json(data: bytes) -> Iterable[Item]:
@@ -247,11 +254,11 @@ def _to_json(items: list[Item]) -> bytes:
 
 
 def _from_parquet(data: bytes) -> Iterable[Item]:
-    """Return of each item what `_tile` needs; whole items take many times as long."""
+    """Return the fields of each item that `_tile` needs; reading whole items is many times slower."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    # Threads of so short a work may be alive when the process ends, and abort it then.
+    # Reader threads may still be alive when a short process ends, and would abort it.
     table = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False).read(use_threads=False)
     plain = [name for name in table.column_names if name.startswith(("proj:", "flexroad:", "datetime"))]
     rows = table.select(["id", "assets", *plain]).to_pylist()
@@ -259,34 +266,34 @@ def _from_parquet(data: bytes) -> Iterable[Item]:
 
 
 def _to_parquet(items: list[Item]) -> bytes:
-    """Return the items as stac-geoparquet lays them out; its own way takes many times as long."""
+    """Return the items in the layout of stac-geoparquet; its own conversion is many times slower."""
     import pyarrow as pa
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
 
-    # Columns are inferred from what an item holds. One that has everything makes the schema the same for
-    # every catalog.
-    schema = parse_stac_items_to_arrow([_everything()]).read_all().schema
+    # Columns are inferred from the item. An item with all fields gives every catalog the same schema.
+    schema = parse_stac_items_to_arrow([_full_item()]).read_all().schema
     with tempfile.TemporaryDirectory() as folder:
-        # It writes to files alone.
+        # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"
         to_parquet(pa.Table.from_pylist([_row(item) for item in items], schema), file)
         return file.read_bytes()
 
 
 def _row(item: Item) -> Item:
-    """Return an item as a row: properties beside the rest, the outline as WKB."""
+    """Return an item as a table row: properties as columns, the outline as WKB."""
     row: Item = {name: value for name, value in item.items() if name != "properties"} | item["properties"]
     (ring,) = item["geometry"]["coordinates"]
     corners = ("xmin", "ymin", "xmax", "ymax")
     row |= {
         "geometry": shapely.to_wkb(shapely.Polygon(ring)),
         "bbox": dict(zip(corners, item["bbox"], strict=True)),
-        "datetime": _when(item["properties"]["datetime"]),
+        "datetime": _datetime(item["properties"]["datetime"]),
     }
     return row
 
 
-def _everything() -> Item:
+def _full_item() -> Item:
+    """Return an item with all layers and fields."""
     layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832") for name in LAYERS)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))

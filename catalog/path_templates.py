@@ -1,7 +1,7 @@
-"""Folders with one file per tile and layer, told by templates such as ``{stratum}/{tile}/dsm.tif``.
+"""Folders with one file per tile and layer, described by templates such as ``{stratum}/{tile}/dsm.tif``.
 
-A template is a path relative to the folder: ``{tile}`` stands for the tile's id and ``{stratum}`` for its
-class of area, each a part of a name without a slash; ``*`` stands for anything without one.
+A template is a path relative to the folder. ``{tile}`` is the tile's id, ``{stratum}`` its class of area, and
+``*`` any text; none of them matches a slash.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ PLACEHOLDER = re.compile(r"\{(.*?)\}")
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the files of a dataset lie, and what they leave unsaid."""
+    """Paths of a dataset's files, and properties that the files do not declare."""
 
     layers: Mapping[str, str]
     """Template by layer (see `catalog.LAYERS`)."""
     road_values: tuple[int, ...] = ()
     """Cell values that mean road in the masks; empty: every value but 0 and nodata."""
     crs: str | None = None
-    """CRS of files that carry none."""
+    """CRS of files without one."""
 
     def __post_init__(self) -> None:
         for name, template in self.layers.items():
             if name not in LAYERS:
-                raise CatalogError(f"layout: no layer is called {name!r}; there are {', '.join(LAYERS)}")
+                raise CatalogError(f"layout: unknown layer {name!r}; layers are {', '.join(LAYERS)}")
             names = PLACEHOLDER.findall(template)
             if "tile" not in names or not set(names) <= {"tile", "stratum"}:
                 raise CatalogError(
-                    f"layout: {name}: {template!r} needs {{tile}} and may have {{stratum}} and *, no other"
+                    f"layout: {name}: {template!r} needs {{tile}} and may have {{stratum}} and *, no others"
                 )
         for name in NEEDED:
             if name not in self.layers:
@@ -50,12 +50,12 @@ class Layout:
 
     @classmethod
     def of(cls, raw: Mapping[str, Any]) -> Layout:
-        """Return the layout that a configuration's ``dataset`` describes.
+        """Return the layout of a configuration's ``dataset`` section.
 
         Raises
         ------
         CatalogError
-            If a key is unknown, a value is of the wrong kind, or a template is none.
+            If a key is unknown, a value has the wrong type, or a template is invalid.
         """
         kinds = {
             "layers": (dict, "a mapping of layers to templates"),
@@ -64,54 +64,54 @@ class Layout:
         kinds["road_values"] = (list, "a list of whole numbers")
         for key, value in raw.items():
             if key not in kinds:
-                raise CatalogError(f"layout: no key is called {key!r}; there are {', '.join(kinds)}")
+                raise CatalogError(f"layout: unknown key {key!r}; keys are {', '.join(kinds)}")
             if not isinstance(value, kinds[key][0]):
                 raise CatalogError(f"layout: {key}: expected {kinds[key][1]}, not {value!r}")
         if not all(isinstance(template, str) for template in raw.get("layers", {}).values()):
-            raise CatalogError(f"layout: layers: a template is text, unlike one of {raw['layers']!r}")
+            raise CatalogError(f"layout: layers: every template must be text, not as in {raw['layers']!r}")
         if not all(isinstance(value, int) for value in raw.get("road_values", [])):
             raise CatalogError(f"layout: road_values: expected whole numbers, not {raw['road_values']!r}")
         return cls(raw.get("layers", {}), tuple(raw.get("road_values", ())), raw.get("crs"))
 
 
 @dataclass(frozen=True)
-class _Found:
-    """A file, and what its template read from its name."""
+class _MatchedFile:
+    """A file, and the stratum read from its path."""
 
     file: RasterFile
     stratum: str
 
 
 def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = None) -> TilingResult:
-    """Return the tiles of a folder; the cells of a tile are those of its DSM file.
+    """Return the tiles of a folder; a tile's grid is that of its DSM file.
 
     Parameters
     ----------
     root : Path
         The folder.
     layout : Layout
-        Where its files lie.
+        Paths of its files.
     dataset : str
-        What reports call the data.
+        Name of the data in reports.
     date : datetime, optional
-        When the data was taken; overrules the files.
+        Date of the survey; overrides the files' dates.
 
     Raises
     ------
     CatalogError
-        If no DSM is found, two files are the same layer of a tile, or one is not in metres.
+        If there is no DSM, two files are the same layer of a tile, or the CRS of a file is not in metres.
     """
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
     root, notes = root.resolve(), []
-    by_layer: dict[str, dict[str, _Found]] = {}
+    by_layer: dict[str, dict[str, _MatchedFile]] = {}
     for name in LAYERS:
         if name in layout.layers:
-            by_layer[name], said = _files(root, name, layout)
-            notes += said
+            by_layer[name], skipped = _files(root, name, layout)
+            notes += skipped
     if not by_layer["dsm"]:
         raise CatalogError(
-            f"no file of use matches {layout.layers['dsm']!r} (dsm) below {root}; {_seen(root, notes)}"
+            f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {_hint(root, notes)}"
         )
     tiles = tuple(
         _tile(
@@ -127,31 +127,31 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
     return TilingResult(tiles, (*notes, *_lacking(tiles, layout), *assumed(tiles)))
 
 
-def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _Found], list[str]]:
-    """Return the files of a layer by tile, and what was skipped."""
+def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFile], list[str]]:
+    """Return the files of a layer by tile id, and notes on skipped files."""
     template = layout.layers[layer]
     pattern = _pattern(template)
     try:
         paths = sorted(path for path in root.glob(PLACEHOLDER.sub("*", template)) if path.is_file())
     except (ValueError, NotImplementedError) as error:
-        raise CatalogError(f"layout: {layer}: {template!r} is no path below {root}: {error}") from error
-    told = {path.relative_to(root).as_posix(): path for path in paths}
-    parts = {name: match.groupdict() for name in told if (match := pattern.fullmatch(name))}
-    files, notes = opened(root, layer, [told[name] for name in parts], layout.crs)
-    found: dict[str, _Found] = {}
+        raise CatalogError(f"layout: {layer}: {template!r} is not a path below {root}: {error}") from error
+    path_of = {path.relative_to(root).as_posix(): path for path in paths}
+    parts = {name: match.groupdict() for name in path_of if (match := pattern.fullmatch(name))}
+    files, notes = opened(root, layer, [path_of[name] for name in parts], layout.crs)
+    by_tile: dict[str, _MatchedFile] = {}
     for file in files:
         tile_id = parts[file.name]["tile"]
-        if tile_id in found:
+        if tile_id in by_tile:
             raise CatalogError(
-                f"{found[tile_id].file.name} and {file.name} are both the {layer} of tile {tile_id}; "
-                f"make its template {template!r} tell them apart"
+                f"{by_tile[tile_id].file.name} and {file.name} are both the {layer} of tile {tile_id}; "
+                f"change the template {template!r} so that it matches only one of them"
             )
-        found[tile_id] = _Found(file, parts[file.name].get("stratum") or "")
-    return found, notes
+        by_tile[tile_id] = _MatchedFile(file, parts[file.name].get("stratum") or "")
+    return by_tile, notes
 
 
 def _pattern(template: str) -> re.Pattern[str]:
-    """Return the expression that reads a tile's id and stratum from a path."""
+    """Return a regular expression with groups for the tile's id and stratum."""
     named: set[str] = set()
     parts = []
     for part in re.split(r"(\{.*?\}|\*)", template):
@@ -165,26 +165,31 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 def _tile(
-    root: Path, tile_id: str, found: Mapping[str, _Found], layout: Layout, dataset: str, date: datetime | None
+    root: Path,
+    tile_id: str,
+    files: Mapping[str, _MatchedFile],
+    layout: Layout,
+    dataset: str,
+    date: datetime | None,
 ) -> Tile:
-    dsm = found["dsm"].file
+    dsm = files["dsm"].file
     require_metric(dsm)
     layers = tuple(
         Layer(
             name,
-            (one.file.name,),
+            (match.file.name,),
             layout.road_values if name in MASKS else (),
-            None if one.file.has_crs else layout.crs,
+            None if match.file.has_crs else layout.crs,
         )
-        for name, one in found.items()
+        for name, match in files.items()
     )
-    stratum = next((one.stratum for one in found.values() if one.stratum), "")
+    stratum = next((match.stratum for match in files.values() if match.stratum), "")
     grid = Grid.covering(dsm.crs, dsm.bounds, dsm.cell)
     return Tile(tile_id, grid, layers, str(root), *taken([dsm], date), stratum=stratum, dataset=dataset)
 
 
 def _lacking(tiles: Sequence[Tile], layout: Layout) -> list[str]:
-    """Return a note on each layer that tiles lack although there is a template for it."""
+    """Return a note on each layer that has a template but no file for some tiles."""
     notes = []
     for name in layout.layers:
         lacking = [tile.id for tile in tiles if tile.layer(name) is None]
@@ -194,7 +199,8 @@ def _lacking(tiles: Sequence[Tile], layout: Layout) -> list[str]:
     return notes
 
 
-def _seen(root: Path, notes: Sequence[str]) -> str:
+def _hint(root: Path, notes: Sequence[str]) -> str:
+    """Return the end of the error for a folder without a DSM: the first note, else which files exist."""
     if notes:
         return notes[0]
     files = sorted(

@@ -1,6 +1,6 @@
-"""The ground that rasters cover, cut into tiles on an absolute grid.
+"""Cut the area that rasters cover into tiles on an absolute grid.
 
-A survey's files rarely have the tiles' cut, so each tile names every file that reaches into it.
+The files of a survey rarely match the tiles, so each tile lists every file that reaches into it.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ class TilingResult:
     """What was skipped, left out or assumed, one line each."""
 
 
-class _Placed(NamedTuple):
+class _PlacedFile(NamedTuple):
     file: RasterFile
     bounds: Bounds
     """In the tiles' CRS (m)."""
 
 
-class _Near(NamedTuple):
-    """The files of one layer near one tile, by name."""
+class _NearFiles(NamedTuple):
+    """The files of one layer near one tile, in the order given."""
 
     files: list[RasterFile]
-    """Those within `REACH_M`."""
+    """Files within `REACH_M`."""
     in_core: list[RasterFile]
-    """Those that reach into the tile itself by more than a lattice error."""
+    """Files that overlap the tile itself by more than `LATTICE_TOLERANCE`."""
     shared: NDArray[np.float64]
-    """What each of ``in_core`` shares with the tile, ``(n, 4)``: west, south, east, north (m)."""
+    """Intersection of each file in ``in_core`` with the tile, ``(n, 4)``: west, south, east, north (m)."""
 
 
 def cut(
     root: Path,
-    found: Mapping[str, Sequence[RasterFile]],
+    layer_files: Mapping[str, Sequence[RasterFile]],
     *,
     road_values: tuple[int, ...] = (),
     tile_size_m: float = 250,
@@ -65,37 +65,37 @@ def cut(
     min_cover: float = 0.25,
     dataset: str = "",
 ) -> TilingResult:
-    """Cut the ground that the DSM files cover into tiles.
+    """Cut the area that the DSM files cover into tiles.
 
     Parameters
     ----------
     root : Path
         The folder that the files' names are relative to, resolved.
-    found : Mapping[str, Sequence[RasterFile]]
-        Layer name (see `catalog.LAYERS`) to its files, one at least; ``dsm`` must be there. Of files
-        that overlap, the first with a value wins.
+    layer_files : Mapping[str, Sequence[RasterFile]]
+        Files by layer name (see `catalog.LAYERS`), at least one each; ``dsm`` is required. Where files
+        overlap, the first one with a value is used.
     road_values : tuple of int
         Cell values that mean road in the masks; empty: every value but 0 and nodata.
     tile_size_m : float
         Edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
     date : datetime, optional
-        When the data was taken; overrules the files.
+        Date of the survey; overrides the files' dates.
     crs : str, optional
-        CRS of files that carry none.
+        CRS of files without one.
     min_cover : float
-        Tiles of which the DSM's files cover less than this share (0 to 1) are left out.
+        Tiles of which the DSM files cover less than this share (0 to 1) are left out.
     dataset : str
-        What reports call the data.
+        Name of the data in reports.
 
     Raises
     ------
     CatalogError
-        If the CRS is not in metres, the tiles' size does not fit the cells, or no tile is left.
+        If the CRS is not in metres, the tile size does not fit the cells, or no tile is left.
     """
-    dsm = found["dsm"]
+    dsm = layer_files["dsm"]
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]
     require_metric(next(file for file in dsm if file.crs == grid_crs))
-    placed = {name: _place(found[name], grid_crs) for name in LAYERS if name in found}
+    placed = {name: _place(layer_files[name], grid_crs) for name in LAYERS if name in layer_files}
     notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs)]
 
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
@@ -105,31 +105,32 @@ def cut(
     tiles = []
     for tile_id, grid in grids.items():
         layers = tuple(
-            _layer(name, here[tile_id], values.get(name, ()), crs)
-            for name, here in near.items()
-            if here[tile_id].in_core
+            _layer(name, by_tile[tile_id], values.get(name, ()), crs)
+            for name, by_tile in near.items()
+            if by_tile[tile_id].in_core
         )
-        when = taken(near["dsm"][tile_id].in_core, date)
-        tiles.append(Tile(tile_id, grid, layers, str(root), *when, dataset=dataset))
+        survey_date = taken(near["dsm"][tile_id].in_core, date)
+        tiles.append(Tile(tile_id, grid, layers, str(root), *survey_date, dataset=dataset))
     return TilingResult(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
 
 
-def _place(files: Sequence[RasterFile], crs: str) -> list[_Placed]:
-    """Return where the files lie in the tiles' CRS."""
+def _place(files: Sequence[RasterFile], crs: str) -> list[_PlacedFile]:
+    """Return the files with their bounds in the tiles' CRS."""
     placed = [
-        _Placed(f, f.bounds if same(f.crs, crs) else transform_bounds(f.crs, crs, *f.bounds)) for f in files
+        _PlacedFile(f, f.bounds if same(f.crs, crs) else transform_bounds(f.crs, crs, *f.bounds))
+        for f in files
     ]
     for file, bounds in placed:
         if not np.isfinite(bounds).all():
             raise CatalogError(
-                f"{file.name} in {short(file.crs)} lies nowhere in {short(crs)}, the CRS of the dsm; "
+                f"{file.name} in {short(file.crs)} has no position in {short(crs)}, the CRS of the dsm; "
                 "leave it out of the pattern or correct its CRS with `gdal_edit.py -a_srs`"
             )
     return placed
 
 
-def _other_crs(layer: str, files: Sequence[_Placed], crs: str) -> list[str]:
-    """Return a note if files are in another CRS: they cost the tiles they lie on, not the others."""
+def _other_crs(layer: str, files: Sequence[_PlacedFile], crs: str) -> list[str]:
+    """Return a note if files are in another CRS: only the tiles they overlap will fail."""
     others = [placed.file for placed in files if not same(placed.file.crs, crs)]
     if not others:
         return []
@@ -137,8 +138,8 @@ def _other_crs(layer: str, files: Sequence[_Placed], crs: str) -> list[str]:
     return [f"{layer} is in {short(others[0].crs)}, not {short(crs)}, in {names}: tiles there will fail"]
 
 
-def _cut(dsm: Sequence[_Placed], crs: str, size_m: float) -> dict[str, Grid]:
-    """Return the tiles that the DSM files touch, by id, with the cells that most files have."""
+def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]:
+    """Return the grids of the tiles that the DSM files touch, by id, with the most frequent cell size."""
     cell = Counter(p.file.cell for p in dsm if p.file.crs == crs).most_common(1)[0][0]
     grids: dict[str, Grid] = {}
     for file, bounds in dsm:
@@ -150,31 +151,31 @@ def _cut(dsm: Sequence[_Placed], crs: str, size_m: float) -> dict[str, Grid]:
     return dict(sorted(grids.items()))
 
 
-def _near(grids: Mapping[str, Grid], files: Sequence[_Placed]) -> dict[str, _Near]:
+def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, _NearFiles]:
     """Return the files near each tile, by tile id."""
     cores = np.array([grid.bounds for grid in grids.values()])
-    theirs = np.array([placed.bounds for placed in files])
-    tree = shapely.STRtree(shapely.box(*theirs.T))
+    extents = np.array([placed.bounds for placed in files])
+    tree = shapely.STRtree(shapely.box(*extents.T))
     tile, file = tree.query(shapely.box(*(cores + REACH_M * np.array([-1, -1, 1, 1])).T))
     order = np.lexsort((file, tile))
     tile, file = tile[order], file[order]
     shared = np.hstack(
-        [np.maximum(cores[tile, :2], theirs[file, :2]), np.minimum(cores[tile, 2:], theirs[file, 2:])]
+        [np.maximum(cores[tile, :2], extents[file, :2]), np.minimum(cores[tile, 2:], extents[file, 2:])]
     )
     cell = next(iter(grids.values())).cell
     in_core = (shared[:, 2:] - shared[:, :2]).min(axis=1) > LATTICE_TOLERANCE * cell
     ends = np.searchsorted(tile, np.arange(len(grids) + 1))
     near = {}
     for tile_id, begin, end in zip(grids, ends[:-1], ends[1:], strict=True):
-        here, core = [files[k].file for k in file[begin:end]], in_core[begin:end]
-        near[tile_id] = _Near(here, list(compress(here, core)), shared[begin:end][core])
+        nearby, core = [files[k].file for k in file[begin:end]], in_core[begin:end]
+        near[tile_id] = _NearFiles(nearby, list(compress(nearby, core)), shared[begin:end][core])
     return near
 
 
 def _covered(
-    grids: Mapping[str, Grid], near: Mapping[str, _Near], min_cover: float
+    grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float
 ) -> tuple[dict[str, Grid], list[str]]:
-    """Return the tiles that the DSM's files cover well enough, and a note on the others."""
+    """Return the tiles of which the DSM files cover at least ``min_cover``, and a note on the others."""
     cover = {
         tile_id: _area(near[tile_id].shared) / (grid.width * grid.cell) ** 2
         for tile_id, grid in grids.items()
@@ -191,29 +192,29 @@ def _covered(
 
 
 def _area(boxes: NDArray[np.float64]) -> float:
-    """Return the area under boxes, ``(n, 4)``; ground that several share counts once."""
+    """Return the area of the union of boxes, ``(n, 4)`` (m2)."""
     return float(shapely.union_all(shapely.box(*boxes.T)).area)
 
 
-def _layer(name: str, near: _Near, values: tuple[int, ...], crs: str | None) -> Layer:
+def _layer(name: str, near: _NearFiles, values: tuple[int, ...], crs: str | None) -> Layer:
     bare = any(not file.has_crs for file in near.files)
     return Layer(name, tuple(file.name for file in near.files), values, crs if bare else None)
 
 
 def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:
-    """Return when a tile's DSM was taken (``date`` overrules its files), and whether that is only assumed."""
+    """Return the date of a tile's DSM (``date`` overrides its files), and whether it is only assumed."""
     if date is not None:
         return zoned(date), False
-    told = [file.taken for file in dsm if file.taken]
-    return (told[0], False) if told else (dsm[0].modified, True)
+    dates = [file.taken for file in dsm if file.taken]
+    return (dates[0], False) if dates else (dsm[0].modified, True)
 
 
 def assumed(tiles: Sequence[Tile]) -> list[str]:
-    """Return a note on the tiles whose date is only assumed."""
+    """Return a note on the tiles whose date is only assumed; empty if there are none."""
     undated = [tile.id for tile in tiles if tile.datetime_assumed]
     if not undated:
         return []
-    return [f"no date in the dsm of {_count(undated)}: the files' times stand in (--date sets it)"]
+    return [f"no date in the dsm of {_count(undated)}: the files' times are used instead (--date sets it)"]
 
 
 def _count(ids: Sequence[str]) -> str:

@@ -1,1 +1,1 @@
-"""What the header of an input file says: extent, CRS, units, bands; one file per kind of data."""
+"""Headers of input files: extent, CRS, units, bands; one module per kind of data."""

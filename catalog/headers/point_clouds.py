@@ -1,4 +1,4 @@
-"""Point clouds (LAS, LAZ, COPC): what their headers say, and their points in chunks."""
+"""Point clouds (LAS, LAZ, COPC): read their headers, and their points in chunks."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ SUFFIXES = (".las", ".laz")
 NOISE = (7, 18)
 """Classes of low and high noise (ASPRS LAS 1.4)."""
 CHUNK = 1_000_000
-"""Points decoded at a time: memory does not grow with the file."""
+"""Points decoded at a time, so that memory does not grow with the file."""
 RGB = ("red", "green", "blue")
 DEGREES = 360.0
 SLACK = 0.01
-"""Points may lie beyond the bounds in the header by this part of their size, and by one unit."""
+"""Points may exceed the header's bounds by this fraction of the extent plus one unit."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """What the header of a point cloud says; plan and heights in the file's own units."""
+    """The header of a point cloud; coordinates and heights in the file's own units."""
 
     path: Path
     points: int
@@ -39,16 +39,16 @@ class Cloud:
     heights: tuple[float, float]
     """Lowest and highest."""
     crs: str | None
-    """As WKT, or None if the file carries none that can be understood."""
+    """As WKT, or None if the file has no valid CRS."""
     has_colours: bool
-    """Whether there is room for colours; they may all be zero."""
+    """Whether the point format has colours; they may all be zero."""
     created: date | None
-    """When the file was written, not when the survey was flown."""
+    """Date when the file was written (not of the survey), or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Some points, in the file's own units."""
+    """Some points of a cloud, ``(n,)`` each, in the file's own units."""
 
     x: Floats
     y: Floats
@@ -60,33 +60,33 @@ class Chunk:
 
 
 def find(inputs: Collection[Path]) -> tuple[Path, ...]:
-    """Return the clouds among files and folders, each once and in order of their paths.
+    """Return the clouds among files and folders, each once, ordered by path.
 
     Raises
     ------
     CatalogError
-        If a folder has none, or there is no such file or folder.
+        If a folder has no cloud, or a file or folder does not exist.
     """
-    found: dict[Path, Path] = {}
+    clouds: dict[Path, Path] = {}
     for path in inputs:
-        inside = [path]
+        files = [path]
         if path.is_dir():
-            inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+            files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
         elif not path.exists():
             raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
-        if not inside:
+        if not files:
             raise CatalogError(f"no LAS or LAZ file in {path}; give the files, or the folder they lie in")
-        found.update({file.resolve(): file for file in inside})
-    return tuple(found[path] for path in sorted(found))
+        clouds.update({file.resolve(): file for file in files})
+    return tuple(clouds[path] for path in sorted(clouds))
 
 
 def inspect(path: Path) -> Cloud:
-    """Return what the header of a cloud says.
+    """Read the header of a cloud.
 
     Raises
     ------
     CatalogError
-        If the file is missing, no LAS or LAZ, cut short, or without points.
+        If the file is missing, not LAS or LAZ, truncated, or without points.
     """
     with _opened(path) as reader:
         header = reader.header
@@ -116,7 +116,7 @@ def inspect(path: Path) -> Cloud:
 
 
 def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iterator[Chunk]:
-    """Yield the points of a cloud, decoded once; withheld ones count as deleted.
+    """Yield the points of a cloud, decoded once; withheld points are left out.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
     Raises
     ------
     CatalogError
-        If the file is missing, unreadable, cut short or damaged. LAZ has no checksum: points that lie
-        beyond the bounds in the header tell the damage.
+        If the file is missing, unreadable, truncated or damaged. LAZ has no checksum: a file is taken as
+        damaged if points lie beyond the header's bounds.
     """
     with _opened(path) as reader:
         header, done = reader.header, 0
@@ -177,7 +177,7 @@ def _opened(path: Path) -> Any:
 
 
 def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
-    """Return what ``read`` returns; whatever the decoders may raise becomes one line."""
+    """Return the result of ``read``; turn any error of the decoders into a `CatalogError` of one line."""
     from laspy import LaspyException
 
     try:
@@ -195,7 +195,7 @@ def _crs(header: Any, bounds: Bounds) -> str | None:
         crs = header.parse_crs()
     except (CRSError, UnicodeDecodeError):
         return None
-    # GeoTIFF keys of a plane of one's own name its geographic base as well: laspy then returns degrees.
+    # GeoTIFF keys of a user-defined projection also name its geographic base CRS, which laspy then returns.
     if crs is None or (crs.is_geographic and max(map(abs, bounds)) > DEGREES):
         return None
     text: str = crs.to_wkt()

@@ -1,4 +1,4 @@
-"""Raster files in a folder: each opened once, for where it lies and when it was taken."""
+"""Raster files in a folder: extent, CRS, cell size and date, read by opening each file once."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.storage.paths import gdal_options
 
 GDAL = {
-    # A folder of 10,000 files is not listed anew for each of them; side-car files are still found.
+    # Do not list the folder for every file (it may hold 10,000); side-car files are still opened.
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
-    # GeoTIFF 1.0 files keep their vertical CRS to themselves otherwise.
+    # Otherwise GDAL does not report the vertical CRS of GeoTIFF 1.0 files.
     "GTIFF_REPORT_COMPD_CS": "YES",
-    # GDAL would leave a note of a packed file's size beside it.
+    # Do not write a file with the unpacked size beside a .gz file.
     "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
 }
 
 
 @dataclass(frozen=True)
 class RasterFile:
-    """What one opening of a file told."""
+    """The header of a raster file."""
 
     name: str
-    """Relative to the folder, with forward slashes; absolute where it lies elsewhere."""
+    """Relative to the folder, with forward slashes; absolute if the file is outside the folder."""
     crs: str
-    """CRS in plan: ``EPSG:25832``, or WKT where there is no code."""
+    """Horizontal CRS: ``EPSG:25832``, or WKT where there is no code."""
     has_crs: bool
-    """False if the file carries no CRS and the caller's stands in."""
+    """False if the file has no CRS and the caller's is used."""
     bounds: Bounds
     cell: float
     """Cell size, rounded to 1e-6 (units of the CRS)."""
     width: int
     height: int
     taken: datetime | None
-    """By the file's tags, with a time zone."""
+    """Date in the file's tags, with a time zone, or None."""
     modified: datetime
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Open rasters as both the catalog and the tasks do; files without a georeference warn of nothing."""
+    """Set GDAL's options for catalog and tasks; suppress warnings about files without a georeference."""
     with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
@@ -70,53 +70,53 @@ def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[Ra
     root : Path
         The folder, resolved.
     layer : str
-        For the messages.
+        Name of the layer, for messages.
     pattern : str
         Glob pattern relative to ``root``.
     crs : str, optional
-        CRS of files that carry none.
+        CRS of files without one.
 
     Returns
     -------
     files : list of RasterFile
-        By name.
+        Ordered by name.
     notes : list of str
-        What was skipped and why, a line for each reason.
+        Skipped files, one line per reason.
 
     Raises
     ------
     CatalogError
-        If nothing matches or is usable, or a file without a CRS meets no ``crs``.
+        If no file matches or can be used, or a file has no CRS and ``crs`` is None.
     """
-    found, notes = opened(root, layer, matching(root, layer, pattern), crs)
-    if not found:
+    files, notes = opened(root, layer, matching(root, layer, pattern), crs)
+    if not files:
         raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {root}; {notes[0]}")
-    return found, notes
+    return files, notes
 
 
 def opened(
     root: Path, layer: str, paths: Iterable[Path], crs: str | None
 ) -> tuple[list[RasterFile], list[str]]:
-    """Open files of a layer, each once; return those that can be used, and what was skipped and why.
+    """Open files of a layer, each once; return the usable ones, and notes on skipped files.
 
     Raises
     ------
     CatalogError
-        If a file without a CRS meets no ``crs``.
+        If a file has no CRS and ``crs`` is None.
     """
-    found: list[RasterFile] = []
+    files: list[RasterFile] = []
     skipped: dict[str, list[str]] = defaultdict(list)
     with quiet():
         for path in paths:
             try:
-                found.append(_open(root, path, crs))
+                files.append(_open(root, path, crs))
             except _Skip as reason:
                 skipped[str(reason)].append(_name(root, path))
-    return found, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
+    return files, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
 
 
 def some(names: Sequence[str]) -> str:
-    """Return the first three names and how many more there are, for a message."""
+    """Return the first three names and the number of the others, for a message."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more
 
@@ -131,7 +131,7 @@ def matching(root: Path, layer: str, pattern: str) -> list[Path]:
     Raises
     ------
     CatalogError
-        If there is none; the line shows what there is.
+        If no file matches; the message shows which files exist.
     """
     try:
         paths = sorted(path for path in root.glob(pattern) if path.is_file())
@@ -139,14 +139,14 @@ def matching(root: Path, layer: str, pattern: str) -> list[Path]:
         raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {root}: {error}") from error
     if not paths:
         files = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
-        there = some(sorted(islice(files, 100)))
-        there = f"there are {there}" if there else "the folder is empty"
-        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {root}; {there}")
+        names = some(sorted(islice(files, 100)))
+        hint = f"there are {names}" if names else "the folder is empty"
+        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {root}; {hint}")
     return paths
 
 
 def _name(root: Path, path: Path) -> str:
-    """Return the path relative to the folder where it lies below it."""
+    """Return the path relative to the folder if it lies below it, else the whole path."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
@@ -157,20 +157,20 @@ def _open(root: Path, path: Path, crs: str | None) -> RasterFile:
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
     except (RasterioError, OSError) as error:
-        raise _Skip("not a raster GDAL can read") from error
+        raise _Skip("not a raster that GDAL can read") from error
     if transform.is_identity:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")
     if transform.b or transform.d:
         raise _Skip("a rotated raster; turn it north up with gdalwarp")
     name = _name(root, path)
     if not wkt and crs is None:
-        raise CatalogError(f"{name} carries no CRS; say which it is with --crs, e.g. --crs EPSG:25832")
+        raise CatalogError(f"{name} has no CRS; give it with --crs, e.g. --crs EPSG:25832")
     west, south, east, north = bounds
     return RasterFile(
         name=name,
         crs=in_plan(wkt or str(crs)),
         has_crs=bool(wkt),
-        # XYZ files that run northward are upside down for GDAL.
+        # GDAL swaps south and north of XYZ files that are sorted from south to north.
         bounds=(west, min(south, north), east, max(south, north)),
         cell=round(min(abs(transform.a), abs(transform.e)), 6),
         width=width,
@@ -184,7 +184,7 @@ def _taken(tags: Mapping[str, str]) -> datetime | None:
     for tag in ("ACQUISITIONDATETIME", "TIFFTAG_DATETIME"):
         text = tags.get(tag, "").strip()
         try:
-            # TIFF writes 2020:05:01, the rest of the world 2020-05-01.
+            # TIFF writes dates as 2020:05:01, ISO 8601 as 2020-05-01.
             return zoned(datetime.fromisoformat(text[:10].replace(":", "-") + text[10:]))
         except ValueError:
             continue
@@ -192,17 +192,17 @@ def _taken(tags: Mapping[str, str]) -> datetime | None:
 
 
 def zoned(date: datetime) -> datetime:
-    """Return the date with a time zone; UTC where it has none."""
+    """Return the date with a time zone: its own, else UTC."""
     return date if date.tzinfo else date.replace(tzinfo=UTC)
 
 
 def require_metric(file: RasterFile) -> None:
-    """Refuse a file whose plan counts in anything but metres.
+    """Check that a file's horizontal CRS is in metres.
 
     Raises
     ------
     CatalogError
-        The line names the command that reprojects it.
+        If it is not; the message names the command that reprojects the file.
     """
     unit, metres = plan_unit(file.crs)
     if unit in ("metre", "meter") and metres == 1.0:
@@ -210,6 +210,6 @@ def require_metric(file: RasterFile) -> None:
     units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
     zone = utm_of(transform_bounds(file.crs, "EPSG:4326", *file.bounds))
     raise CatalogError(
-        f"{file.name} is in {short(file.crs)}, which counts in {units}; "
+        f"{file.name} is in {short(file.crs)}, whose unit is {units}; "
         f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}"
     )

@@ -1,4 +1,4 @@
-"""Vector files of roads, named by the tiles they reach: any format GDAL reads, wherever the file lies."""
+"""Vector files of roads, in any format that GDAL reads, and the tiles that they reach."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 @dataclass(frozen=True)
 class VectorFile:
-    """What one opening of a file told."""
+    """The header of a vector file."""
 
     path: Path
     """Absolute."""
     has_crs: bool
-    """False if the file carries no CRS and the caller's stands in."""
+    """False if the file has no CRS and the caller's is used."""
     extents: tuple[tuple[str, Bounds], ...] | None
-    """CRS and bounds of each layer with features, or None where only reading all of them would tell."""
+    """CRS and bounds of each layer with features, or None if the format does not store them."""
 
 
 def find(root: Path, given: str, crs: str | None) -> list[VectorFile]:
@@ -39,12 +39,12 @@ def find(root: Path, given: str, crs: str | None) -> list[VectorFile]:
     given : str
         A file, or a glob pattern relative to ``root``.
     crs : str, optional
-        CRS of files that carry none.
+        CRS of files without one.
 
     Raises
     ------
     CatalogError
-        If there is no such file, or one is no vector file or has no CRS.
+        If there is no such file, or a file is not a vector file or has no CRS.
     """
     paths = [Path(given)] if Path(given).is_file() else matching(root.resolve(), "roads", given)
     return [opened(path, crs) for path in paths]
@@ -56,25 +56,25 @@ def opened(path: Path, crs: str | None) -> VectorFile:
     Raises
     ------
     CatalogError
-        If it is no vector file, or has no CRS and ``crs`` is None.
+        If it is not a vector file, or has no CRS and ``crs`` is None.
     """
     import pyogrio
 
     try:
         names = [name for name, kind in pyogrio.list_layers(path) if kind is not None]
         infos = [pyogrio.read_info(path, layer=name) for name in names]
-        # OSM's own format knows its bounds only after all of it was read.
-        far = any(info["driver"] == "OSM" for info in infos)
-        if not far:
+        # The bounds of an OSM file are known only after reading all of it.
+        no_bounds = any(info["driver"] == "OSM" for info in infos)
+        if not no_bounds:
             infos = [pyogrio.read_info(path, layer=name, force_total_bounds=True) for name in names]
     except (RuntimeError, ValueError) as error:
-        raise CatalogError(f"--roads {path} is no vector file: {error}") from error
+        raise CatalogError(f"--roads {path} is not a vector file: {error}") from error
     if not infos:
-        raise CatalogError(f"--roads {path} is no vector file: it has no layer with geometries")
+        raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
     has_crs = all(info["crs"] for info in infos)
     if not has_crs and crs is None:
         raise CatalogError(
-            f"--roads {path} carries no CRS; say which it is with --crs, or give it one with ogr2ogr -a_srs"
+            f"--roads {path} has no CRS; give it with --crs, or add it to the file with ogr2ogr -a_srs"
         )
     # An empty layer has no bounds.
     extents = tuple(
@@ -82,11 +82,11 @@ def opened(path: Path, crs: str | None) -> VectorFile:
         for info in infos
         if info["total_bounds"] is not None
     )
-    return VectorFile(path.resolve(), has_crs, None if far else extents)
+    return VectorFile(path.resolve(), has_crs, None if no_bounds else extents)
 
 
 def with_roads(tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None) -> tuple[Tile, ...]:
-    """Return the tiles with the files that come within `REACH_M` of each as its layer ``roads``.
+    """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
 
     Raises
     ------
@@ -96,25 +96,25 @@ def with_roads(tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | No
     reached = [_reached(file, tiles) for file in files]
     for file, reaches in zip(files, reached, strict=True):
         if not reaches.any():
-            raise CatalogError(f"--roads {file.path} reaches no tile; check its CRS and its place")
+            raise CatalogError(f"--roads {file.path} reaches no tile; check its CRS and its extent")
     return tuple(
-        _named(tile, [file for file, reaches in zip(files, reached, strict=True) if reaches[i]], crs)
+        _with_layer(tile, [file for file, reaches in zip(files, reached, strict=True) if reaches[i]], crs)
         for i, tile in enumerate(tiles)
     )
 
 
 def _reached(file: VectorFile, tiles: Sequence[Tile]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return the tiles near the file, ``(n,)``; all where it does not tell its bounds."""
+    """Return which tiles are near the file, ``(n,)``; all of them if the file has no bounds."""
     if file.extents is None:
         return np.ones(len(tiles), bool)
     near = np.zeros(len(tiles), bool)
     for target in {tile.grid.crs for tile in tiles}:
-        here = np.array([tile.grid.crs == target for tile in tiles])
+        in_target = np.array([tile.grid.crs == target for tile in tiles])
         grown = shapely.box(*np.array([tile.grid.buffered(REACH_M).bounds for tile in tiles]).T)
         for crs, bounds in file.extents:
             box = _box(crs, target, bounds)
-            # Bounds that have no place in the tiles' CRS may be wider than what lies near the tiles.
-            near |= here & (shapely.intersects(grown, box) if box else True)
+            # Bounds that cannot be transformed may still hold features near the tiles.
+            near |= in_target & (shapely.intersects(grown, box) if box else True)
     return near
 
 
@@ -126,7 +126,7 @@ def _box(crs: str, target: str, bounds: Bounds) -> shapely.Polygon | None:
     return shapely.box(*placed) if np.isfinite(placed).all() else None
 
 
-def _named(tile: Tile, files: Sequence[VectorFile], crs: str | None) -> Tile:
+def _with_layer(tile: Tile, files: Sequence[VectorFile], crs: str | None) -> Tile:
     if not files:
         return tile
     root = Path(tile.root)

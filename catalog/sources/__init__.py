@@ -1,1 +1,1 @@
-"""One file per kind of input folder; each turns it into tiles."""
+"""Sources of tiles: one module per kind of input folder."""

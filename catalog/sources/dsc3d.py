@@ -1,8 +1,8 @@
-"""DSC3D, the DeepScenario Open 3D Dataset: scenes of any size, rastered from photogrammetric meshes.
+"""DSC3D, the DeepScenario Open 3D Dataset: scenes of any size, rasterised from photogrammetric meshes.
 
-The paper evaluates on rasters made from the scenes' meshes, with true heights of their own; this source
-reads such rasters, one set per scene. How anyone's folder names them is not known here, so templates tell
-(`catalog.layout`); those of ``configs/dsc3d.yaml`` are a guess until one has seen the folder.
+The paper evaluates on rasters made from the scenes' meshes, with separate true heights. This source reads
+such rasters, one set per scene. File names differ between users, so templates describe them
+(`catalog.path_templates`); the templates in ``configs/dsc3d.yaml`` are a guess, to be adapted to the folder.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None
     root : Path
         The folder.
     layout : Mapping[str, Any]
-        ``layers`` (templates), ``road_values`` and ``crs``, as a configuration's ``dataset`` holds them.
+        ``layers`` (templates), ``road_values`` and ``crs``, as in a configuration's ``dataset``.
     date : datetime, optional
-        When the data was taken; overrules the files.
+        Date of the survey; overrides the files' dates.
 
     Raises
     ------
     CatalogError
-        If the layout is none, or the folder does not hold what it says.
+        If the layout is invalid, or the folder does not match it.
     """
-    found = read(root, Layout.of(layout), dataset=DATASET, date=date)
-    untold = [tile.id for tile in found.tiles if tile.layer("reference") is None]
-    if not untold:
-        return found
-    # The paper's truth takes roads from the filtered DSM, terrain from the refined DTM.
-    note = f"no reference for {some(untold)}: the DTM stands in for it, unlike in the paper"
-    return replace(found, notes=(*found.notes, note))
+    result = read(root, Layout.of(layout), dataset=DATASET, date=date)
+    without = [tile.id for tile in result.tiles if tile.layer("reference") is None]
+    if not without:
+        return result
+    # The paper's reference takes roads from the filtered DSM and terrain from the refined DTM.
+    note = f"no reference for {some(without)}: the DTM is used instead, unlike in the paper"
+    return replace(result, notes=(*result.notes, note))

@@ -1,7 +1,7 @@
 """GeRoD, the paper's GeoRoad dataset: 240 tiles of 250 x 250 m of North Rhine-Westphalia.
 
-How the published archive names its files is not known here, so templates tell (`catalog.layout`); those
-of ``configs/gerod.yaml`` are a guess until one has seen the archive.
+The file names of the published archive are not fixed here; templates describe them
+(`catalog.path_templates`). The templates in ``configs/gerod.yaml`` are a guess, to be adapted to the archive.
 """
 
 from __future__ import annotations
@@ -33,31 +33,32 @@ def index(root: Path, layout: Mapping[str, Any], *, date: datetime | None = None
     root : Path
         The folder.
     layout : Mapping[str, Any]
-        ``layers`` (templates), ``road_values`` and ``crs``, as a configuration's ``dataset`` holds them.
+        ``layers`` (templates), ``road_values`` and ``crs``, as in a configuration's ``dataset``.
     date : datetime, optional
-        When the data was taken; overrules the files.
+        Date of the survey; overrides the files' dates.
 
     Raises
     ------
     CatalogError
-        If the layout is none, or the folder does not hold what it says.
+        If the layout is invalid, or the folder does not match it.
     """
-    found = read(root, Layout.of(layout), dataset=DATASET, date=date)
-    notes = (*found.notes, *_elsewhere(found.tiles))
-    if len(found.tiles) != TILES:
-        notes += (f"{len(found.tiles)} of the dataset's {TILES} tiles are here",)
-    return replace(found, notes=notes)
+    result = read(root, Layout.of(layout), dataset=DATASET, date=date)
+    notes = (*result.notes, *_misplaced(result.tiles))
+    if len(result.tiles) != TILES:
+        notes += (f"{len(result.tiles)} of the dataset's {TILES} tiles are here",)
+    return replace(result, notes=notes)
 
 
-def _elsewhere(tiles: Sequence[Tile]) -> list[str]:
-    """Return a note on tiles that do not lie at their ids: a wrong template or CRS shows there."""
-    off = [tile.id for tile in tiles if not _at_its_id(tile)]
-    return [f"not at the corner that its name tells: {some(off)}; are layout and CRS right?"] if off else []
+def _misplaced(tiles: Sequence[Tile]) -> list[str]:
+    """Return a note on tiles that are not at the corner in their id: the template or CRS is wrong."""
+    off = [tile.id for tile in tiles if not _is_at_id(tile)]
+    return [f"not at the corner given by the tile's name: {some(off)}; check layout and CRS"] if off else []
 
 
-def _at_its_id(tile: Tile) -> bool:
+def _is_at_id(tile: Tile) -> bool:
+    """Return whether the tile's south-west corner is the one in its id, to within one cell."""
     corner = CORNER.fullmatch(tile.id)
-    # Rasters of points, as some programs write them, begin half a cell before the corner.
+    # Some programs write rasters of points, which begin half a cell before the corner.
     return (
         corner is not None and math.dist(map(float, corner.groups()), tile.grid.bounds[:2]) <= tile.grid.cell
     )

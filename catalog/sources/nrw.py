@@ -1,9 +1,9 @@
-"""Downloads of Geobasis NRW (North Rhine-Westphalia), known by their names and cut into tiles.
+"""Downloads of Geobasis NRW (North Rhine-Westphalia), recognised by their names and cut into tiles.
 
 The state delivers squares of a kilometre, as in ``dom1_32_356_5699_1_nw_2020.tif``: product, UTM zone,
 kilometres of the south-west corner, length of the side (km), state, year of the survey (in newer names).
 ``dom1`` is the surface model, ``dgm1`` the terrain model, ``dop10rgbi`` the orthophoto, ``3dm`` the
-classified point cloud. The names tell what a file is and of which year; where it lies tells the file.
+classified point cloud. Product and year are taken from the name, the position from the file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexroad.catalog.tile import Tile
 from flexroad.catalog.tiling import TilingResult, cut
 
 CRS = "EPSG:25832"
-"""The state's own, which its XYZ files do not carry."""
+"""CRS of all downloads; XYZ files do not declare it."""
 DATASET = "Geobasis NRW"
 
 NAME = re.compile(
@@ -33,24 +33,24 @@ NAME = re.compile(
     re.IGNORECASE,
 )
 LAYER_OF = {"dom": "dsm", "dgm": "dtm", "dop": "dop"}
-"""Layer by the first letters of the product; point clouds are none."""
+"""Layer by the first letters of the product; point clouds are not a layer."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """What a file's name tells."""
+    """A downloaded file and the properties in its name."""
 
     path: Path
     layer: str | None
     """Layer of the catalog, or None for a point cloud."""
     square: Bounds
-    """Where the file should lie (m, EPSG:25832)."""
+    """Bounds according to the name (m, EPSG:25832)."""
     year: int
-    """Year of the survey; 0 where the name has none."""
+    """Year of the survey; 0 if the name has none."""
 
 
 def parse(path: Path) -> Download | None:
-    """Return what the name of a download tells, or None if it is none of Geobasis NRW."""
+    """Return the properties in a file's name, or None if it is not a download of Geobasis NRW."""
     name = NAME.fullmatch(path.name)
     if name is None:
         return None
@@ -70,56 +70,57 @@ def index(
     derived: Path | None = None,
     roads: str | None = None,
 ) -> TilingResult:
-    """Cut the downloads below a folder into tiles; where years overlap, the newest one counts.
+    """Cut the downloads below a folder into tiles; where years overlap, the newest one is used.
 
     Parameters
     ----------
     root : Path
-        The folder; files may lie in folders below it.
+        The folder; subfolders are searched as well.
     road_mask : str, optional
-        Glob pattern, relative to ``root``, of rasters with road cells: the state has none.
+        Glob pattern, relative to ``root``, of rasters with road cells; the state does not provide any.
     road_values : tuple of int
         Cell values that mean road in them; empty: every value but 0 and nodata.
     tile_size_m : float
         Edge of a tile (m).
     date : datetime, optional
-        When the data was taken; overrules names and tags.
+        Date of the survey; overrides the dates in names and tags.
     min_cover : float
         Tiles of which the surface model covers less than this share (0 to 1) are left out.
     derived : Path, optional
-        Folder for rasters of the bridge points (class 17) of the point clouds, which with the terrain
-        model make the paper's extended DTM; without it the clouds are left unread, with a note.
+        Folder for rasters of the bridge points (class 17) of the point clouds; together with the terrain
+        model they are the paper's extended DTM. If None, the clouds are not read, and a note is added.
     roads : str, optional
         Vector files of roads: a file, or a glob pattern relative to ``root``.
 
     Raises
     ------
     CatalogError
-        If there is no surface model, the mask's or the roads' pattern finds nothing, or no tile is left.
+        If there is no surface model, no file matches the pattern of the mask or the roads, or no tile is
+        left.
     """
     root = root.resolve()
     downloads = _downloads(root)
-    found: dict[str, list[RasterFile]] = {}
+    layer_files: dict[str, list[RasterFile]] = {}
     bridges, notes = _bridges(root, downloads, derived)
     if bridges:
-        found["bridges"] = bridges
+        layer_files["bridges"] = bridges
     for layer in LAYER_OF.values():
         named = [download for download in downloads if download.layer == layer]
         files, skipped = opened(root, layer, [download.path for download in named], CRS)
         files, misplaced = _placed(root, files, named)
         notes += [*skipped, *misplaced]
         if files:
-            found[layer] = files
-    if "dsm" not in found:
+            layer_files[layer] = files
+    if "dsm" not in layer_files:
         raise CatalogError(
-            f"no dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz of use below {root}; {_seen(root, notes)}"
+            f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {_hint(root, notes)}"
         )
     if road_mask is not None:
-        found["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS)
+        layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS)
         notes += skipped
     indexed = cut(
         root,
-        found,
+        layer_files,
         road_values=road_values,
         tile_size_m=tile_size_m,
         date=date,
@@ -136,7 +137,7 @@ def index(
 
 
 def _downloads(root: Path) -> list[Download]:
-    """Return the downloads below a folder, newest first, as the first with a value wins."""
+    """Return the downloads below a folder, newest first, because the first file with a value is used."""
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
     parsed = (parse(path) for path in sorted(root.rglob("*")) if path.is_file())
@@ -146,25 +147,25 @@ def _downloads(root: Path) -> list[Download]:
 def _placed(
     root: Path, files: Sequence[RasterFile], named: Sequence[Download]
 ) -> tuple[list[RasterFile], list[str]]:
-    """Return the files that lie where their names say, with the years of these, and notes on the others."""
-    told = {download.path.relative_to(root).as_posix(): download for download in named}
+    """Return the files whose position matches their name, dated by it, and notes on the others."""
+    by_name = {download.path.relative_to(root).as_posix(): download for download in named}
     kept, notes = [], []
     for file in files:
-        download = told[file.name]
+        download = by_name[file.name]
         west, south, east, north = download.square
         x, y = (file.bounds[0] + file.bounds[2]) / 2, (file.bounds[1] + file.bounds[3]) / 2
         if file.crs == CRS and west < x < east and south < y < north:
             kept.append(_dated(file, download.year))
         else:
             notes.append(
-                f"skipped {file.name} ({download.layer}): it lies at {x:.0f} {y:.0f} in {short(file.crs)}, "
-                f"not where its name says; download it again"
+                f"skipped {file.name} ({download.layer}): its centre {x:.0f} {y:.0f} in {short(file.crs)} "
+                f"does not match its name; download it again"
             )
     return kept, notes
 
 
 def _dated(file: RasterFile, year: int) -> RasterFile:
-    """Return the file with the year of its name, unless its tags know the day in that year."""
+    """Return the file dated by the year in its name, unless its tags give a date in that year."""
     if not year or (file.taken and file.taken.year == year):
         return file
     return replace(file, taken=datetime(year, 1, 1, tzinfo=UTC))
@@ -179,7 +180,7 @@ def _bridges(
     if not clouds:
         return [], []
     if derived is None:
-        return [], [f"point clouds are left unread, so the reference lacks the bridges in {some(names)}"]
+        return [], [f"point clouds were not read, so the reference lacks the bridges in {some(names)}"]
     targets, notes = [], []
     for cloud in clouds:
         target = derived.resolve() / f"{cloud.path.stem}_bridges.tif"
@@ -196,10 +197,11 @@ def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
     lacking = [tile.id for tile in tiles if tile.layer("dtm") is None]
     if not lacking:
         return []
-    return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model, too"]
+    return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model as well"]
 
 
-def _seen(root: Path, notes: Sequence[str]) -> str:
+def _hint(root: Path, notes: Sequence[str]) -> str:
+    """Return the end of the error for a folder without a DSM: the first note, else which files exist."""
     if notes:
         return notes[0]
     files = sorted(path.name for path in root.rglob("*") if path.is_file())

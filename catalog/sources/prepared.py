@@ -1,9 +1,9 @@
-"""The folder FlexRoad's own makers write: ``FOLDER/<layer>/<tile id>.tif``, one GeoTIFF a layer and tile.
+"""Folders written by FlexRoad itself: ``FOLDER/<layer>/<tile id>.tif``, one GeoTIFF per layer and tile.
 
-Both directions stand here, so that no other file need know the layout. Tile, layer, stratum and date
-travel as tags inside the files; names of files are for people. Heights are float32, which is exact to
-0.03 mm below 512 m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 where there is road. The
-orthophoto has pixels of its own size over the same ground.
+This module both writes and reads them. Tile id, layer, stratum and date are stored as tags in the files;
+file names are never parsed. Heights are float32, which is exact to 0.03 mm below 512 m and to 0.5 mm anywhere
+on Earth; NaN is nodata. Masks are 1 where there is road. The orthophoto has its own pixel size over the same
+bounds.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from flexroad.catalog.tile import LAYERS, Layer, Tile
 HEIGHTS = ("dsm", "dtm", "reference")
 MASKS = ("road_mask", "reference_road")
 PHOTO = "dop"
-KNOWN = (*HEIGHTS, *MASKS, PHOTO)
+SUPPORTED = (*HEIGHTS, *MASKS, PHOTO)
 
 TILE_TAG, LAYER_TAG, STRATUM_TAG = "FLEXROAD_TILE", "FLEXROAD_LAYER", "FLEXROAD_STRATUM"
 DATASET_TAG = "FLEXROAD_DATASET"
 DATE_TAG, DATE_FORMAT = "TIFFTAG_DATETIME", "%Y:%m:%d %H:%M:%S"
-"""TIFF knows no time zone: ours is UTC."""
+"""TIFF dates have no time zone; they are written and read as UTC."""
 
 
 def write_tile(
@@ -46,34 +46,34 @@ def write_tile(
     date: datetime | None = None,
     dataset: str = "",
 ) -> None:
-    """Write a tile's layers; files already there are replaced, each at once.
+    """Write a tile's layers; existing files are replaced, each atomically.
 
     Parameters
     ----------
     folder : Path
-        Where the layers' folders are or will be.
+        Parent of the layers' folders.
     tile_id : str
         The tile's id, unique in the folder.
     grid : Grid
-        The cells of every layer but ``dop``.
+        Grid of every layer but ``dop``.
     layers : mapping of str to (H, W) array
-        By layer name: heights (m) as ``dsm``, ``dtm`` and ``reference``, masks as ``road_mask`` and
+        Arrays by layer name: heights (m) as ``dsm``, ``dtm`` and ``reference``, masks as ``road_mask`` and
         ``reference_road``, red, green and blue (uint8) as ``dop``, ``(3, h, w)`` over the grid's bounds.
     stratum : str
         Class of area for reports.
     date : datetime, optional
-        When the data was taken, with a time zone.
+        Date of the survey, with a time zone.
     dataset : str
-        What reports call the data.
+        Name of the data in reports.
 
     Raises
     ------
     CatalogError
-        If a layer is unknown here or does not fit the grid, if the id makes no file name, or if the CRS or
-        the folder does not do.
+        If a layer is not supported or does not fit the grid, the id is not a valid file name, the CRS is
+        invalid, or the folder cannot be written.
     """
     if not tile_id or Path(tile_id).name != tile_id:
-        raise CatalogError(f"tile id {tile_id!r} makes no file name in {folder}; leave out slashes")
+        raise CatalogError(f"tile id {tile_id!r} is not a valid file name in {folder}; leave out slashes")
     tags = {TILE_TAG: tile_id, STRATUM_TAG: stratum, DATASET_TAG: dataset}
     if date is not None:
         tags[DATE_TAG] = date.astimezone(UTC).strftime(DATE_FORMAT)
@@ -84,18 +84,18 @@ def write_tile(
 
 
 def index(folder: Path) -> list[Tile]:
-    """Return the tiles whose layers lie in a folder that `write_tile` filled, in the order of their ids.
+    """Return the tiles of a folder written by `write_tile`, in the order of their ids.
 
     Raises
     ------
     CatalogError
-        If there is no layer, if a file is no GeoTIFF or lacks its tags, or if the files of a tile
-        contradict each other.
+        If there is no layer, a file is not a GeoTIFF or lacks its tags, or the files of a tile contradict
+        each other.
     """
     root = folder.resolve()
     files = [path for name in LAYERS for path in sorted((root / name).glob("*.tif"))]
     if not files:
-        raise CatalogError(f"no LAYER/*.tif in {folder} with LAYER one of {', '.join(KNOWN)}")
+        raise CatalogError(f"no LAYER/*.tif in {folder} with LAYER one of {', '.join(SUPPORTED)}")
     by_id: dict[str, list[_File]] = {}
     for path in files:
         file = _read(path)
@@ -105,7 +105,7 @@ def index(folder: Path) -> list[Tile]:
 
 @dataclass(frozen=True)
 class _File:
-    """What one file says about itself."""
+    """The header and tags of one file."""
 
     path: Path
     tile_id: str
@@ -117,8 +117,8 @@ class _File:
 
 
 def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
-    if name not in KNOWN:
-        raise CatalogError(f"no layer {name!r} in a prepared folder; known are {', '.join(KNOWN)}")
+    if name not in SUPPORTED:
+        raise CatalogError(f"no layer {name!r} in a prepared folder; layers are {', '.join(SUPPORTED)}")
     if name == PHOTO:
         fits = array.ndim == 3 and len(array) == 3 and array.dtype == np.uint8
         if not fits or array.shape[1] * grid.width != array.shape[2] * grid.height:
@@ -131,7 +131,7 @@ def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
 
 
 def _bands(name: str, array: NDArray[Any]) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Return what a file holds, ``(bands, H, W)``, and how it is kept."""
+    """Return the bands of a file, ``(bands, H, W)``, and its creation options."""
     if name == PHOTO:
         return array, {"photometric": "RGB", "interleave": "pixel", "predictor": 2}
     if name in HEIGHTS:
@@ -164,7 +164,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
             dataset.update_tags(**tags)
         temporary.replace(path)
     except (OSError, RasterioIOError, CRSError) as error:
-        # GDAL's own reason is the cause of rasterio's.
+        # rasterio's error has GDAL's error, with the reason, as its cause.
         raise CatalogError(f"cannot write {path}: {error.__cause__ or error}") from error
     finally:
         with contextlib.suppress(OSError):
@@ -177,14 +177,14 @@ def _read(path: Path) -> _File:
             tags, transform, crs = dataset.tags(), dataset.transform, dataset.crs
             width, height = dataset.width, dataset.height
     except RasterioIOError as error:
-        raise CatalogError(f"{path} is no GeoTIFF: {error}") from error
+        raise CatalogError(f"{path} is not a GeoTIFF: {error}") from error
     missing = [tag for tag in (TILE_TAG, LAYER_TAG) if not tags.get(tag)]
     if missing or crs is None:
         lack = ", ".join(missing) or "CRS"
-        raise CatalogError(f"{path} carries no {lack}; it was not made by FlexRoad, catalog it as rasters")
+        raise CatalogError(f"{path} has no {lack}; FlexRoad did not write it, so catalog it as rasters")
     cell = transform.a
     if (transform.b, transform.d, transform.e) != (0, 0, -cell):
-        raise CatalogError(f"{path} has no square north-up cells: {tuple(transform)[:6]}; write it anew")
+        raise CatalogError(f"{path} has no square north-up cells: {tuple(transform)[:6]}; write it again")
     return _File(
         path=path,
         tile_id=tags[TILE_TAG],
@@ -203,26 +203,26 @@ def _date(path: Path, tag: str | None) -> datetime | None:
         return datetime.strptime(tag, DATE_FORMAT).replace(tzinfo=UTC)
     except ValueError as error:
         raise CatalogError(
-            f"{path} has {DATE_TAG} {tag!r}, not YYYY:MM:DD HH:MM:SS; write it anew"
+            f"{path} has {DATE_TAG} {tag!r}, not YYYY:MM:DD HH:MM:SS; write it again"
         ) from error
 
 
 def _tile(files: Iterable[_File], root: Path) -> Tile:
-    """Return the tile that files of one id make; the files come in the order of `LAYERS`."""
+    """Return the tile made of the files of one id, given in the order of `LAYERS`."""
     files = list(files)
     first = next((file for file in files if file.layer != PHOTO), None)
     if first is None:
         raise CatalogError(
-            f"{files[0].path} is all there is of tile {files[0].tile_id}; a tile needs heights"
+            f"{files[0].path} is the only file of tile {files[0].tile_id}; a tile needs heights"
         )
     by_layer: dict[str, _File] = {}
     for file in files:
         if file.layer in by_layer:
             raise CatalogError(
-                f"{by_layer[file.layer].path} and {file.path} both say they are layer {file.layer} "
+                f"{by_layer[file.layer].path} and {file.path} are both tagged as layer {file.layer} "
                 f"of tile {file.tile_id}; remove one"
             )
-        _check_alike(first, file)
+        _check_same_tile(first, file)
         by_layer[file.layer] = file
     date = first.date or datetime.fromtimestamp(first.path.stat().st_mtime, UTC)
     return Tile(
@@ -241,18 +241,18 @@ def _tile(files: Iterable[_File], root: Path) -> Tile:
     )
 
 
-def _check_alike(first: _File, file: _File) -> None:
-    """Refuse files that contradict each other about their tile."""
-    for what in ("grid", "stratum", "dataset"):
-        mine, other = getattr(first, what), getattr(file, what)
-        if what == "grid" and file.layer == PHOTO and _same_ground(mine, other):
+def _check_same_tile(first: _File, file: _File) -> None:
+    """Raise an error if two files of a tile differ in grid, stratum or dataset."""
+    for name in ("grid", "stratum", "dataset"):
+        expected, value = getattr(first, name), getattr(file, name)
+        if name == "grid" and file.layer == PHOTO and _same_bounds(expected, value):
             continue
-        if mine != other:
+        if expected != value:
             raise CatalogError(
-                f"{first.path} and {file.path} of tile {file.tile_id} differ in {what}: "
-                f"{mine} and {other}; write the tile anew"
+                f"{first.path} and {file.path} of tile {file.tile_id} differ in {name}: "
+                f"{expected} and {value}; write the tile again"
             )
 
 
-def _same_ground(one: Grid, other: Grid) -> bool:
-    return one.crs == other.crs and np.allclose(one.bounds, other.bounds, rtol=0, atol=1e-3)
+def _same_bounds(a: Grid, b: Grid) -> bool:
+    return a.crs == b.crs and np.allclose(a.bounds, b.bounds, rtol=0, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Folders of rasters: GeoTIFF, ASCII grid, XYZ or VRT, in any cut, put into tiles; and roads as vectors."""
+"""Folders of rasters (GeoTIFF, ASCII grid, XYZ or VRT, of any extent), cut into tiles; roads as vectors."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ def index(
     crs: str | None = None,
     min_cover: float = 0.25,
 ) -> TilingResult:
-    """Cut the ground that the DSM files cover into tiles.
+    """Cut the area that the DSM files cover into tiles.
 
     Parameters
     ----------
     root : Path
         The folder.
     patterns : Mapping[str, str]
-        Layer name (see `catalog.LAYERS`) to glob pattern relative to ``root``; ``dsm`` must be there.
-        Of ``roads``, vector files, the pattern may be a file anywhere.
+        Layer name (see `catalog.LAYERS`) to glob pattern relative to ``root``; ``dsm`` is required. For
+        ``roads`` (vector files) the path of a file outside ``root`` is allowed as well.
     road_values : tuple of int
         Cell values that mean road in the masks; empty: every value but 0 and nodata.
     tile_size_m : float
         Edge of a tile (m); tiles lie on multiples of it in the DSM's CRS.
     date : datetime, optional
-        When the data was taken; overrules the files' tags.
+        Date of the survey; overrides the files' tags.
     crs : str, optional
-        CRS of files that carry none.
+        CRS of files without one.
     min_cover : float
-        Tiles of which the DSM's files cover less than this share (0 to 1) are left out.
+        Tiles of which the DSM files cover less than this share (0 to 1) are left out.
 
     Raises
     ------
     CatalogError
-        If a pattern finds nothing usable, the CRS is missing or not in metres, no tile is left, or a file
-        of roads reaches none.
+        If no usable file matches a pattern, the CRS is missing or not in metres, no tile is left, or a file
+        of roads reaches no tile.
     """
     root = root.resolve()
     _check(root, patterns)
@@ -72,7 +72,7 @@ def index(
 def _check(root: Path, patterns: Mapping[str, str]) -> None:
     unknown = sorted(set(patterns) - set(LAYERS))
     if unknown:
-        raise CatalogError(f"no layer is called {unknown[0]!r}; there are {', '.join(LAYERS)}")
+        raise CatalogError(f"unknown layer {unknown[0]!r}; layers are {', '.join(LAYERS)}")
     if "dsm" not in patterns:
         raise CatalogError("a catalog needs surface heights; give their files with --dsm")
     if not root.is_dir():

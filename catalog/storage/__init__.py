@@ -1,1 +1,1 @@
-"""Where files are: paths on disk and in object storage, and atomic writes."""
+"""Locations of files on disk and in object storage, and atomic writes."""

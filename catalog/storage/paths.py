@@ -1,11 +1,12 @@
-"""Where files are: on disk, or in object storage; the one file that knows the difference.
+"""File access on disk and in object storage; the only module that distinguishes the two.
 
-A place on disk is a plain `pathlib.Path`. One in a bucket, ``s3://bucket/name``, is a `upath.UPath`, and
-wants the extra ``s3``. Both join with ``/`` and have ``parent`` and ``name``; what touches files is here.
+A location on disk is a `pathlib.Path`. A location in a bucket, ``s3://bucket/name``, is a `upath.UPath` and
+needs the extra ``s3``. Both join with ``/`` and have ``parent`` and ``name``; reading, writing and listing
+files is done by the functions below.
 
-Nothing here tries again by itself: botocore (which s3fs stands on) and GDAL do, after pauses that grow, when
-storage throttles, answers 5xx or drops the connection. Both read the usual variables ``AWS_...``;
-`gdal_options` tells GDAL those that it knows by other names.
+This module does not retry requests. botocore (used by s3fs) and GDAL do, with growing pauses, when storage
+throttles, answers 5xx or drops the connection. Both read the usual variables ``AWS_...``; `gdal_options`
+passes on those that have another name in GDAL.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from upath import UPath
 Location = Path | UPath
 
 TRIES = 5
-"""How often a request is sent before it counts as failed, unless AWS_MAX_ATTEMPTS says otherwise."""
+"""Attempts per request before it fails, unless AWS_MAX_ATTEMPTS is set."""
 ROUNDS = 3
-"""How often s3fs, which alone sees an answer break off in the middle, begins with that anew."""
-# Path("s3://bucket") has lost a slash.
+"""Attempts of s3fs when an answer breaks off in the middle; botocore does not retry these."""
+# Path("s3://bucket") drops a slash.
 _BUCKET = re.compile(r"s3:/{1,2}(?=[^/])")
-# s3fs raises some without their number.
+# s3fs raises some of these without an errno.
 _NUMBERS = (
     (FileNotFoundError, errno.ENOENT),
     (PermissionError, errno.EACCES),
@@ -42,20 +43,21 @@ _YES = ("YES", "TRUE", "ON", "1")
 
 @dataclass(frozen=True)
 class FileStat:
-    """How a file looked."""
+    """Size and version of a file."""
 
     size: int
+    """Bytes."""
     version: int | str
-    """What changes with its bytes: the time (ns) on disk, the ETag in a bucket."""
+    """Changes when the file's content changes: modification time (ns) on disk, ETag in a bucket."""
 
 
 def parse_location(where: str | Location) -> Location:
-    """Return where a file is, by what an operator or a record calls it: a path, or s3://BUCKET/NAME.
+    """Return the location given as text: a path, or s3://BUCKET/NAME.
 
     Raises
     ------
     OSError
-        If it is in a bucket and s3fs is not installed; the line says how to get it.
+        If it is in a bucket and s3fs is not installed; the message gives the install command.
     """
     if isinstance(where, UPath):
         return where
@@ -76,22 +78,22 @@ def parse_location(where: str | Location) -> Location:
 
 
 def is_remote(where: Location) -> bool:
-    """Tell whether a file is in object storage."""
+    """Return whether a location is in object storage."""
     return not isinstance(where, Path)
 
 
 def absolute(where: Location) -> Location:
-    """Return a place that means the same to every process."""
+    """Return the location as an absolute path with links resolved; one in a bucket is unchanged."""
     return where.resolve() if isinstance(where, Path) else where
 
 
 def join(folder: str, name: str) -> str:
-    """Return what a file is called whose name is relative to a folder, a whole path or an address."""
-    return name if _BUCKET.match(name) else os.path.join(folder, name)  # noqa: PTH118 (places are slow)
+    """Return the full name of a file: relative names are joined to the folder, others are unchanged."""
+    return name if _BUCKET.match(name) else os.path.join(folder, name)  # noqa: PTH118 (UPath is slow)
 
 
 def normalise(name: str) -> str:
-    """Return an absolute path or address without ``..``, by the name alone: links are not followed."""
+    """Return an absolute path or address without ``..``; links are not followed."""
     bucket = _BUCKET.match(name)
     if bucket is None:
         return os.path.normpath(name if name.startswith("/") else Path(name).absolute())
@@ -99,21 +101,21 @@ def normalise(name: str) -> str:
 
 
 def gdal_name(where: Location) -> str:
-    """Return what GDAL calls a file."""
+    """Return GDAL's name of a file."""
     return str(where) if isinstance(where, Path) else f"/vsis3/{where.path}"
 
 
 def gdal_options() -> dict[str, str]:
-    """Return GDAL's options for object storage; what the environment sets for GDAL itself stands."""
+    """Return GDAL's options for object storage; options set in the environment are left out."""
     options = {
-        # A worker lives longer than a file: what was read of one is forgotten as it is closed.
+        # A file may change during a worker's life: drop its cached content when it is closed.
         "CPL_VSIL_CURL_NON_CACHED": "/vsis3/",
         "GDAL_HTTP_MAX_RETRY": str(_tries() - 1),
         "GDAL_HTTP_RETRY_DELAY": "0.5",
-        # 0: no answer at all.
+        # 0 means no answer.
         "GDAL_HTTP_RETRY_CODES": "0,429,500,502,503,504",
         "GDAL_HTTP_CONNECTTIMEOUT": "10",
-        # Not a limit on large files: less than a byte a second, for a minute.
+        # Give up below 1 byte per second for a minute; large files are not affected.
         "GDAL_HTTP_LOW_SPEED_LIMIT": "1",
         "GDAL_HTTP_LOW_SPEED_TIME": "60",
     }
@@ -127,50 +129,50 @@ def gdal_options() -> dict[str, str]:
 
 
 def stat(where: Location) -> FileStat | None:
-    """Return how a file looks, or None if it is not there.
+    """Return a file's size and version, or None if it does not exist.
 
     Raises
     ------
     OSError
-        If the storage does not answer; on disk, what cannot be looked at is not there.
+        If the storage does not answer. A file on disk that cannot be accessed gives None.
     """
     if isinstance(where, Path):
         try:
-            found = where.stat()
+            stats = where.stat()
         except OSError:
             return None
-        return FileStat(found.st_size, found.st_mtime_ns)
+        return FileStat(stats.st_size, stats.st_mtime_ns)
     try:
         with named(where):
-            return _seen(where.fs.info(where.path))
+            return _entry_stat(where.fs.info(where.path))
     except FileNotFoundError:
         return None
 
 
 def listing(folder: Location) -> dict[str, FileStat]:
-    """Return every file below a folder by its name relative to it: one sweep, or one paged list of a bucket.
+    """Return all files below a folder by their relative names; empty if the folder does not exist.
 
-    A folder that is not there has none.
+    In a bucket this is one (paged) list request.
     """
     if isinstance(folder, Path):
-        return dict(_swept(folder, ""))
+        return dict(_scan(folder, ""))
     with named(folder):
         return _files(folder, folder.fs.find(folder.path, detail=True))
 
 
 @dataclass(frozen=True)
 class StatCache:
-    """How files looked, each looked at once: the files of a bucket by one list of the folder they lie in.
+    """Sizes and versions of files, read once each; in a bucket, with one list request per folder.
 
-    Make one for each sweep over a catalog, and call it for each source: ``look = Sightings(); look(path)``
-    gives the same as ``stat(path)``. What changes while it lives is not noticed.
+    Create one per pass over a catalog: ``stat_of = StatCache(); stat_of(path)`` returns the same as
+    ``stat(path)``. Later changes of a file are not noticed.
     """
 
     _files: dict[Location, FileStat | None] = field(default_factory=dict)
     _folders: dict[str, dict[str, FileStat]] = field(default_factory=dict)
 
     def __call__(self, where: Location) -> FileStat | None:
-        """Return how a file looks, or None if it is not there.
+        """Return a file's size and version, or None if it does not exist.
 
         Raises
         ------
@@ -178,7 +180,7 @@ class StatCache:
             If the storage does not answer.
         """
         if not isinstance(where, Path):
-            # Its own ways to parent and name take as long as all the rest.
+            # UPath's `parent` and `name` would take as long as all the rest.
             folder, _, name = where.path.rpartition("/")
             if folder not in self._folders:
                 self._folders[folder] = _listed(where.parent)
@@ -189,19 +191,19 @@ class StatCache:
 
 
 def _listed(folder: UPath) -> dict[str, FileStat]:
-    """Return the files in a folder of a bucket, but not those in folders within."""
+    """Return the files in a folder of a bucket, without those in subfolders."""
     try:
         with named(folder):
-            there = {found["name"]: found for found in folder.fs.ls(folder.path, detail=True)}
+            entries = {entry["name"]: entry for entry in folder.fs.ls(folder.path, detail=True)}
     except FileNotFoundError:
         return {}
-    return _files(folder, there)
+    return _files(folder, entries)
 
 
 def sidecars(where: UPath) -> set[str]:
-    """Return the names of a file in a bucket and of those that differ in what follows its stem: one list.
+    """Return the names of a file in a bucket and of the files with the same stem, by one list request.
 
-    Asked before GDAL opens a file, it saves a dozen requests for files beside it that are seldom there.
+    Calling this before GDAL opens a file saves a dozen requests for side-car files, which are rare.
 
     Raises
     ------
@@ -214,7 +216,7 @@ def sidecars(where: UPath) -> set[str]:
 
 
 def exists(where: Location) -> bool:
-    """Tell whether there is such a file, or in a bucket anything below such a name."""
+    """Return whether the file exists, or in a bucket any file below its name."""
     if isinstance(where, Path):
         return where.exists()
     with named(where):
@@ -222,12 +224,12 @@ def exists(where: Location) -> bool:
 
 
 def read(where: Location) -> bytes:
-    """Return a file's bytes, by one request.
+    """Return a file's bytes; in a bucket, by one request.
 
     Raises
     ------
     OSError
-        FileNotFoundError if it is not there; it names the file.
+        If the file cannot be read, FileNotFoundError if it does not exist; names the file.
     """
     if isinstance(where, Path):
         return where.read_bytes()
@@ -237,12 +239,12 @@ def read(where: Location) -> bytes:
 
 
 def fetch(where: UPath, folder: Path) -> Path:
-    """Copy a file of a bucket, and those beside it that belong to it, into a folder; return the copy.
+    """Copy a file of a bucket and its side-car files into a folder; return the path of the copy.
 
     Raises
     ------
     OSError
-        If it is not there, or the storage does not answer.
+        If the file does not exist, or the storage does not answer.
     """
     for name in {where.name, *sidecars(where)}:
         source = where.parent / name
@@ -252,15 +254,15 @@ def fetch(where: UPath, folder: Path) -> Path:
 
 
 def write(where: Location, data: bytes) -> None:
-    """Write a file whole or not at all: renamed when it is whole, or by one request.
+    """Write a file atomically: to a temporary file that is then renamed, or in a bucket by one request.
 
     Raises
     ------
     OSError
-        If the disk is full or the folder cannot be written; it names the file, and nothing is left behind.
+        If the disk is full or the folder cannot be written; names the file. No temporary file is left.
     """
     if not isinstance(where, Path):
-        # A bucket shows a file when all of it has come, and not before.
+        # A file appears in a bucket only when it is complete.
         with named(where):
             where.fs.pipe_file(where.path, data)
         return
@@ -271,19 +273,19 @@ def write(where: Location, data: bytes) -> None:
 
 @contextlib.contextmanager
 def atomic_path(where: Path) -> Iterator[Path]:
-    """Give another file to write beside one, whose place it takes when it is whole.
+    """Yield a temporary file beside ``where``; rename it to ``where`` at the end of the block.
 
     Raises
     ------
     OSError
-        If it cannot be written; it names the place, and nothing is left behind.
+        If it cannot be written; names ``where``. No temporary file is left.
     """
     temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
     try:
         yield temporary
         temporary.replace(where)
     except OSError as error:
-        # A full disk names no file, a failed renaming the temporary one.
+        # The error of a full disk has no file name, that of a failed rename has the temporary one.
         number = error.errno or errno.EIO
         raise OSError(number, error.strerror or str(error), str(where)) from error
     finally:
@@ -292,7 +294,7 @@ def atomic_path(where: Path) -> Iterator[Path]:
 
 
 def remove(where: Location) -> None:
-    """Remove a file; one that is not there is no error."""
+    """Remove a file; do nothing if it does not exist."""
     if isinstance(where, Path):
         where.unlink(missing_ok=True)
         return
@@ -300,26 +302,28 @@ def remove(where: Location) -> None:
         where.fs.rm_file(where.path)
 
 
-def _swept(folder: Path, above: str) -> Iterator[tuple[str, FileStat]]:
+def _scan(folder: Path, prefix: str) -> Iterator[tuple[str, FileStat]]:
+    """Yield name and stat of all files below a folder; names start with ``prefix``."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         for entry in entries:
-            name = above + entry.name
+            name = prefix + entry.name
             if entry.is_dir():
-                yield from _swept(folder / entry.name, name + "/")
+                yield from _scan(folder / entry.name, name + "/")
             else:
                 with contextlib.suppress(FileNotFoundError):
-                    found = entry.stat()
-                    yield name, FileStat(found.st_size, found.st_mtime_ns)
+                    stats = entry.stat()
+                    yield name, FileStat(stats.st_size, stats.st_mtime_ns)
 
 
-def _files(folder: UPath, found: dict[str, Any]) -> dict[str, FileStat]:
-    """Return the files among what a list of a bucket holds, by their names relative to the folder."""
+def _files(folder: UPath, entries: dict[str, Any]) -> dict[str, FileStat]:
+    """Return the files among the entries of a bucket's list, by their names relative to the folder."""
     start = len(folder.path.rstrip("/")) + 1
-    named = {name[start:]: _seen(entry) for name, entry in found.items()}
-    return {name: seen for name, seen in named.items() if name and seen}
+    stats = {name[start:]: _entry_stat(entry) for name, entry in entries.items()}
+    return {name: stat for name, stat in stats.items() if name and stat}
 
 
-def _seen(entry: dict[str, Any]) -> FileStat | None:
+def _entry_stat(entry: dict[str, Any]) -> FileStat | None:
+    """Return the stat of a list entry, or None if it is not a file."""
     if entry["type"] != "file":
         return None
     return FileStat(int(entry["size"]), str(entry["ETag"]).strip('"'))
@@ -334,21 +338,21 @@ def _tries() -> int:
 
 
 def _s3_options() -> dict[str, Any]:
-    """Return what s3fs is told; credentials and region it finds as every program of AWS does."""
+    """Return the options of s3fs; it reads credentials and region itself, as AWS programs do."""
     config: dict[str, Any] = {
-        # The other modes give a process an allowance of second tries, which a night of stumbles uses up.
+        # The other modes limit the retries per process; a long run would use them up.
         "retries": {"total_max_attempts": _tries(), "mode": os.environ.get("AWS_RETRY_MODE") or "legacy"},
         "connect_timeout": 10,
         "read_timeout": 60,
     }
     options: dict[str, Any] = {
         "config_kwargs": config,
-        # What another process wrote a moment ago has to be seen.
+        # Files that another process has just written must be listed.
         "use_listings_cache": False,
         "anon": os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in _YES,
     }
     if endpoint := _endpoint():
-        # Private endpoints seldom have a name for each bucket.
+        # Private endpoints rarely have a host name per bucket.
         config["s3"] = {"addressing_style": "path"}
         options["endpoint_url"] = endpoint
     return options
@@ -356,7 +360,7 @@ def _s3_options() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def named(where: UPath) -> Iterator[None]:
-    """Turn what goes wrong with object storage into an OSError that names the file."""
+    """Turn errors of object storage into an OSError that names the file."""
     from aiohttp import ClientError
     from botocore.exceptions import BotoCoreError
 

@@ -1,6 +1,7 @@
-"""Files that grow or change in place, and large ones: a bucket takes only whole files, so they wait on disk.
+"""Local copies of files in a bucket that grow or change in place, or are large.
 
-On disk a mirror is the file itself, and costs nothing.
+A bucket stores only whole files, so such files are written locally and uploaded. For a location on disk the
+staged file is the file itself; nothing is copied.
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from pathlib import Path
 from flexroad.catalog.storage.paths import Location, atomic_path, read, write
 
 PUT_S = 60.0
-"""How often a mirror is put back."""
+"""Shortest time between two uploads (s)."""
 
 
 class StagedFile:
-    """A local file that stands for one in a bucket, and is put back now and then.
+    """A local copy of a file in a bucket that is uploaded from time to time.
 
     Parameters
     ----------
-    where : Place
+    where : Location
         The file.
     writable : bool
-        Whether to put it back, or only to read it.
+        Whether changes are uploaded; False for reading only.
 
     Attributes
     ----------
     path : Path
-        What to read and write.
+        The local file to read and write.
     """
 
     def __init__(self, where: Location, writable: bool = True) -> None:
@@ -46,7 +47,7 @@ class StagedFile:
         self._pause = PUT_S
 
     def fetch(self) -> None:
-        """Begin with what is there.
+        """Download the file; do nothing if it does not exist.
 
         Raises
         ------
@@ -58,7 +59,7 @@ class StagedFile:
                 self.path.write_bytes(read(self.where))
 
     def sync_if_due(self) -> None:
-        """Put the file back if that is due.
+        """Upload the file if the last upload is long enough ago.
 
         Raises
         ------
@@ -69,7 +70,7 @@ class StagedFile:
             self.put()
 
     def put(self) -> None:
-        """Put the file back.
+        """Upload the file.
 
         Raises
         ------
@@ -80,23 +81,23 @@ class StagedFile:
             start = time.monotonic()
             write(self.where, self.path.read_bytes())
             self._put = time.monotonic()
-            # The database of a state is large: no more than a twentieth of the time is spent on it.
+            # A run database may be large: spend at most a twentieth of the time on uploads.
             self._pause = max(PUT_S, 20 * (self._put - start))
 
     def close(self) -> None:
-        """Forget the local file."""
+        """Delete the local copy."""
         if self._folder:
             self._folder.cleanup()
 
 
 @contextlib.contextmanager
 def atomic_file(where: Location) -> Iterator[Path]:
-    """Give a local file to write; it takes its place when all of it is there.
+    """Yield a local file to write; at the end of the block, move or upload it to ``where``.
 
     Raises
     ------
     OSError
-        If it cannot be written; it names the place, and nothing is left behind.
+        If it cannot be written; names ``where``. No temporary file is left.
     """
     if not isinstance(where, Path):
         with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:

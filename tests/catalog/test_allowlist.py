@@ -1,4 +1,4 @@
-"""A catalog names no file outside its folder that the operator does not allow."""
+"""Files of a catalog must lie in its folder or in a folder that the operator allows."""
 
 from datetime import UTC, datetime
 
@@ -25,69 +25,69 @@ def catalog(*files, root) -> Catalog:
         ("s3:/bucket/my dsm/a.tif", "'s3://bucket/my dsm'"),
     ],
 )
-def test_a_file_outside_is_refused_and_the_option_named_that_allows_it(tmp_path, file, allow):
+def test_file_outside_folder_raises_error_with_option(tmp_path, file, allow):
     home = tmp_path / "home"
-    found = catalog("dsm/in.tif", file, root=home)
+    tile_catalog = catalog("dsm/in.tif", file, root=home)
     option = f"--allow {allow.format(tmp_path / 'dsm')}"
     with pytest.raises(CatalogError, match="^tile one: dsm names ") as caught:
-        check_allowed(found, home)
-    assert str(caught.value).endswith(f"if that is meant, add {option}")
-    (folder,) = needed(found, home)
+        check_allowed(tile_catalog, home)
+    assert str(caught.value).endswith(f"to allow it, add {option}")
+    (folder,) = needed(tile_catalog, home)
     assert folder in option
-    check_allowed(found, home, [folder])
-    check_allowed(found, home, [folder + "/"])
+    check_allowed(tile_catalog, home, [folder])
+    check_allowed(tile_catalog, home, [folder + "/"])
     with pytest.raises(CatalogError):
-        check_allowed(found, home, [folder + "-more"])
+        check_allowed(tile_catalog, home, [folder + "-more"])
 
 
 @pytest.mark.parametrize("file", ["https://host/a.tif", "file:///etc/passwd", "ftp://host/a", "HTTP:/host/a"])
-def test_other_addresses_are_never_read(tmp_path, file):
-    for found in (catalog(file, root=tmp_path), catalog("a.tif", root=file)):
+def test_other_addresses_are_never_allowed(tmp_path, file):
+    for tile_catalog in (catalog(file, root=tmp_path), catalog("a.tif", root=file)):
         with pytest.raises(CatalogError, match="fetch it first"):
-            check_allowed(found, tmp_path, ["/", file])
+            check_allowed(tile_catalog, tmp_path, ["/", file])
 
 
-def test_a_catalog_cannot_say_itself_where_its_folder_is(tmp_path):
-    """As the root that a run's own copy names."""
+def test_root_in_catalog_does_not_allow_files(tmp_path):
+    """The root of tiles is read from the catalog and must not be trusted."""
     with pytest.raises(CatalogError, match="--allow /etc"):
         check_allowed(catalog("passwd", root="/etc"), tmp_path)
 
 
-def test_folders_of_links_stay_usable(tmp_path):
+def test_folder_of_links_is_allowed(tmp_path):
     data, home = tmp_path / "data", tmp_path / "home"
     data.mkdir()
     home.mkdir()
     (home / "dsm").symlink_to(data)
     check_allowed(catalog("dsm/a.tif", root=home), home)
-    # By either name of the catalog's own folder.
+    # The catalog's folder may be given by either name.
     (tmp_path / "alias").symlink_to(home)
     check_allowed(catalog("dsm/a.tif", root=home), tmp_path / "alias")
     check_allowed(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
 
 
 @pytest.mark.slow
-def test_a_catalog_in_a_bucket_has_its_folder_there(bucket):
+def test_catalog_in_bucket_allows_only_its_folder(bucket):
     check_allowed(catalog("dsm/a.tif", root=bucket), bucket)
     for file in ("../a.tif", "../../other/a.tif", "/data/a.tif", f"{bucket}-more/a.tif"):
         with pytest.raises(CatalogError, match="--allow"):
             check_allowed(catalog(file, root=bucket), bucket)
 
 
-def test_what_needs_to_be_allowed_is_few(tmp_path):
-    def asked(*files):
+def test_needed_returns_few_folders(tmp_path):
+    def folders(*files):
         return needed(catalog(*files, root=tmp_path), tmp_path)
 
-    assert asked("a.tif", "b/c.tif") == ()
-    assert asked("/d/dsm/a.tif", "/d/dsm/b/a.tif", "/d/dsm-2/a.tif") == ("/d/dsm", "/d/dsm-2")
-    assert asked(*(f"/d/{i}/a.tif" for i in range(9))) == ("/d",)
-    assert asked(*(f"/{i}/a.tif" for i in range(9))) == tuple(f"/{i}" for i in range(9))
-    assert asked(*(f"s3://b/d/{i}/a.tif" for i in range(9))) == ("s3://b/d",)
+    assert folders("a.tif", "b/c.tif") == ()
+    assert folders("/d/dsm/a.tif", "/d/dsm/b/a.tif", "/d/dsm-2/a.tif") == ("/d/dsm", "/d/dsm-2")
+    assert folders(*(f"/d/{i}/a.tif" for i in range(9))) == ("/d",)
+    assert folders(*(f"/{i}/a.tif" for i in range(9))) == tuple(f"/{i}" for i in range(9))
+    assert folders(*(f"s3://b/d/{i}/a.tif" for i in range(9))) == ("s3://b/d",)
 
 
-def test_what_nobody_reads_may_lie_anywhere(tmp_path):
-    found = catalog("/elsewhere/a.tif", root=tmp_path)
+def test_layers_not_read_are_not_checked(tmp_path):
+    tile_catalog = catalog("/elsewhere/a.tif", root=tmp_path)
     others = set(LAYERS) - {"dsm"}
-    check_allowed(found, tmp_path, layers=others)
-    assert needed(found, tmp_path, others) == ()
+    check_allowed(tile_catalog, tmp_path, layers=others)
+    assert needed(tile_catalog, tmp_path, others) == ()
     with pytest.raises(CatalogError, match="--allow /elsewhere"):
-        check_allowed(found, tmp_path, layers={"dsm"})
+        check_allowed(tile_catalog, tmp_path, layers={"dsm"})

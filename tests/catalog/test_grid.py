@@ -8,7 +8,7 @@ UTM = "EPSG:25832"
 TILE = Grid(UTM, 295500.0, 5629500.0, 1.0, 250, 250)
 
 
-def test_centres_of_a_paper_tile_span_249_m():
+def test_paper_tile_centres_span_249_m():
     assert TILE.eastings[-1] - TILE.eastings[0] == 249
     assert TILE.northings[0] - TILE.northings[-1] == 249
     assert TILE.bounds == (295500, 5629250, 295750, 5629500)
@@ -26,23 +26,23 @@ def test_tile_ids_are_the_south_west_corner():
     ]
 
 
-def test_a_rounding_error_in_the_corner_adds_no_tile():
+def test_tiles_rounding_error_in_corner_adds_no_tile():
     almost = Grid(UTM, 295499.9999, 5629500.0001, 1.0, 250, 250)
     assert [i for i, _ in almost.tiles(250)] == ["295500_5629250"]
 
 
-def test_ids_west_and_south_of_the_origin():
+def test_tiles_negative_coordinates_give_negative_ids():
     assert [i for i, _ in Grid(UTM, -10.0, -5.0, 1.0, 5, 5).tiles(250)] == ["-250_-250"]
 
 
 @pytest.mark.parametrize("size", [250.5, 0.3])
-def test_a_tile_must_be_whole_metres_and_cells(size):
+def test_tiles_size_not_whole_raises_error(size):
     with pytest.raises(CatalogError, match="whole number"):
         list(TILE.tiles(size))
 
 
 @given(halo=st.floats(0, 60), cell=st.sampled_from([0.25, 0.5, 1.0, 2.0]))
-def test_core_sits_in_the_middle_of_its_buffer(halo, cell):
+def test_buffered_core_is_in_the_middle(halo, cell):
     core = Grid(UTM, 500000.0, 5600000.0, cell, 40, 30)
     outer = core.buffered(halo)
     rows, cols = outer.window(core)
@@ -51,7 +51,7 @@ def test_core_sits_in_the_middle_of_its_buffer(halo, cell):
     assert halo - 1e-5 <= rows.start * cell < halo + cell + 1e-5
 
 
-def test_window_refuses_another_lattice_and_a_larger_grid():
+def test_window_other_lattice_or_larger_grid_raises_error():
     with pytest.raises(CatalogError, match="does not lie"):
         TILE.window(Grid(UTM, 295500.4, 5629500.0, 1.0, 10, 10))
     with pytest.raises(CatalogError, match="does not lie"):
@@ -59,17 +59,17 @@ def test_window_refuses_another_lattice_and_a_larger_grid():
 
 
 @given(row=st.integers(0, 249), col=st.integers(0, 249))
-def test_every_centre_lies_in_its_own_cell(row, col):
+def test_cells_of_centre_is_its_own_cell(row, col):
     got = TILE.cells(TILE.eastings[col], TILE.northings[row])
     assert (int(got[0]), int(got[1])) == (row, col)
 
 
-def test_points_outside_get_the_nearest_cell():
+def test_cells_point_outside_gives_nearest_cell():
     row, col = TILE.cells(TILE.west - 5, TILE.south - 5)
     assert (int(row), int(col)) == (249, 0)
 
 
-def test_nonsense_is_refused():
+def test_grid_invalid_size_raises_error():
     with pytest.raises(CatalogError, match="cell size"):
         Grid(UTM, 0, 0, 0.0, 1, 1)
     with pytest.raises(CatalogError, match="at least one cell"):

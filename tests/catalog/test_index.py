@@ -13,24 +13,31 @@ from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
 
 def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
     grid = Grid(crs, east, 5629500.0, 1.0, 250, 250)
-    made = tuple(
+    tile_layers = tuple(
         Layer(name, (f"{name}/a.tif", f"{name}/b.tif"), (1, 3) if name == "road_mask" else ())
         for name in LAYERS
         if name in layers
     )
     return Tile(
-        f"{east}_5629250", grid, made, str(root), datetime(2020, 5, 1, 10, tzinfo=UTC), True, "urban", "made"
+        f"{east}_5629250",
+        grid,
+        tile_layers,
+        str(root),
+        datetime(2020, 5, 1, 10, tzinfo=UTC),
+        True,
+        "urban",
+        "made",
     )
 
 
 @pytest.mark.parametrize("name", ["catalog.parquet", "catalog.json", "catalog.geojson"])
-def test_round_trip(tmp_path, name):
+def test_catalog_round_trip_keeps_tiles(tmp_path, name):
     tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS))
     Catalog(tiles).write(tmp_path / name)
     assert Catalog.read(tmp_path / name).tiles == tiles
 
 
-def test_a_catalog_that_does_not_name_its_data_can_be_read(tmp_path):
+def test_read_catalog_without_dataset_gives_empty_dataset(tmp_path):
     Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
     items = json.loads((tmp_path / "c.json").read_text())
     del items["features"][0]["properties"]["flexroad:dataset"]
@@ -38,7 +45,7 @@ def test_a_catalog_that_does_not_name_its_data_can_be_read(tmp_path):
     assert Catalog.read(tmp_path / "c.json").tiles == (replace(tile(295500, tmp_path), dataset=""),)
 
 
-def test_round_trip_of_a_crs_without_a_code(tmp_path):
+def test_crs_without_code_round_trip_keeps_wkt(tmp_path):
     from pyproj import CRS
 
     wkt = CRS("+proj=tmerc +lat_0=1 +lon_0=7 +x_0=300000 +y_0=5000000 +ellps=GRS80 +units=m").to_wkt()
@@ -47,13 +54,13 @@ def test_round_trip_of_a_crs_without_a_code(tmp_path):
     assert Catalog.read(tmp_path / "c.parquet").tiles == tiles
 
 
-def test_schema_is_the_same_for_every_catalog(tmp_path):
+def test_parquet_schema_is_same_for_every_catalog(tmp_path):
     Catalog((tile(295500, tmp_path, layers=("dsm",)),)).write(tmp_path / "a.parquet")
     Catalog((tile(295500, tmp_path, layers=LAYERS),)).write(tmp_path / "b.parquet")
     assert pq.read_schema(tmp_path / "a.parquet").equals(pq.read_schema(tmp_path / "b.parquet"))
 
 
-def test_files_below_the_catalog_move_with_it(tmp_path):
+def test_files_below_catalog_move_with_it(tmp_path):
     home = tmp_path / "home"
     Catalog((tile(295500, home),)).write(home / "c.json")
     shutil.move(home, tmp_path / "away")
@@ -64,13 +71,13 @@ def test_files_below_the_catalog_move_with_it(tmp_path):
     assert moved.paths(layer)[0] == tmp_path / "away" / "dsm" / "a.tif"
 
 
-def test_files_elsewhere_are_absolute(tmp_path):
+def test_files_outside_catalog_folder_are_absolute(tmp_path):
     Catalog((tile(295500, tmp_path / "data"),)).write(tmp_path / "catalogs" / "c.json")
     (read,) = Catalog.read(tmp_path / "catalogs" / "c.json").tiles
     assert read.layers[0].files[0] == str(tmp_path / "data" / "dsm" / "a.tif")
 
 
-def test_a_copy_elsewhere_names_the_files_alike(tmp_path):
+def test_write_not_movable_keeps_file_names(tmp_path):
     tiles = (tile(295500, tmp_path / "data"),)
     Catalog(tiles).write(tmp_path / "run" / "c.json", movable=False)
     assert Catalog.read(tmp_path / "run" / "c.json").tiles == tiles
@@ -78,7 +85,7 @@ def test_a_copy_elsewhere_names_the_files_alike(tmp_path):
     assert feature["assets"]["dsm"]["href"] == str(tmp_path / "data" / "dsm" / "a.tif")
 
 
-def test_it_is_stac_and_opens_as_a_map(tmp_path):
+def test_catalog_is_valid_stac_and_geoparquet(tmp_path):
     Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.json")
     Catalog((tile(295500, tmp_path),)).write(tmp_path / "c.parquet")
     (feature,) = json.loads((tmp_path / "c.json").read_text())["features"]
@@ -88,11 +95,11 @@ def test_it_is_stac_and_opens_as_a_map(tmp_path):
     frame = geopandas.read_parquet(tmp_path / "c.parquet")
     assert frame.crs == "EPSG:4326"
     west, south, east, north = frame.to_crs("EPSG:25832").total_bounds
-    # The outline in degrees is a straight-edged copy: exact in the corners, so to the centimetre.
+    # The outline in degrees has straight edges and is exact only at the corners, hence 1 cm.
     assert (west, south, east, north) == pytest.approx((295500, 5629250, 295750, 5629500), abs=0.01)
 
 
-def test_select(tmp_path):
+def test_select_by_id_and_bbox_returns_matching_tiles(tmp_path):
     catalog = Catalog((tile(295500, tmp_path), tile(295750, tmp_path), tile(296000, tmp_path)))
     assert [t.id for t in catalog.select(ids=["295750_5629250"]).tiles] == ["295750_5629250"]
     assert [t.id for t in catalog.select(bbox=(295600, 5629300, 295750, 5629310)).tiles] == ["295500_5629250"]
@@ -102,7 +109,7 @@ def test_select(tmp_path):
         catalog.select(bbox=(0, 0, 1, 1))
 
 
-def test_what_cannot_be_read_is_named(tmp_path):
+def test_read_missing_or_broken_file_names_it(tmp_path):
     with pytest.raises(CatalogError, match="missing.parquet does not exist"):
         Catalog.read(tmp_path / "missing.parquet")
     (tmp_path / "bad.parquet").write_bytes(b"not parquet at all")
@@ -110,25 +117,25 @@ def test_what_cannot_be_read_is_named(tmp_path):
     for name in ("bad.parquet", "bad.json"):
         with pytest.raises(CatalogError, match=f"{name} is not a FlexRoad catalog"):
             Catalog.read(tmp_path / name)
-    with pytest.raises(CatalogError, match=r"ends in .parquet"):
+    with pytest.raises(CatalogError, match=r"must end in .parquet"):
         Catalog(()).write(tmp_path / "catalog.csv")
 
 
-def test_doubled_ids_are_refused(tmp_path):
-    with pytest.raises(CatalogError, match="295500_5629250 stand more than once"):
+def test_duplicate_ids_raise_error(tmp_path):
+    with pytest.raises(CatalogError, match="295500_5629250 occur more than once"):
         Catalog((tile(295500, tmp_path), tile(295500, tmp_path)))
 
 
-def test_rows_and_tables_are_those_of_stac_geoparquet(tmp_path):
-    """Its own way takes many times as long; it is the oracle for ours."""
+def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
+    """stac-geoparquet's own conversion is many times slower; it is the oracle here."""
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
 
-    from flexroad.catalog.index import _everything, _tile, item
+    from flexroad.catalog.index import _full_item, _tile, item
 
     tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS), tile(296000, tmp_path, layers=()))
     Catalog(tiles).write(tmp_path / "c.parquet")
     table = pq.read_table(tmp_path / "c.parquet")
-    items = [_everything(), *(item(one) for one in tiles)]
+    items = [_full_item(), *(item(tile) for tile in tiles)]
     assert table.equals(parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks())
-    slowly = tuple(_tile(found, str(tmp_path)) for found in stac_table_to_items(table))
-    assert Catalog.read(tmp_path / "c.parquet").tiles == slowly
+    expected = tuple(_tile(row, str(tmp_path)) for row in stac_table_to_items(table))
+    assert Catalog.read(tmp_path / "c.parquet").tiles == expected

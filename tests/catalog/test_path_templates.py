@@ -23,20 +23,20 @@ def made(root, layers=("dsm.tif", "dtm_2020.tif"), stratum="urban", crs=UTM):
     return root
 
 
-def test_templates_tell_tile_layer_and_stratum(tmp_path):
+def test_read_templates_give_id_layers_and_stratum(tmp_path):
     made(tmp_path)
     write(tmp_path / "rural" / "one" / "dsm.tif", FLAT, 1000, 2000)
-    found = read(tmp_path, Layout(TWO), dataset="mine", date=datetime(2020, 5, 1))
-    assert [(tile.id, tile.stratum, tile.dataset) for tile in found.tiles] == [
+    result = read(tmp_path, Layout(TWO), dataset="mine", date=datetime(2020, 5, 1))
+    assert [(tile.id, tile.stratum, tile.dataset) for tile in result.tiles] == [
         ("295500_5629250", "urban", "mine"),
         ("295750_5629250", "urban", "mine"),
         ("one", "rural", "mine"),
     ]
-    first = found.tiles[0]
+    first = result.tiles[0]
     assert first.layer("dtm").files == ("urban/295500_5629250/dtm_2020.tif",)
     assert first.grid.bounds == (295500, 5629250, 295520, 5629270)
     assert first.datetime == datetime(2020, 5, 1, tzinfo=UTC)
-    assert found.notes == ("no dtm at '{stratum}/{tile}/dtm_*.tif' for 1 of 3 tiles: one",)
+    assert result.notes == ("no dtm at '{stratum}/{tile}/dtm_*.tif' for 1 of 3 tiles: one",)
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -46,14 +46,14 @@ def test_templates_tell_tile_layer_and_stratum(tmp_path):
         ["dsm/{tile}.tif", "{tile}/dsm_{tile}.tif", "a.b/x_{tile}_1m.tif", "*/{tile}.tif"]
     ),
 )
-def test_an_id_is_what_it_was_named(tmp_path_factory, tile, template):
+def test_read_any_id_is_kept(tmp_path_factory, tile, template):
     root = tmp_path_factory.mktemp("layout")
     write(root / template.replace("{tile}", tile).replace("*", "any"), FLAT)
-    (found,) = read(root, Layout({"dsm": template, "dtm": "dtm/{tile}.tif"}), dataset="").tiles
-    assert found.id == tile
+    (result,) = read(root, Layout({"dsm": template, "dtm": "dtm/{tile}.tif"}), dataset="").tiles
+    assert result.id == tile
 
 
-def test_road_values_and_crs_go_where_they_are_missing(tmp_path):
+def test_read_layout_sets_road_values_and_missing_crs(tmp_path):
     made(tmp_path, ("dsm.tif", "dtm_1.tif"))
     made(tmp_path, ("road.tif",), crs=None)
     layout = Layout.of({"layers": TWO | {"road_mask": "*/{tile}/road.tif"}, "road_values": [2], "crs": UTM})
@@ -67,53 +67,53 @@ def test_road_values_and_crs_go_where_they_are_missing(tmp_path):
     [
         ({}, "no template for dsm"),
         ({"layers": {"dsm": "{tile}.tif"}}, "no template for dtm; a tile needs dsm and dtm"),
-        ({"layers": {"dom": "{tile}.tif"}}, "no layer is called 'dom'; there are dsm"),
+        ({"layers": {"dom": "{tile}.tif"}}, "unknown layer 'dom'; layers are dsm"),
         ({"layers": {"dsm": "dsm.tif"}}, r"dsm: 'dsm.tif' needs \{tile\}"),
         ({"layers": {"dsm": "{tile}_{year}.tif"}}, r"needs \{tile\} and may have \{stratum\}"),
-        ({"layers": {"dsm": 3}}, "a template is text"),
+        ({"layers": {"dsm": 3}}, "every template must be text"),
         ({"layers": ["dsm"]}, r"layers: expected a mapping of layers to templates, not \['dsm'\]"),
-        ({"layer": {}}, "no key is called 'layer'; there are layers"),
+        ({"layer": {}}, "unknown key 'layer'; keys are layers"),
         ({"road_values": ["a"]}, "road_values: expected whole numbers"),
         ({"crs": 25832}, "crs: expected a CRS such as EPSG:25832, not 25832"),
     ],
 )
-def test_a_layout_that_is_none_is_named(raw, line):
+def test_layout_invalid_raises_error(raw, line):
     with pytest.raises(CatalogError, match=line):
         Layout.of(raw)
 
 
-def test_a_folder_that_is_not_so_is_named(tmp_path):
+def test_read_folder_not_matching_layout_raises_error(tmp_path):
     with pytest.raises(CatalogError, match="nowhere does not exist"):
         read(tmp_path / "nowhere", Layout(TWO), dataset="")
-    with pytest.raises(CatalogError, match=r"no file of use matches '\{stratum\}.*the folder is empty"):
+    with pytest.raises(CatalogError, match=r"no usable file matches '\{stratum\}.*the folder is empty"):
         read(tmp_path, Layout(TWO), dataset="")
     made(tmp_path)
     with pytest.raises(CatalogError, match="there are urban/.*dsm.tif.*--layout"):
         read(tmp_path, Layout(TWO | {"dsm": "{tile}.tif"}), dataset="")
-    with pytest.raises(CatalogError, match="is no path below"):
+    with pytest.raises(CatalogError, match="is not a path below"):
         read(tmp_path, Layout(TWO | {"dsm": "/{tile}.tif"}), dataset="")
     both = {"dsm": "urban/{tile}/d*.tif", "dtm": "urban/{tile}/dtm_*.tif"}
     with pytest.raises(CatalogError, match=r"dsm.tif and .*dtm_2020.tif are both the dsm of tile 295500"):
         read(tmp_path, Layout(both), dataset="")
 
 
-def test_feet_are_refused(tmp_path):
+def test_read_crs_in_feet_raises_error(tmp_path):
     made(tmp_path, crs="EPSG:2994")
-    with pytest.raises(CatalogError, match="which counts in feet; reproject"):
+    with pytest.raises(CatalogError, match="whose unit is feet; reproject"):
         read(tmp_path, Layout(TWO), dataset="")
 
 
-def test_gerod_s_tiles_lie_at_their_ids(tmp_path):
+def test_gerod_tile_not_at_its_id_is_noted(tmp_path):
     made(tmp_path)
-    found = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
-    assert {tile.dataset for tile in found.tiles} == {"GeRoD"}
-    assert found.notes == ("2 of the dataset's 240 tiles are here",)
+    result = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
+    assert {tile.dataset for tile in result.tiles} == {"GeRoD"}
+    assert result.notes == ("2 of the dataset's 240 tiles are here",)
     write(tmp_path / "rural" / "295000_5629250" / "dsm.tif", FLAT, 296000, 5629270)
     moved = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
-    assert "not at the corner that its name tells: 295000_5629250; are layout and CRS right?" in moved.notes
+    assert "not at the corner given by the tile's name: 295000_5629250; check layout and CRS" in moved.notes
 
 
-def test_dsc3d_says_where_truth_is_missing(tmp_path):
+def test_dsc3d_missing_reference_is_noted(tmp_path):
     made(tmp_path, ("dsm.tif", "dtm_1.tif", "truth.tif"), stratum="a")
     date = datetime(2023, 1, 1)
     whole = dsc3d.index(tmp_path, {"layers": TWO | {"reference": "a/{tile}/truth.tif"}}, date=date)
@@ -121,5 +121,5 @@ def test_dsc3d_says_where_truth_is_missing(tmp_path):
     assert {tile.dataset for tile in whole.tiles} == {"DSC3D"}
     without = dsc3d.index(tmp_path, {"layers": TWO}, date=date)
     assert without.notes == (
-        "no reference for 295500_5629250, 295750_5629250: the DTM stands in for it, unlike in the paper",
+        "no reference for 295500_5629250, 295750_5629250: the DTM is used instead, unlike in the paper",
     )

@@ -12,12 +12,12 @@ COLOGNE = (6.95, 50.94)
 
 
 def nameless(code: str, shift: float = 0) -> str:
-    """The same CRS without names and codes that a register could know it by; its plane moved."""
-    told = CRS(code).to_json_dict()
-    told["name"], told["conversion"]["name"] = "mine", "mine"
-    told.pop("id")
-    told["conversion"]["parameters"][-1]["value"] += shift
-    return CRS.from_json_dict(told).to_wkt()
+    """The same CRS without its registered names and code; its false northing moved by ``shift``."""
+    definition = CRS(code).to_json_dict()
+    definition["name"], definition["conversion"]["name"] = "mine", "mine"
+    definition.pop("id")
+    definition["conversion"]["parameters"][-1]["value"] += shift
+    return CRS.from_json_dict(definition).to_wkt()
 
 
 @pytest.mark.parametrize(
@@ -31,19 +31,19 @@ def nameless(code: str, shift: float = 0) -> str:
         (nameless("EPSG:25832"), "EPSG:25832", (356000, 5700000)),
     ],
 )
-def test_a_plane_in_feet_has_its_twin_in_metres(feet, metres, place):
+def test_projected_crs_target_is_its_twin_in_metres(feet, metres, place):
     assert MetricTransform.of(feet, place).target == metres
 
 
-def test_a_twin_that_no_register_knows_is_described():
+def test_metric_twin_not_in_register_is_wkt():
     twin = metric_twin(nameless("EPSG:2994", shift=1000), *OREGON)
     assert plan_unit(twin)[1] == 1
     there = Transformer.from_crs(twin, "EPSG:2993", always_xy=True).transform(200000, 260000)
     assert there == pytest.approx((200000, 260000 - 304.8), abs=1e-5)
 
 
-def test_feet_become_metres_by_multiplication_alone():
-    """And PROJ agrees, up to the digits that the register has of the twins' false eastings."""
+def test_feet_to_metres_is_exact_multiplication():
+    """PROJ gives the same, up to the digits of the twins' false eastings in the register."""
     frame = MetricTransform.of("EPSG:2994", OREGON)
     x, y, z = np.array([635652.69, 639003.73]), np.array([851377.98, 853537.66]), np.array([407.81, 598.15])
     got = frame.metres(x, y, z)
@@ -52,8 +52,8 @@ def test_feet_become_metres_by_multiplication_alone():
     assert np.abs(np.array(got[:2]) - proj).max() < 1e-5
 
 
-def test_the_two_feet_are_kept_apart():
-    """2 ppm: 4 m in 6.5 million feet of California."""
+def test_us_and_international_foot_differ():
+    """2 ppm are 4 m in 6.5 million feet (California)."""
     x, zero = np.array([6.5e6]), np.zeros(1)
     survey = MetricTransform.of("EPSG:2227", (6.5e6, 2.1e6)).metres(x, zero, x)
     assert survey[0][0] == pytest.approx(6.5e6 * 1200 / 3937, abs=1e-6)
@@ -74,14 +74,14 @@ def test_the_two_feet_are_kept_apart():
         ("EPSG:25832", "foot", 0.3048, 0),
     ],
 )
-def test_heights_have_a_unit_of_their_own(crs, unit, metres, notes):
+def test_height_unit_from_crs_or_option(crs, unit, metres, notes):
     frame = MetricTransform.of(crs, OREGON, unit=unit)
     assert frame.height_m == pytest.approx(metres, rel=1e-12)
     assert len(frame.notes) == notes
-    assert all("taken to be in feet, like the plan; --height-unit" in note for note in frame.notes)
+    assert all("assumed to be in feet, like x and y; if not, use --height-unit" in n for n in frame.notes)
 
 
-def test_degrees_go_to_the_zone_of_the_place():
+def test_geographic_crs_target_is_utm_zone_of_point():
     frame = MetricTransform.of("EPSG:4326", COLOGNE)
     assert (frame.target, frame.height_m, frame.notes) == ("EPSG:32632", 1.0, ())
     east, north = np.array([COLOGNE[0], 6.96]), np.array([COLOGNE[1], 50.95])
@@ -91,7 +91,7 @@ def test_degrees_go_to_the_zone_of_the_place():
     assert np.array_equal(got[2], [50.0, 60.0])
 
 
-def test_another_crs_may_be_asked_for():
+def test_to_crs_overrides_target():
     frame = MetricTransform.of("EPSG:2994", OREGON, to_crs="EPSG:32610")
     x, y = np.array([OREGON[0]]), np.array([OREGON[1]])
     want = Transformer.from_crs("EPSG:2994", "EPSG:32610", always_xy=True).transform(x, y)
@@ -100,28 +100,28 @@ def test_another_crs_may_be_asked_for():
 
 
 @pytest.mark.parametrize(
-    ("how", "message"),
+    ("arguments", "message"),
     [
         ({"to_crs": "EPSG:2994"}, "--to-crs EPSG:2994 is in feet; give a projected CRS in metres"),
         ({"to_crs": "EPSG:4326"}, "--to-crs EPSG:4326 is in degrees; give a projected CRS in metres"),
         ({"to_crs": "EPSG:0"}, "unknown CRS 'EPSG:0'"),
-        ({"unit": "yard"}, "--height-unit yard: there is metre, foot, us-foot"),
+        ({"unit": "yard"}, "--height-unit yard: must be one of metre, foot, us-foot"),
         ({"source": "EPSG:2994+5703", "unit": "foot"}, "--height-unit foot, but heights of .* are in metre;"),
         ({"source": "EPSG:4978"}, "neither projected nor geographic; reproject"),
     ],
 )
-def test_what_does_not_fit_is_one_line(how, message):
+def test_invalid_crs_or_unit_raises_error(arguments, message):
     with pytest.raises(CatalogError, match=message):
-        MetricTransform.of(**{"source": "EPSG:2994", "place": OREGON, **how})
+        MetricTransform.of(**{"source": "EPSG:2994", "place": OREGON, **arguments})
 
 
-def test_a_place_that_the_target_does_not_have_is_an_error():
+def test_point_outside_target_crs_raises_error():
     frame = MetricTransform.of("EPSG:4326", COLOGNE, to_crs="EPSG:25832")
-    with pytest.raises(CatalogError, match="in EPSG:4326 lie nowhere in EPSG:25832; .* --to-crs"):
+    with pytest.raises(CatalogError, match="in EPSG:4326 have no position in EPSG:25832; .* --to-crs"):
         frame.metres(np.array([7.0]), np.array([95.0]), np.zeros(1))
 
 
-def test_files_of_a_set_share_one_crs():
+def test_agreed_mixed_crs_raises_error():
     feet = CRS("EPSG:2994").to_wkt()
     assert in_plan(agreed([("a", feet), ("b", None)], "EPSG:2994")) == "EPSG:2994"
     assert agreed([("a", None), ("b", None)], "EPSG:25832") == "EPSG:25832"
@@ -136,7 +136,7 @@ def test_files_of_a_set_share_one_crs():
 
 
 @pytest.mark.real
-def test_the_survey_without_a_code_gets_one(real_data):
+def test_real_survey_without_code_target_has_code(real_data):
     cloud = inspect(real_data / "autzen" / "autzen_north.laz")
     assert MetricTransform.of(cloud.crs, cloud.bounds[:2]).target == "EPSG:2993"
     assert inspect(real_data / "autzen" / "autzen-thin.las").crs is None

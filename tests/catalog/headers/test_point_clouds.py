@@ -17,27 +17,27 @@ def some_points(n=N):
     return np.round(rng.uniform([636000, 848000, 400], [639000, 853000, 600], (n, 3)), 2)
 
 
-def joined(path, **how):
-    parts = list(chunks(path, **how))
+def joined(path, **options):
+    parts = list(chunks(path, **options))
     xyz = np.concatenate([np.stack([part.x, part.y, part.z], axis=1) for part in parts])
     colour = None if parts[0].colour is None else np.concatenate([part.colour for part in parts])
     return xyz, np.concatenate([part.kind for part in parts]), colour
 
 
-def test_a_header_tells_what_there_is(tmp_path):
+def test_inspect_returns_header_fields(tmp_path):
     xyz = some_points(500)
     path = write_cloud(tmp_path / "a.laz", xyz, crs="EPSG:2994", colour=np.full((500, 3), 9))
-    told = inspect(path)
-    assert (told.points, told.has_colours, in_plan(told.crs)) == (500, True, "EPSG:2994")
-    assert told.bounds == pytest.approx((*xyz.min(axis=0)[:2], *xyz.max(axis=0)[:2]), abs=1e-6)
-    assert told.heights == pytest.approx((xyz[:, 2].min(), xyz[:, 2].max()), abs=1e-6)
+    cloud = inspect(path)
+    assert (cloud.points, cloud.has_colours, in_plan(cloud.crs)) == (500, True, "EPSG:2994")
+    assert cloud.bounds == pytest.approx((*xyz.min(axis=0)[:2], *xyz.max(axis=0)[:2]), abs=1e-6)
+    assert cloud.heights == pytest.approx((xyz[:, 2].min(), xyz[:, 2].max()), abs=1e-6)
     plain = inspect(write_cloud(tmp_path / "b.las", xyz))
     assert (plain.has_colours, plain.crs) == (False, None)
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("size", [N, 50_000, 7919])
-def test_any_chunk_gives_the_same_points(tmp_path, suffix, size):
+def test_chunks_any_size_gives_same_points(tmp_path, suffix, size):
     rng = np.random.default_rng(6)
     xyz, kind, colour = some_points(), rng.integers(0, 7, N), rng.integers(0, 65536, (N, 3))
     got = joined(write_cloud(tmp_path / f"a.{suffix}", xyz, kind, colour=colour), size=size)
@@ -46,7 +46,7 @@ def test_any_chunk_gives_the_same_points(tmp_path, suffix, size):
     assert np.array_equal(got[2], colour)
 
 
-def test_noise_and_withheld_points_stay_out(tmp_path):
+def test_chunks_drop_noise_and_withheld_points(tmp_path):
     kind, withheld = [1, 7, 18, 2, 17], [False, False, False, True, False]
     path = write_cloud(tmp_path / "a.laz", some_points(5), kind, withheld=withheld)
     assert list(joined(path)[1]) == [1, 17]
@@ -55,7 +55,7 @@ def test_noise_and_withheld_points_stay_out(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 @pytest.mark.parametrize("part", [0.0, 0.0001, 0.3, 0.7, 0.999])
-def test_a_file_cut_anywhere_is_one_clear_line(tmp_path, suffix, part):
+def test_truncated_file_raises_one_line(tmp_path, suffix, part):
     path = write_cloud(tmp_path / f"a.{suffix}", some_points())
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * part)])
@@ -67,8 +67,8 @@ def test_a_file_cut_anywhere_is_one_clear_line(tmp_path, suffix, part):
 
 
 @pytest.mark.parametrize("part", [0.2, 0.5, 0.8])
-def test_damage_within_a_file_is_seen(tmp_path, part):
-    """LAZ has no checksum: spoiled bytes end too early, or decode to points far away."""
+def test_damaged_bytes_raise_error(tmp_path, part):
+    """LAZ has no checksum: overwritten bytes end too early, or decode to points far away."""
     rng = np.random.default_rng(3)
     walk = np.cumsum(rng.integers(-5, 6, (N, 3)), axis=0) / 100 + [636000, 848000, 400]
     path = write_cloud(tmp_path / "a.laz", walk)
@@ -81,7 +81,7 @@ def test_damage_within_a_file_is_seen(tmp_path, part):
         list(chunks(path))
 
 
-def test_points_beyond_the_header_are_damage(tmp_path):
+def test_points_outside_header_bounds_raise_error(tmp_path):
     xyz = some_points(100)
     path = write_cloud(tmp_path / "a.las", xyz)
 
@@ -98,7 +98,7 @@ def test_points_beyond_the_header_are_damage(tmp_path):
         inspect(path)
 
 
-def test_what_is_no_cloud_is_named(tmp_path):
+def test_inspect_not_a_cloud_raises_error(tmp_path):
     with pytest.raises(CatalogError, match="none.laz does not exist; give LAS or LAZ files"):
         inspect(tmp_path / "none.laz")
     text = tmp_path / "a.laz"
@@ -109,14 +109,15 @@ def test_what_is_no_cloud_is_named(tmp_path):
         inspect(write_cloud(tmp_path / "empty.laz", np.zeros((0, 3))))
 
 
-def test_keys_of_a_plane_without_a_code_are_not_taken_for_degrees(tmp_path):
+def test_inspect_user_defined_projection_has_no_crs(tmp_path):
     def with_keys(name, xyz):
         header = laspy.LasHeader(point_format=1, version="1.2")
         header.scales, header.offsets = [1e-4] * 3, xyz[0]
         points = laspy.LasData(header)
         points.x, points.y, points.z = xyz.T
         keys = GeoKeyDirectoryVlr()
-        # Version; then model type, geographic base NAD83(HARN), plane of one's own: key, place, count, value.
+        # Version; then model type, geographic base NAD83(HARN), user-defined projection:
+        # key, location, count, value.
         values = [1, 1, 0, 3, 1024, 0, 1, 1, 2048, 0, 1, 4152, 3072, 0, 1, 32767]
         keys.parse_record_data(np.array(values, "<u2").tobytes())
         points.header.vlrs.append(keys)
@@ -127,7 +128,7 @@ def test_keys_of_a_plane_without_a_code_are_not_taken_for_degrees(tmp_path):
     assert in_plan(with_keys("degrees.las", some_points(10) / [-5200, 20000, 1])) == "EPSG:4152"
 
 
-def test_folders_are_searched_and_each_file_counts_once(tmp_path):
+def test_find_searches_folders_and_removes_duplicates(tmp_path):
     xyz = some_points(3)
     folder = tmp_path / "clouds"
     paths = [write_cloud(folder / name, xyz) for name in ("b.laz", "c.copc.laz")]

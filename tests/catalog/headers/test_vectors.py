@@ -1,4 +1,4 @@
-"""Vector files of roads are named by the tiles they reach."""
+"""Tiles list the vector files of roads that reach them."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def named(tiles):
     ]
 
 
-def test_a_file_is_named_by_the_tiles_within_reach(survey, tmp_path):
+def test_roads_file_is_listed_by_tiles_in_reach(survey, tmp_path):
     """The first road ends 99 m west of the last tile, the other 20 m within it."""
     write_roads(survey / "a.gpkg", [LineString([(295_400, 5_629_300), (295_901, 5_629_300)])])
     write_roads(survey / "b.gpkg", [LineString([(296_020, 5_629_300), (296_900, 5_629_300)])])
@@ -44,7 +44,7 @@ def test_a_file_is_named_by_the_tiles_within_reach(survey, tmp_path):
     assert again.paths(again.layer("roads"))[0].is_file()
 
 
-def test_a_file_may_lie_anywhere_in_any_crs(survey, tmp_path):
+def test_roads_file_outside_folder_in_other_crs_is_used(survey, tmp_path):
     import geopandas
 
     line = geopandas.GeoSeries([LineString([(295_500, 5_629_300), (295_600, 5_629_300)])], crs="EPSG:25832")
@@ -56,37 +56,37 @@ def test_a_file_may_lie_anywhere_in_any_crs(survey, tmp_path):
     assert tiles[0].paths(tiles[0].layer("roads")) == (roads,)
 
 
-def test_osm_files_tell_no_bounds_and_are_named_by_all(survey):
+def test_osm_file_without_bounds_is_used_by_all_tiles(survey):
     write_osm(survey / "map.osm", {"highway=service": [(6.1, 50.7), (6.2, 50.8)]})
     assert named(indexed(survey, "map.osm")) == [["map.osm"]] * 3
 
 
-def test_nrw_downloads_take_roads_too(tmp_path):
+def test_nrw_index_accepts_roads(tmp_path):
     for product in ("dom1", "dgm1"):
         write(tmp_path / f"{product}_32_356_5699_1_nw_2020.tif", HEIGHTS[:, :250], 356_000, 5_700_000)
     write_roads(tmp_path / "r.gpkg", [box(356_000, 5_699_800, 356_100, 5_699_900)])
     assert named(nrw.index(tmp_path, roads="r.gpkg").tiles) == [["r.gpkg"]]
 
 
-def test_a_crs_given_stands_in_for_a_missing_one(survey):
+def test_crs_option_is_used_for_file_without_crs(survey):
     with pytest.warns(UserWarning, match="'crs' was not provided"):
         write_roads(survey / "r.gpkg", [LineString([(295_500, 5_629_300), (295_600, 5_629_300)])], None)
-    with pytest.raises(CatalogError, match=r"--roads .*r.gpkg carries no CRS; say which it is with --crs"):
+    with pytest.raises(CatalogError, match=r"--roads .*r.gpkg has no CRS; give it with --crs"):
         indexed(survey, "r.gpkg")
     assert [tile.layer("roads").crs for tile in indexed(survey, "r.gpkg", "EPSG:25832")[:1]] == ["EPSG:25832"]
 
 
 @pytest.mark.parametrize(
-    ("make", "given", "says"),
+    ("make", "name", "message"),
     [
         (lambda path: None, "r.gpkg", "no file matches --roads 'r.gpkg' below .*; there are dsm.tif"),
-        (lambda path: path.write_text("roads"), "r.gpkg", "--roads .*r.gpkg is no vector file"),
-        (lambda path: None, "dsm.tif", "--roads .*dsm.tif is no vector file"),
+        (lambda path: path.write_text("roads"), "r.gpkg", "--roads .*r.gpkg is not a vector file"),
+        (lambda path: None, "dsm.tif", "--roads .*dsm.tif is not a vector file"),
         (lambda path: write_roads(path, [box(0, 0, 1, 1)]), "r.gpkg", "--roads .*r.gpkg reaches no tile"),
     ],
 )  # fmt: skip
-def test_what_is_no_roads_is_one_line(survey, make, given, says):
+def test_invalid_roads_file_raises_one_line(survey, make, name, message):
     make(survey / "r.gpkg")
-    with pytest.raises(CatalogError, match=says) as caught:
-        indexed(survey, given)
+    with pytest.raises(CatalogError, match=message) as caught:
+        indexed(survey, name)
     assert "\n" not in str(caught.value)

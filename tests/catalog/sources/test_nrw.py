@@ -22,7 +22,7 @@ def heights(rows=500, columns=500):
 
 
 def packed(path: Path, values, west=WEST, north=NORTH) -> Path:
-    """An XYZ file as the state packs it."""
+    """Write a gzipped XYZ file, as the state delivers it."""
     plain = write_xyz(path.with_suffix(""), values, west, north)
     path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
     plain.unlink()
@@ -40,9 +40,9 @@ def packed(path: Path, values, west=WEST, north=NORTH) -> Path:
         ("DGM1_32_356_5699_1_NW_2022.TIF", "dtm", (356e3, 5699e3, 357e3, 5700e3), 2022),
     ],
 )
-def test_a_name_tells_product_place_and_year(name, layer, square, year):
-    told = parse(Path("below") / name)
-    assert (told.layer, told.square, told.year) == (layer, square, year)
+def test_parse_name_gives_layer_square_and_year(name, layer, square, year):
+    download = parse(Path("below") / name)
+    assert (download.layer, download.square, download.year) == (layer, square, year)
 
 
 @pytest.mark.parametrize(
@@ -55,18 +55,18 @@ def test_a_name_tells_product_place_and_year(name, layer, square, year):
         "dom_356.tif",
     ],
 )
-def test_other_files_are_none(name):
+def test_parse_other_name_returns_none(name):
     assert parse(Path(name)) is None
 
 
 @given(st.integers(100, 999), st.integers(1000, 9999), st.sampled_from(["dom1", "dgm1", "dop10rgbi", "3dm"]))
-def test_every_square_is_read_as_it_was_named(east, north, product):
-    told = parse(Path(f"{product}_32_{east}_{north}_1_nw_2019.tif"))
-    assert told.square == (east * 1000, north * 1000, east * 1000 + 1000, north * 1000 + 1000)
+def test_parse_any_square_gives_its_bounds(east, north, product):
+    download = parse(Path(f"{product}_32_{east}_{north}_1_nw_2019.tif"))
+    assert download.square == (east * 1000, north * 1000, east * 1000 + 1000, north * 1000 + 1000)
 
 
-def test_a_square_becomes_the_paper_s_tiles(tmp_path):
-    """DSM as GeoTIFF, DTM as packed XYZ without a CRS, JP2 of four bands: 250 m tiles of all three."""
+def test_index_square_gives_tiles_of_250_m(tmp_path):
+    """DSM as GeoTIFF, DTM as gzipped XYZ without a CRS, DOP as JP2 of four bands."""
     dom, dgm = heights(), heights() - 10
     write(tmp_path / "dom" / "dom1_32_356_5699_1_nw_2020.tif", dom, WEST, NORTH)
     packed(tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz", dgm)
@@ -78,12 +78,12 @@ def test_a_square_becomes_the_paper_s_tiles(tmp_path):
         dst.write(rgbi)
     (tmp_path / "dom" / "dom1_nw.csv").write_text("metadata")
     before = sorted(tmp_path.rglob("*"))
-    found = index(tmp_path)
-    assert [tile.id for tile in found.tiles] == [
+    result = index(tmp_path)
+    assert [tile.id for tile in result.tiles] == [
         "356000_5699500", "356000_5699750", "356250_5699500", "356250_5699750",
     ]  # fmt: skip
-    assert found.notes == ()
-    tile = found.tiles[1]
+    assert result.notes == ()
+    tile = result.tiles[1]
     assert (tile.datetime, tile.datetime_assumed) == (datetime(2020, 1, 1, tzinfo=UTC), False)
     assert (tile.dataset, tile.grid.crs) == ("Geobasis NRW", UTM)
     assert [(layer.name, layer.files, layer.crs) for layer in tile.layers] == [
@@ -98,7 +98,7 @@ def test_a_square_becomes_the_paper_s_tiles(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_newest_year_counts(tmp_path):
+def test_index_several_years_uses_newest(tmp_path):
     for year in (2016, 2022, 2019):
         write(tmp_path / f"dom1_32_356_5699_1_nw_{year}.tif", np.full((250, 250), year - 2000.0), WEST, NORTH)
     write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
@@ -107,7 +107,7 @@ def test_the_newest_year_counts(tmp_path):
     assert (load(tile, Options()).dsm == 22).all()
 
 
-def test_a_tag_tells_the_day_within_the_year_of_the_name(tmp_path):
+def test_index_date_tag_in_year_of_name_is_used(tmp_path):
     square = np.zeros((250, 250), np.float32)
     name = "dom1_32_356_5699_1_nw_2020.tif"
     write(tmp_path / name, square, WEST, NORTH, tags={"TIFFTAG_DATETIME": "2020:03:07 00:00:00"})
@@ -117,23 +117,23 @@ def test_a_tag_tells_the_day_within_the_year_of_the_name(tmp_path):
     assert index(tmp_path, date=datetime(2019, 5, 1)).tiles[0].datetime == datetime(2019, 5, 1, tzinfo=UTC)
 
 
-def test_what_does_not_help_is_said(tmp_path):
+def test_index_unusable_files_are_noted(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "dom1_32_400_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     (tmp_path / "dgm1_32_356_5699_1_nw_2020.tif").write_bytes(b"cut short")
     (tmp_path / "3dm_32_356_5699_1_nw.laz").write_bytes(b"points")
-    found = index(tmp_path)
-    assert found.notes == (
-        "point clouds are left unread, so the reference lacks the bridges in 3dm_32_356_5699_1_nw.laz",
-        "skipped dom1_32_400_5699_1_nw_2020.tif (dsm): it lies at 356125 5699875 in EPSG:25832, "
-        "not where its name says; download it again",
-        "skipped dgm1_32_356_5699_1_nw_2020.tif (dtm): not a raster GDAL can read",
-        "no dgm1 file under 356000_5699750: these tiles will fail; download the terrain model, too",
+    result = index(tmp_path)
+    assert result.notes == (
+        "point clouds were not read, so the reference lacks the bridges in 3dm_32_356_5699_1_nw.laz",
+        "skipped dom1_32_400_5699_1_nw_2020.tif (dsm): its centre 356125 5699875 in EPSG:25832 "
+        "does not match its name; download it again",
+        "skipped dgm1_32_356_5699_1_nw_2020.tif (dtm): not a raster that GDAL can read",
+        "no dgm1 file under 356000_5699750: these tiles will fail; download the terrain model as well",
     )
-    assert found.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
+    assert result.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
 
 
-def test_a_mask_of_one_s_own_goes_with_it(tmp_path):
+def test_index_road_mask_pattern_adds_layer(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "atkis.tif", np.full((250, 250), 3, np.uint8), WEST, NORTH)
     mask = index(tmp_path, road_mask="atkis.tif", road_values=(3, 4)).tiles[0].layer("road_mask")
@@ -142,8 +142,8 @@ def test_a_mask_of_one_s_own_goes_with_it(tmp_path):
         index(tmp_path, road_mask="osm.tif")
 
 
-def test_a_folder_without_a_surface_model_is_named(tmp_path):
-    with pytest.raises(CatalogError, match=r"no dom1_32_E_N_1_nw\*.tif.*the folder is empty"):
+def test_index_folder_without_dsm_raises_error(tmp_path):
+    with pytest.raises(CatalogError, match=r"no usable dom1_32_E_N_1_nw\*.tif.*the folder is empty"):
         index(tmp_path)
     (tmp_path / "dom.tif").write_bytes(b"x")
     with pytest.raises(CatalogError, match="there are dom.tif"):
@@ -153,7 +153,7 @@ def test_a_folder_without_a_surface_model_is_named(tmp_path):
 
 
 def cloud(path: Path, x, y, z, classes) -> Path:
-    """A classified point cloud in centimetres, as the state packs it."""
+    """Write a classified point cloud in centimetres, as the state delivers it."""
     import laspy
 
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -165,8 +165,8 @@ def cloud(path: Path, x, y, z, classes) -> Path:
     return path
 
 
-def test_bridge_points_make_the_extended_dtm(tmp_path):
-    """Class 17 alone, the mean per cell, over the DTM; and only as reference: the fit keeps the DTM."""
+def test_index_bridge_points_extend_reference(tmp_path):
+    """The reference is the DTM with the mean of class 17 per cell; the DTM itself does not change."""
     root, derived = tmp_path / "nrw", tmp_path / "derived"
     dgm = heights(250, 250)
     write(root / "dom1_32_356_5699_1_nw_2020.tif", dgm + 5, WEST, NORTH)
@@ -174,9 +174,9 @@ def test_bridge_points_make_the_extended_dtm(tmp_path):
     x = WEST + np.array([10.2, 10.8, 20.5, 30.5])
     y = NORTH - np.array([5.5, 5.5, 7.5, 8.5])
     cloud(root / "3dm_32_356_5699_1_nw.laz", x, y, [200.0, 201.0, 202.0, 203.0], [17, 17, 2, 17])
-    found = index(root, derived=derived)
-    assert found.notes == ()
-    (tile,) = found.tiles
+    result = index(root, derived=derived)
+    assert result.notes == ()
+    (tile,) = result.tiles
     made = derived / "3dm_32_356_5699_1_nw_bridges.tif"
     assert tile.layer("bridges").files == (str(made),)
     data = load(tile, Options())
@@ -189,15 +189,15 @@ def test_bridge_points_make_the_extended_dtm(tmp_path):
     assert made.stat().st_mtime_ns == before
 
 
-def test_a_cloud_without_bridges_or_cut_short_costs_nothing(tmp_path):
+def test_index_cloud_without_bridges_or_broken_keeps_tile(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "dgm1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     cloud(tmp_path / "3dm_32_356_5699_1_nw_2020.laz", [WEST + 1.0], [NORTH - 1.0], [100.0], [2])
     bad = tmp_path / "3dm_32_356_5699_1_nw_2021.laz"
     bad.write_bytes(b"points")
-    found = index(tmp_path, derived=tmp_path / "derived")
-    (note,) = found.notes
+    result = index(tmp_path, derived=tmp_path / "derived")
+    (note,) = result.notes
     assert note.startswith(f"skipped {bad} cannot be read as a point cloud: ")
-    (tile,) = found.tiles
+    (tile,) = result.tiles
     assert tile.layer("bridges") is None
     assert load(tile, Options()).reference is None

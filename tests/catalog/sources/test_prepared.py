@@ -23,7 +23,7 @@ def road(grid: Grid = GRID) -> np.ndarray:
     return np.random.default_rng(1).random(grid.shape) < 0.3
 
 
-def test_round_trip(tmp_path):
+def test_write_tile_and_index_round_trip(tmp_path):
     write_tile(tmp_path, "b", GRID, {"dsm": heights(), "road_mask": road()}, "urban", TAKEN, "made")
     write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
     first, second = index(tmp_path)
@@ -46,13 +46,13 @@ def test_round_trip(tmp_path):
             assert file.nodata is None
 
 
-def test_heights_are_stored_to_a_tenth_of_a_millimetre(tmp_path):
+def test_write_tile_heights_are_exact_to_a_tenth_of_a_millimetre(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dtm": heights()})
     with rasterio.open(tmp_path / "dtm" / "a.tif") as file:
         assert np.nanmax(np.abs(file.read(1) - heights())) < 1e-4
 
 
-def test_layers_come_in_the_catalog_s_order_and_the_catalog_can_be_written(tmp_path):
+def test_index_layers_follow_catalog_order(tmp_path):
     names = ("reference_road", "reference", "dtm", "road_mask", "dsm")
     write_tile(tmp_path, "a", GRID, {n: road() if "road" in n else heights() for n in names}, "rural", TAKEN)
     (tile,) = index(tmp_path)
@@ -67,7 +67,7 @@ def test_layers_come_in_the_catalog_s_order_and_the_catalog_can_be_written(tmp_p
     assert Catalog.read(tmp_path / "catalog.parquet").tiles == (tile,)
 
 
-def test_without_a_date_the_file_s_time_stands_in(tmp_path):
+def test_index_without_date_uses_file_time(tmp_path):
     before = datetime.now(UTC) - timedelta(seconds=5)
     write_tile(tmp_path, "a", GRID, {"dsm": heights()})
     (tile,) = index(tmp_path)
@@ -81,13 +81,13 @@ def test_without_a_date_the_file_s_time_stands_in(tmp_path):
     west=st.floats(0, 1e6, allow_subnormal=False),
     north=st.floats(0, 1e7, allow_subnormal=False),
 )
-def test_odd_lattices_come_back_exactly(tmp_path, cell, west, north):
+def test_index_odd_lattice_is_exact(tmp_path, cell, west, north):
     grid = Grid("EPSG:25832", west, north, cell, 7, 5)
     write_tile(tmp_path, "a", grid, {"dsm": heights(grid)})
     assert index(tmp_path)[0].grid == grid
 
 
-def test_the_id_is_in_the_file_not_in_its_name(tmp_path):
+def test_index_id_is_read_from_tag(tmp_path):
     write_tile(tmp_path, "500000_5600000", GRID, {"dsm": heights()})
     (tmp_path / "dsm" / "500000_5600000.tif").rename(tmp_path / "dsm" / "1_2.tif")
     (tile,) = index(tmp_path)
@@ -95,59 +95,59 @@ def test_the_id_is_in_the_file_not_in_its_name(tmp_path):
     assert tile.layers[0].files == ("dsm/1_2.tif",)
 
 
-def test_a_tile_written_again_replaces_the_old_one(tmp_path):
+def test_write_tile_again_replaces_files(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights()})
     write_tile(tmp_path, "a", GRID, {"dsm": heights() + 1})
     with rasterio.open(tmp_path / "dsm" / "a.tif") as file:
         assert file.read(1)[1, 1] == np.float32(heights()[1, 1] + 1)
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path):
+def test_write_tile_failed_keeps_old_file(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    was = (tmp_path / "dsm" / "a.tif").read_bytes()
+    before = (tmp_path / "dsm" / "a.tif").read_bytes()
     nowhere = Grid("EPSG:999999", GRID.west, GRID.north, 1.0, 25, 20)
     with pytest.raises(CatalogError, match="EPSG"):
         write_tile(tmp_path, "a", nowhere, {"dsm": heights()})
     assert [path.name for path in (tmp_path / "dsm").iterdir()] == ["a.tif"]
-    assert (tmp_path / "dsm" / "a.tif").read_bytes() == was
+    assert (tmp_path / "dsm" / "a.tif").read_bytes() == before
 
 
 @pytest.mark.parametrize(
     ("tile_id", "layers", "line"),
     [
-        ("a/b", {}, r"'a/b' makes no file name.*slashes"),
-        ("", {}, "'' makes no file name"),
-        ("a", {"dem": heights()}, "no layer 'dem'.*known are dsm, dtm"),
+        ("a/b", {}, r"'a/b' is not a valid file name.*slashes"),
+        ("", {}, "'' is not a valid file name"),
+        ("a", {"dem": heights()}, "no layer 'dem'.*layers are dsm, dtm"),
         ("a", {"dsm": heights()[:-1]}, r"dsm of tile a is \(19, 25\), but its grid is \(20, 25\)"),
     ],
 )
-def test_what_cannot_be_written_is_refused_whole(tmp_path, tile_id, layers, line):
+def test_write_tile_invalid_input_writes_nothing(tmp_path, tile_id, layers, line):
     with pytest.raises(CatalogError, match=line):
         write_tile(tmp_path, tile_id, GRID, {"dtm": heights(), **layers})
     assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_folder_is_named(tmp_path):
+def test_index_empty_folder_raises_error(tmp_path):
     with pytest.raises(CatalogError, match=f"no LAYER/.*{tmp_path.name}.*dsm"):
         index(tmp_path)
 
 
-def test_a_file_without_tags_is_named(tmp_path):
+def test_index_file_without_tags_raises_error(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights()})
     with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
         file.update_tags(FLEXROAD_TILE="")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif carries no FLEXROAD_TILE; .*catalog it as rasters"):
+    with pytest.raises(CatalogError, match=r"dsm/a.tif has no FLEXROAD_TILE; .*catalog it as rasters"):
         index(tmp_path)
 
 
-def test_a_broken_file_is_named(tmp_path):
+def test_index_broken_file_raises_error(tmp_path):
     (tmp_path / "dsm").mkdir()
     (tmp_path / "dsm" / "a.tif").write_bytes(b"II*\0 nothing")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif is no GeoTIFF"):
+    with pytest.raises(CatalogError, match=r"dsm/a.tif is not a GeoTIFF"):
         index(tmp_path)
 
 
-def test_a_date_that_is_none_is_named(tmp_path):
+def test_index_invalid_date_raises_error(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights()}, date=TAKEN)
     with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
         file.update_tags(TIFFTAG_DATETIME="May 2024")
@@ -155,7 +155,7 @@ def test_a_date_that_is_none_is_named(tmp_path):
         index(tmp_path)
 
 
-def test_files_of_a_tile_that_contradict_each_other_are_named(tmp_path):
+def test_index_contradicting_files_raise_error(tmp_path):
     moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
     write_tile(tmp_path, "a", GRID, {"dsm": heights()}, "urban")
     write_tile(tmp_path, "a", moved, {"dtm": heights()}, "urban")
@@ -166,10 +166,10 @@ def test_files_of_a_tile_that_contradict_each_other_are_named(tmp_path):
         index(tmp_path)
 
 
-def test_two_files_of_one_layer_are_named(tmp_path):
+def test_index_two_files_of_one_layer_raise_error(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights()})
     (tmp_path / "dsm" / "b.tif").write_bytes((tmp_path / "dsm" / "a.tif").read_bytes())
-    with pytest.raises(CatalogError, match=r"a.tif and .*b.tif both say they are layer dsm of tile a"):
+    with pytest.raises(CatalogError, match=r"a.tif and .*b.tif are both tagged as layer dsm of tile a"):
         index(tmp_path)
 
 
@@ -177,7 +177,7 @@ def photo(rows: int = 40, columns: int = 50) -> np.ndarray:
     return np.random.default_rng(2).integers(0, 256, (3, rows, columns), dtype=np.uint8)
 
 
-def test_a_photo_keeps_its_own_pixels(tmp_path):
+def test_write_tile_photo_keeps_its_pixels(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dop": photo(), "road_mask": road()}, "urban", TAKEN)
     (tile,) = index(tmp_path)
     assert tile.grid == GRID
@@ -190,20 +190,20 @@ def test_a_photo_keeps_its_own_pixels(tmp_path):
         assert [band.name for band in file.colorinterp] == ["red", "green", "blue"]
 
 
-def test_a_photo_whose_pixels_are_no_round_part_of_a_cell_fits(tmp_path):
+def test_write_tile_photo_with_odd_pixel_size_fits(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
     assert index(tmp_path)[0].layer("dop") is not None
 
 
 @pytest.mark.parametrize("wrong", [photo()[0], photo()[:2], photo().astype(float), photo(40, 40)])
-def test_what_is_no_photo_of_the_tile_is_refused(tmp_path, wrong):
+def test_write_tile_invalid_photo_raises_error(tmp_path, wrong):
     with pytest.raises(CatalogError, match="layer dop of tile a is .* over 25 x 20 cells"):
         write_tile(tmp_path, "a", GRID, {"dop": wrong})
 
 
-def test_a_photo_alone_is_no_tile_and_must_lie_on_it(tmp_path):
+def test_index_photo_alone_or_misplaced_raises_error(tmp_path):
     write_tile(tmp_path, "a", GRID, {"dop": photo()})
-    with pytest.raises(CatalogError, match="dop/a.tif is all there is of tile a"):
+    with pytest.raises(CatalogError, match="dop/a.tif is the only file of tile a"):
         index(tmp_path)
     moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
     write_tile(tmp_path, "a", moved, {"dsm": heights()})

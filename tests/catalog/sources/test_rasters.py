@@ -25,51 +25,51 @@ def files(indexed, layer="dsm"):
     return [tile.layer(layer).files if tile.layer(layer) else None for tile in indexed.tiles]
 
 
-def test_a_file_of_a_kilometre_gives_sixteen_tiles(tmp_path):
+def test_index_file_of_a_kilometre_gives_sixteen_tiles(tmp_path):
     write(tmp_path / "dom" / "a.tif", np.ones((1000, 1000), np.float32), 356000, 5700000)
-    found = index(tmp_path, {"dsm": "dom/*.tif"}, date=datetime(2020, 5, 1))
-    assert len(found.tiles) == 16
-    assert ids(found)[0] == "356000_5699000"
-    assert ids(found)[-1] == "356750_5699750"
-    assert found.tiles[0].grid.bounds == (356000, 5699000, 356250, 5699250)
-    assert found.tiles[0].grid.crs == UTM
-    assert set(files(found)) == {("dom/a.tif",)}
-    assert found.tiles[0].root == str(tmp_path.resolve())
-    assert found.notes == ()
+    result = index(tmp_path, {"dsm": "dom/*.tif"}, date=datetime(2020, 5, 1))
+    assert len(result.tiles) == 16
+    assert ids(result)[0] == "356000_5699000"
+    assert ids(result)[-1] == "356750_5699750"
+    assert result.tiles[0].grid.bounds == (356000, 5699000, 356250, 5699250)
+    assert result.tiles[0].grid.crs == UTM
+    assert set(files(result)) == {("dom/a.tif",)}
+    assert result.tiles[0].root == str(tmp_path.resolve())
+    assert result.notes == ()
 
 
-def test_a_tile_names_every_file_that_reaches_into_it(tmp_path):
-    """Four files meet in the middle of a tile; one 90 m off is in reach of a halo, one 110 m off is not."""
+def test_tile_lists_every_file_in_reach(tmp_path):
+    """Four files meet in the middle of a tile; a file 90 m away is in reach, one 110 m away is not."""
     for name, west, north in [("d", 0, 300), ("c", 125, 300), ("b", 0, 125), ("a", 125, 125)]:
         write(tmp_path / f"{name}.tif", np.ones((175, 125), np.float32), west, north)
     write(tmp_path / "near.tif", np.ones((5, 5), np.float32), 340, 100)
     write(tmp_path / "off.tif", np.ones((5, 5), np.float32), 360, 100)
-    found = index(tmp_path, {"dsm": "*.tif"}, min_cover=0.5)
-    assert dict(zip(ids(found), files(found), strict=True)) == {
+    result = index(tmp_path, {"dsm": "*.tif"}, min_cover=0.5)
+    assert dict(zip(ids(result), files(result), strict=True)) == {
         "0_0": ("a.tif", "b.tif", "c.tif", "d.tif", "near.tif")
     }
 
 
-def test_a_layer_that_only_its_halo_would_see_is_none_of_the_tile(tmp_path):
+def test_file_only_in_halo_is_not_a_layer(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     write(tmp_path / "dtm.tif", FLAT, west=295750)
     (tile,) = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}).tiles
     assert tile.layer("dtm") is None
 
 
-def test_tiles_covered_too_little_are_left_out_and_said_so(tmp_path):
+def test_tiles_below_min_cover_are_left_out_with_note(tmp_path):
     write(tmp_path / "a.tif", np.ones((250, 300), np.float32))
-    found = index(tmp_path, {"dsm": "a.tif"})
-    assert ids(found) == ["295500_5629250"]
+    result = index(tmp_path, {"dsm": "a.tif"})
+    assert ids(result) == ["295500_5629250"]
     assert "left out 1 tile covered less than 25% by the DSM (--min-cover 0 keeps them): 295750_5629250" in (
-        found.notes
+        result.notes
     )
     assert len(index(tmp_path, {"dsm": "a.tif"}, min_cover=0).tiles) == 2
     with pytest.raises(CatalogError, match=r"no tile is left: .*--min-cover 0 keeps"):
         index(tmp_path, {"dsm": "a.tif"}, min_cover=1.1)
 
 
-def test_ground_that_two_files_share_counts_once(tmp_path):
+def test_cover_counts_overlapping_files_once(tmp_path):
     write(tmp_path / "a.tif", FLAT[:, :100])
     write(tmp_path / "b.tif", FLAT[:, :100])
     with pytest.raises(CatalogError, match="no tile is left"):
@@ -85,8 +85,8 @@ def test_ground_that_two_files_share_counts_once(tmp_path):
     height=st.integers(1, 600),
     cut=st.floats(0, 1),
 )
-def test_covered_ground_is_the_same_however_it_is_cut(tmp_path_factory, west, north, width, height, cut):
-    """Each cell of the survey lies in one tile, and cutting the file in two changes no tile."""
+def test_tiles_do_not_depend_on_file_boundaries(tmp_path_factory, west, north, width, height, cut):
+    """Each cell of the survey lies in one tile, and splitting the file in two changes no tile."""
     root = tmp_path_factory.mktemp("cut")
     values = np.ones((height, width), np.uint8)
     write(root / "whole" / "a.tif", values, west, north)
@@ -107,14 +107,14 @@ def test_covered_ground_is_the_same_however_it_is_cut(tmp_path_factory, west, no
     assert {t.grid.bounds[:2] for t in whole} == touched
 
 
-def test_cells_that_are_a_metre_but_for_rounding(tmp_path):
+def test_cell_size_is_rounded(tmp_path):
     write(tmp_path / "a.tif", FLAT, cell=0.99999999)
     (tile,) = index(tmp_path, {"dsm": "a.tif"}).tiles
     assert tile.grid.cell == 1.0
     assert tile.grid.shape == (250, 250)
 
 
-def test_ascii_grids_point_lists_and_mosaics(tmp_path):
+def test_index_reads_ascii_grid_xyz_and_vrt(tmp_path):
     write(tmp_path / "a.asc", FLAT, driver="AAIGrid", crs=None)
     write_xyz(tmp_path / "down.xyz", FLAT[:20, :30], 295500, 5629500)
     write_xyz(tmp_path / "up.xyz", FLAT[:20, :30], 295500, 5629500, northward=True)
@@ -131,23 +131,23 @@ def test_ascii_grids_point_lists_and_mosaics(tmp_path):
         assert (tile.id, tile.grid.cell) == ("295500_5629250", 1.0), name
 
 
-def test_files_without_a_crs_need_one_said(tmp_path):
+def test_file_without_crs_needs_option(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     write(tmp_path / "dtm.asc", FLAT, driver="AAIGrid", crs=None)
     layers = {"dsm": "dsm.tif", "dtm": "dtm.asc"}
-    with pytest.raises(CatalogError, match=r"dtm.asc carries no CRS; say which it is with --crs"):
+    with pytest.raises(CatalogError, match=r"dtm.asc has no CRS; give it with --crs"):
         index(tmp_path, layers)
     (tile,) = index(tmp_path, layers, crs=UTM).tiles
     assert [layer.crs for layer in tile.layers] == [None, UTM]
 
 
-def test_a_compound_crs_counts_by_its_plan(tmp_path):
+def test_compound_crs_gives_its_horizontal_crs(tmp_path):
     write(tmp_path / "a.tif", FLAT, crs="EPSG:5555")
     (tile,) = index(tmp_path, {"dsm": "a.tif"}).tiles
     assert tile.grid.crs == UTM
 
 
-def test_a_crs_without_a_code_is_kept_as_wkt(tmp_path):
+def test_crs_without_code_is_stored_as_wkt(tmp_path):
     own = CRS("+proj=tmerc +lat_0=51 +lon_0=6.1 +x_0=300000 +y_0=5600000 +ellps=GRS80 +units=m")
     write(tmp_path / "a.tif", FLAT, crs=own.to_wkt())
     (tile,) = index(tmp_path, {"dsm": "a.tif"}).tiles
@@ -155,32 +155,32 @@ def test_a_crs_without_a_code_is_kept_as_wkt(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("crs", "west", "north", "cell", "says"),
+    ("crs", "west", "north", "cell", "message"),
     [
         ("EPSG:2227", 6040000, 2120000, 1.0, "US survey feet; .* gdalwarp -t_srs EPSG:32610"),
-        ("EPSG:2994", 650000, 880000, 1.0, "counts in feet"),
+        ("EPSG:2994", 650000, 880000, 1.0, "feet"),
         ("EPSG:4326", 6.1, 50.8, 1e-5, "degrees; .* gdalwarp -t_srs EPSG:32632"),
     ],
 )
-def test_only_metric_plans(tmp_path, crs, west, north, cell, says):
+def test_crs_not_in_metres_raises_error(tmp_path, crs, west, north, cell, message):
     write(tmp_path / "a.tif", FLAT, west, north, cell=cell, crs=crs)
-    with pytest.raises(CatalogError, match=f"a.tif is in {crs}, which .*{says}"):
+    with pytest.raises(CatalogError, match=f"a.tif is in {crs}, whose unit is .*{message}"):
         index(tmp_path, {"dsm": "a.tif"})
 
 
-def test_a_layer_in_another_crs_costs_its_tiles_only(tmp_path):
-    """The neighbouring UTM zone, some 430 km off by numbers, on the same ground."""
+def test_layer_in_other_crs_is_noted_for_its_tiles(tmp_path):
+    """The DTM is in the neighbouring UTM zone, on the same ground."""
     write(tmp_path / "dsm.tif", np.ones((250, 500), np.float32), 750000, 5650000)
     from rasterio.warp import transform
 
     (east,), (north,) = transform(UTM, "EPSG:25833", [750010], [5649990])
     write(tmp_path / "dtm.tif", np.ones((50, 50), np.float32), east, north, crs="EPSG:25833")
-    found = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"})
-    assert files(found, "dtm") == [("dtm.tif",), None]
-    assert "dtm is in EPSG:25833, not EPSG:25832, in dtm.tif: tiles there will fail" in found.notes
+    result = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"})
+    assert files(result, "dtm") == [("dtm.tif",), None]
+    assert "dtm is in EPSG:25833, not EPSG:25832, in dtm.tif: tiles there will fail" in result.notes
 
 
-def test_one_broken_file_costs_itself(tmp_path):
+def test_index_broken_file_is_skipped_with_note(tmp_path):
     write(tmp_path / "dsm" / "good.tif", FLAT)
     (tmp_path / "dsm" / "broken.tif").write_bytes(b"no raster at all")
     turned = Affine.translation(295500, 5629500) @ Affine.rotation(10) @ Affine.scale(1, -1)
@@ -192,34 +192,36 @@ def test_one_broken_file_costs_itself(tmp_path):
         crs=None,
         transform=Affine.identity(),
     )
-    found = index(tmp_path, {"dsm": "dsm/*.[tp][in][fg]"})
-    assert files(found) == [("dsm/good.tif",)]
-    assert [note for note in found.notes if note.startswith("skipped")] == [
+    result = index(tmp_path, {"dsm": "dsm/*.[tp][in][fg]"})
+    assert files(result) == [("dsm/good.tif",)]
+    assert [note for note in result.notes if note.startswith("skipped")] == [
         "skipped dsm/bare.png (dsm): no georeference; give it a world file or `gdal_translate -a_ullr`",
-        "skipped dsm/broken.tif (dsm): not a raster GDAL can read",
+        "skipped dsm/broken.tif (dsm): not a raster that GDAL can read",
         "skipped dsm/turned.tif (dsm): a rotated raster; turn it north up with gdalwarp",
     ]
     with pytest.raises(CatalogError, match="no usable file .* skipped dsm/broken.tif"):
         index(tmp_path, {"dsm": "dsm/broken.tif"})
 
 
-def test_when_it_was_taken(tmp_path):
+def test_tile_date_from_tag_file_time_or_option(tmp_path):
     write(tmp_path / "a.tif", FLAT, tags={"TIFFTAG_DATETIME": "2020:05:01 10:30:00"})
     write(tmp_path / "b.tif", FLAT, west=295750)
     os.utime(tmp_path / "b.tif", (0, 0))
-    found = index(tmp_path, {"dsm": "*.tif"})
-    assert [(t.datetime, t.datetime_assumed) for t in found.tiles] == [
+    result = index(tmp_path, {"dsm": "*.tif"})
+    assert [(t.datetime, t.datetime_assumed) for t in result.tiles] == [
         (datetime(2020, 5, 1, 10, 30, tzinfo=UTC), False),
         (datetime(1970, 1, 1, tzinfo=UTC), True),
     ]
-    assert found.notes == ("no date in the dsm of 1 tile: the files' times stand in (--date sets it)",)
-    said = index(tmp_path, {"dsm": "*.tif"}, date=datetime(2019, 3, 4))
-    assert {(t.datetime, t.datetime_assumed) for t in said.tiles} == {
+    assert result.notes == (
+        "no date in the dsm of 1 tile: the files' times are used instead (--date sets it)",
+    )
+    dated = index(tmp_path, {"dsm": "*.tif"}, date=datetime(2019, 3, 4))
+    assert {(t.datetime, t.datetime_assumed) for t in dated.tiles} == {
         (datetime(2019, 3, 4, tzinfo=UTC), False)
     }
 
 
-def test_the_acquisition_tells_more_than_the_file(tmp_path):
+def test_acquisition_tag_overrides_file_tag(tmp_path):
     write(tmp_path / "a.tif", FLAT, tags={"TIFFTAG_DATETIME": "2022:01:01 00:00:00"})
     with rasterio.open(tmp_path / "a.tif", "r+") as dst:
         dst.update_tags(ns="IMAGERY", ACQUISITIONDATETIME="2020-05-01 10:30:00")
@@ -227,7 +229,7 @@ def test_the_acquisition_tells_more_than_the_file(tmp_path):
     assert tile.datetime == datetime(2020, 5, 1, 10, 30, tzinfo=UTC)
 
 
-def test_road_values_go_with_the_masks(tmp_path):
+def test_road_values_are_set_on_masks_only(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     layers = {"road_mask": "dsm.tif", "dsm": "dsm.tif", "reference_road": "dsm.tif"}
     (tile,) = index(tmp_path, layers, road_values=(1, 3)).tiles
@@ -238,7 +240,7 @@ def test_road_values_go_with_the_masks(tmp_path):
     ]
 
 
-def test_it_fits_into_a_catalog(tmp_path):
+def test_indexed_tiles_round_trip_through_catalog(tmp_path):
     write(tmp_path / "data" / "a.tif", np.ones((500, 500), np.float32), 295500, 5629500)
     tiles = index(tmp_path / "data", {"dsm": "*.tif"}).tiles
     Catalog(tiles).write(tmp_path / "c.parquet")
@@ -247,13 +249,13 @@ def test_it_fits_into_a_catalog(tmp_path):
     assert read[0].layer("dsm").files == ("data/a.tif",)
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_index_wrong_pattern_or_layer_raises_error(tmp_path):
     write(tmp_path / "dom" / "a.tif", FLAT)
     with pytest.raises(CatalogError, match=r"no file matches --road-mask '\*.png' .*; there are dom/a.tif"):
         index(tmp_path, {"dsm": "dom/*.tif", "road_mask": "*.png"})
     with pytest.raises(CatalogError, match="is no pattern below"):
         index(tmp_path, {"dsm": "/dom/*.tif"})
-    with pytest.raises(CatalogError, match="no layer is called 'dom'"):
+    with pytest.raises(CatalogError, match="unknown layer 'dom'"):
         index(tmp_path, {"dsm": "dom/*.tif", "dom": "*"})
     with pytest.raises(CatalogError, match="--dsm"):
         index(tmp_path, {"dtm": "*"})

@@ -1,4 +1,4 @@
-"""A file behaves alike on disk and in a bucket."""
+"""Files behave the same on disk and in a bucket."""
 
 import sys
 from pathlib import Path
@@ -15,24 +15,24 @@ def folder(request, tmp_path):
     return tmp_path if request.param == "disk" else request.getfixturevalue("bucket")
 
 
-def test_what_is_written_is_seen_listed_and_read(folder):
+def test_written_files_can_be_listed_and_read(folder):
     assert paths.listing(folder) == {}
     for name in ("a.bin", "b/c.bin", "b/d/e.bin"):
         paths.write(folder / name, name.encode())
-    found = paths.listing(folder)
-    assert {name: seen.size for name, seen in found.items()} == {"a.bin": 5, "b/c.bin": 7, "b/d/e.bin": 9}
-    look = StatCache()
-    for name, seen in found.items():
+    files = paths.listing(folder)
+    assert {name: stat.size for name, stat in files.items()} == {"a.bin": 5, "b/c.bin": 7, "b/d/e.bin": 9}
+    stat_of = StatCache()
+    for name, stat in files.items():
         assert paths.read(folder / name) == name.encode()
-        assert paths.stat(folder / name) == look(folder / name) == seen
+        assert paths.stat(folder / name) == stat_of(folder / name) == stat
     assert paths.listing(folder / "b").keys() == {"c.bin", "d/e.bin"}
     for name in ("no.bin", "b/no.bin", "no/no.bin"):
-        assert look(folder / name) is paths.stat(folder / name) is None
+        assert stat_of(folder / name) is paths.stat(folder / name) is None
         assert not paths.exists(folder / name)
     assert paths.exists(folder / "a.bin")
 
 
-def test_other_bytes_are_another_version(folder):
+def test_changed_content_changes_version(folder):
     paths.write(folder / "a", b"one")
     before = paths.stat(folder / "a")
     paths.write(folder / "a", b"two")
@@ -41,7 +41,7 @@ def test_other_bytes_are_another_version(folder):
     assert before.version != after.version
 
 
-def test_what_is_missing_is_named(folder):
+def test_missing_file_is_named_and_remove_ignores_it(folder):
     with pytest.raises(FileNotFoundError) as caught:
         paths.read(folder / "no")
     assert caught.value.filename in (str(folder / "no"), folder / "no")
@@ -52,45 +52,45 @@ def test_what_is_missing_is_named(folder):
 
 
 @pytest.mark.slow
-def test_a_place_says_what_it_was_called(tmp_path, bucket):
+def test_location_text_round_trip(tmp_path, bucket):
     assert parse_location(str(tmp_path)) == tmp_path
     assert type(parse_location(str(tmp_path))) is type(tmp_path)
     assert not paths.is_remote(parse_location("a/s3:/b"))
     address = f"{bucket}/a/b.tif"
-    # A path has lost a slash on its way through a command line.
-    for told in (address, Path(address), bucket / "a" / "b.tif"):
-        assert str(parse_location(told)) == address
-        assert paths.is_remote(parse_location(told))
+    # Path() drops a slash of the address.
+    for text in (address, Path(address), bucket / "a" / "b.tif"):
+        assert str(parse_location(text)) == address
+        assert paths.is_remote(parse_location(text))
     assert paths.gdal_name(parse_location(address)) == address.replace("s3://", "/vsis3/")
 
 
-def test_without_s3fs_the_remedy_is_named(monkeypatch):
+def test_parse_location_without_s3fs_names_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
     with pytest.raises(OSError, match=r"install it with pip install 'flexroad\[s3\]'.*s3://bucket/name"):
         parse_location("s3://bucket/name")
 
 
-def test_a_name_is_made_plain_without_a_look_at_links(tmp_path):
+def test_normalise_does_not_follow_links(tmp_path):
     (tmp_path / "link").symlink_to("/")
     assert paths.normalise(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
     assert paths.normalise("s3://one/a/../b/c") == "s3://one/b/c"
-    # Out of the bucket is another bucket, and no longer below the folder.
+    # ".." above the bucket leads to another bucket.
     assert paths.normalise("s3://one/a/../../../two/c") == "s3://two/c"
 
 
 @pytest.mark.slow
-def test_a_folder_of_a_bucket_is_listed_once(bucket, storage):
+def test_stat_cache_lists_bucket_folder_once(bucket, storage):
     for i in range(20):
         paths.write(bucket / "data" / f"{i}.tif", b"x")
     storage.requests()
-    look = StatCache()
-    assert all(look(bucket / "data" / f"{i}.tif") for i in range(20))
+    stat_of = StatCache()
+    assert all(stat_of(bucket / "data" / f"{i}.tif") for i in range(20))
     assert len(storage.requests()) == 1
 
 
 @pytest.mark.slow
-def test_a_write_is_one_request(bucket, storage):
+def test_write_and_read_are_one_request_each(bucket, storage):
     storage.requests()
     paths.write(bucket / "a", b"x" * 1_000_000)
     assert [method for method, _ in storage.requests()] == ["PUT"]
@@ -100,7 +100,7 @@ def test_a_write_is_one_request(bucket, storage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("answer", ["slow", "error", "cut"])
-def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
+def test_storage_fails_twice_request_is_retried(bucket, storage, answer):
     storage.fail(Fault(answer, first=2))
     paths.write(bucket / "a" / "b", b"whole")
     assert paths.read(bucket / "a" / "b") == b"whole"
@@ -109,7 +109,7 @@ def test_storage_that_stumbles_is_asked_again(bucket, storage, answer):
 
 
 @pytest.mark.slow
-def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
+def test_read_truncated_answer_is_retried(bucket, storage):
     data = bytes(range(256)) * 1000
     paths.write(bucket / "a", data)
     storage.fail(Fault("half", method="GET", first=1))
@@ -118,7 +118,7 @@ def test_an_answer_that_breaks_off_is_asked_for_again(bucket, storage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("answer", ["slow", "denied"])
-def test_storage_that_never_answers_is_named(bucket, storage, answer):
+def test_storage_always_fails_error_names_bucket(bucket, storage, answer):
     storage.fail(Fault(answer))
     for attempt in (
         lambda: paths.write(bucket / "a", b""),
