@@ -93,7 +93,7 @@ class Catalog:
         """
         path = _location(path)
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
-            raise CatalogError(f"a catalog's name must end in .parquet, .json or .geojson, not {path.name}")
+            raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, but not {path.name}")
         folder = absolute(path).parent
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet

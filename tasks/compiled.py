@@ -1,7 +1,7 @@
-"""Functions that numba compiles when they are first called.
+"""Functions that numba compiles at their first call.
 
-Importing them costs nothing, so that commands that compute nothing start at once. What is compiled is kept on
-disk, and the next process reads it.
+Importing them does not import numba, so commands that compute nothing start fast. Compiled code is cached on
+disk and used by later processes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Compiled(Generic[P, R]):
         """The function as numba's dispatcher."""
         from numba import njit
 
-        # The functions that this one calls: numba must find dispatchers under their names.
+        # numba needs dispatchers, not Compiled objects, under the names of the functions that this one calls.
         names = self.function.__globals__
         for name in self.function.__code__.co_names:
             if isinstance(names.get(name), Compiled):

@@ -1,10 +1,10 @@
-"""The one base of what this package complains about."""
+"""The base class of this package's errors."""
 
 from __future__ import annotations
 
 
 class TaskError(Exception):
-    """A stage that cannot do its work on a tile; one line with the value and the remedy.
+    """A stage that fails on a tile; one line with the value and the remedy.
 
     Parameters
     ----------
@@ -13,7 +13,7 @@ class TaskError(Exception):
     file : str, optional
         The source file at fault, for the table of failures.
     layer : str, optional
-        The tile's layer at fault, where the stage knows no file: the runner names the layer's.
+        The tile's layer at fault, if the stage has no file name: the runner then reports the layer's files.
     """
 
     def __init__(self, message: str, file: str = "", layer: str = "") -> None:

@@ -1,7 +1,7 @@
 """Step A of the paper, geospatial data acquisition: the rasters R^DSM and R^DTM of one tile on one lattice.
 
-The door of the program: behind it heights are metres in float64, row 0 lies in the north, and what is
-unknown is NaN, whatever the files' cut, lattice, unit or nodata.
+All later stages get heights in metres (float64), row 0 in the north and NaN where there is no value,
+whatever the files' extent, lattice, unit and nodata value.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ VERSION = 1
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES
-"""Layers the result depends on; the others are only named to who reads them."""
+"""Layers that are read; of other layers the result holds only the file names."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Heights beyond these are nodata that nobody declared."""
+"""Heights outside this range are taken as undeclared nodata."""
 
 METRE: Unit = ("metre", 1.0)
 
@@ -41,18 +41,18 @@ UNITS = {
     **dict.fromkeys(("us-ft", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
 }
-"""Metres in the units that bands of heights declare, in lower case."""
+"""Size (m) of the units of height that bands declare; names in lower case."""
 
 
 class Options(options.Options):
-    """What `load` reads."""
+    """Options of `load`."""
 
     halo_m: float = Field(
         0.0,
         ge=0,
         le=500,
         description="ground read around the tile (m), so that neighbouring surfaces meet; 0 in the paper; "
-        "a catalog of rasters names the files up to 100 m around",
+        "a catalog of rasters lists the files up to 100 m around a tile",
     )
     min_valid: float = Field(
         0.25, ge=0, le=1, description="share of the tile's cells that need a DSM height, or the tile fails"
@@ -66,7 +66,7 @@ class _Mosaic:
     values: Floats
     """``(H, W)``, heights in m or class values; NaN where no file has a value."""
     patches: tuple[RasterWindow, ...]
-    """What was read, in the order of the files."""
+    """The parts read, in the order of the files."""
     notes: tuple[str, ...]
 
 
@@ -74,12 +74,12 @@ def load(tile: Tile, options: Options) -> TileData:
     """Read a tile's DSM, DTM, masks and reference onto its lattice, grown by the halo.
 
     Cells that coincide are copied; others are resampled (heights bilinearly, classes to the nearest),
-    with a note. Of files that overlap, the first with a value wins.
+    with a note. Where files overlap, the first one with a value is used.
 
     Raises
     ------
     TaskError
-        If a file that the tile needs is missing or broken, one is in another CRS, the layers differ in
+        If a file that the tile needs is missing or broken, a file is in another CRS, the layers differ in
         their unit of height, the tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
     """
     for name in ("dsm", "dtm"):
@@ -89,21 +89,21 @@ def load(tile: Tile, options: Options) -> TileData:
 
     grid = tile.grid.buffered(options.halo_m)
     with quiet():
-        found = {layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in READS}
-    _check_units([patch for name in HEIGHTS if name in found for patch in found[name].patches])
+        mosaics = {layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in READS}
+    _check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
     core = grid.window(tile.grid)
-    _check_valid(found["dsm"], core, options.min_valid)
-    _check_valid(found["dtm"], core, 0.0)
+    _check_valid(mosaics["dsm"], core, options.min_valid)
+    _check_valid(mosaics["dtm"], core, 0.0)
     return TileData(
         tile_id=tile.id,
         grid=grid,
         core=tile.grid,
-        dsm=found["dsm"].values,
-        dtm=found["dtm"].values,
-        road_mask=_road(tile, "road_mask", found),
-        reference=_reference(found),
-        reference_road=_road(tile, "reference_road", found),
-        notes=tuple(note for mosaic in found.values() for note in mosaic.notes),
+        dsm=mosaics["dsm"].values,
+        dtm=mosaics["dtm"].values,
+        road_mask=_road(tile, "road_mask", mosaics),
+        reference=_reference(mosaics),
+        reference_road=_road(tile, "reference_road", mosaics),
+        notes=tuple(note for mosaic in mosaics.values() for note in mosaic.notes),
         dop=_source(tile, "dop"),
         roads=_source(tile, "roads"),
     )
@@ -114,14 +114,14 @@ def _source(tile: Tile, name: str) -> Source | None:
     return Source(name, tile.paths(layer), layer.crs) if layer else None
 
 
-def _reference(found: Mapping[str, _Mosaic]) -> Floats | None:
-    """Return the true heights: as given, else the paper's extended DTM where bridge decks are known."""
-    if "reference" in found:
-        return found["reference"].values
-    if "bridges" not in found:
+def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:
+    """Return the layer ``reference``, else the paper's extended DTM (DTM and bridge decks), else None."""
+    if "reference" in mosaics:
+        return mosaics["reference"].values
+    if "bridges" not in mosaics:
         return None
-    decks = found["bridges"].values
-    return np.where(np.isfinite(decks), decks, found["dtm"].values)
+    decks = mosaics["bridges"].values
+    return np.where(np.isfinite(decks), decks, mosaics["dtm"].values)
 
 
 def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
@@ -134,7 +134,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     broken: list[Unreadable] = []
     resampling = Resampling.bilinear if layer.name in HEIGHTS else Resampling.nearest
     patches: list[RasterWindow] = []
-    cut = 0
+    absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
             patch = read_window(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
@@ -146,35 +146,35 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         reached |= _reached(patch, grid)
         if layer.name in HEIGHTS:
             patch, absurd = _metres(patch)
-            cut += absurd
+            absurd_cells += absurd
         patches.append(patch)
         np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
         if not np.isnan(values).any():
             break
-    # Files are named for the ground around a tile, too: a broken one costs the tiles it lies on.
+    # A tile also lists files around it: a broken file fails only the tiles that need it.
     if broken and not reached[grid.window(tile.grid)].all():
         raise TaskError(str(broken[0]), broken[0].file)
     if not patches:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         raise TaskError(
             f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
-            "build the catalog anew",
+            "build the catalog again",
             str(tile.paths(layer)[0]),
         )
     notes = [
-        f"{layer.name} resampled: {why}"
-        for why in dict.fromkeys(misalignment(p.lattice, grid) for p in patches)
-        if why
+        f"{layer.name} resampled: {reason}"
+        for reason in dict.fromkeys(misalignment(p.lattice, grid) for p in patches)
+        if reason
     ]
-    notes += [f"the tile is whole without it: {error}" for error in broken]
-    if cut:
-        cells = "1 cell" if cut == 1 else f"{cut} cells"
+    notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
+    if absurd_cells:
+        cells = "1 cell" if absurd_cells == 1 else f"{absurd_cells} cells"
         notes.append(f"{layer.name}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
     return _Mosaic(values, tuple(patches), tuple(notes))
 
 
 def _reached(patch: RasterWindow, grid: Grid) -> Bools:
-    """Return the cells of the grid whose centres lie within the patch, with a value or not, ``(H, W)``."""
+    """Return the cells of the grid whose centres lie within the patch's bounds, ``(H, W)``."""
     west, south, east, north = patch.lattice.bounds
     inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
         (west < grid.eastings) & (grid.eastings < east)
@@ -183,7 +183,7 @@ def _reached(patch: RasterWindow, grid: Grid) -> Bools:
 
 
 def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
-    """Return the patch with heights in metres, and how many were no heights at all."""
+    """Return the patch with heights in metres, and the number of cells outside the range of heights."""
     values = patch.values * _unit(patch)[1]
     absurd = (values < LOWEST_M) | (values > HIGHEST_M)
     values[absurd] = np.nan
@@ -191,13 +191,13 @@ def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
 
 
 def _unit(patch: RasterWindow) -> Unit:
-    """Return the unit of heights: as the band declares it, else the CRS, else metres."""
+    """Return the unit of heights declared by the band, else by the CRS, else metres."""
     if not patch.unit:
         return (height_unit(patch.crs) if patch.crs else None) or METRE
     metres = UNITS.get(patch.unit.lower())
     if metres is None:
         raise TaskError(
-            f"{patch.name} counts in {patch.unit!r}, which is no unit of height known here; "
+            f"{patch.name} has the unit {patch.unit!r}, which is not a supported unit of height; "
             "convert it, or correct the unit with gdal_edit.py -units m",
             patch.file,
         )
@@ -205,13 +205,13 @@ def _unit(patch: RasterWindow) -> Unit:
 
 
 def _check_units(patches: Sequence[RasterWindow]) -> None:
-    """Refuse heights in feet beside heights in metres: more likely a missing tag than a mixed survey."""
+    """Raise an error if layers differ in their unit of height: probably a missing tag, not a mixed survey."""
     first = patches[0]
     for patch in patches[1:]:
         (a, a_metres), (b, b_metres) = _unit(first), _unit(patch)
         if not math.isclose(a_metres, b_metres, rel_tol=1e-4):
             raise TaskError(
-                f"{first.name} counts heights in {a}, {patch.name} in {b}; "
+                f"{first.name} has heights in {a}, {patch.name} in {b}; "
                 "convert one, or correct its unit with gdal_edit.py -units",
                 patch.file,
             )
@@ -230,11 +230,11 @@ def _check_valid(mosaic: _Mosaic, core: tuple[slice, slice], min_valid: float) -
         )
 
 
-def _road(tile: Tile, name: str, found: Mapping[str, _Mosaic]) -> Bools | None:
+def _road(tile: Tile, name: str, mosaics: Mapping[str, _Mosaic]) -> Bools | None:
     """Return the road cells of a mask, or None if the tile has no such layer."""
     layer = tile.layer(name)
     if layer is None:
         return None
-    values = found[name].values
+    values = mosaics[name].values
     road: Bools = np.isin(values, layer.values) if layer.values else np.nan_to_num(values) != 0
     return road

@@ -1,4 +1,4 @@
-"""The same as `load` for rasters that are in memory as DataArrays: one tile's data on one lattice."""
+"""Load one tile from xarray DataArrays in memory; the counterpart of `load` for files."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
 
 
 def _patch(name: str, array: xr.DataArray) -> RasterWindow:
-    """Return an array's values, rows from the north, and where they lie; refuse what has no such place."""
+    """Return an array's values, rows from the north, with their lattice and CRS."""
     array = _plane(name, array)
     crs = _crs(name, array)
     _check_unit(name, array, crs)
@@ -112,15 +112,15 @@ def _crs(name: str, array: xr.DataArray) -> str:
 
 
 def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:
-    """Refuse heights that are declared in another unit than metres."""
+    """Raise an error if heights are declared in another unit than metres."""
     if name == "road_mask":
         return
     unit, metres = array.attrs.get("units"), 1.0
     if unit:
-        known = UNITS.get(str(unit).lower())
-        if known is None:
+        factor = UNITS.get(str(unit).lower())
+        if factor is None:
             raise TaskError(f"{name} has units {unit!r}; give metres and set {name}.attrs['units'] = 'm'")
-        metres = known
+        metres = factor
     else:
         unit, metres = height_unit(crs) or ("metre", 1.0)
     if not math.isclose(metres, 1.0):
@@ -130,7 +130,7 @@ def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:
 
 
 def _lattice(name: str, array: xr.DataArray) -> tuple[RasterGrid, bool]:
-    """Return where the cells lie, and whether the first column is in the west."""
+    """Return the lattice of the cells, and whether the first column is in the west."""
     y, x = array.dims
     transform = array.rio.transform()
     if transform.b or transform.d:
@@ -138,7 +138,7 @@ def _lattice(name: str, array: xr.DataArray) -> tuple[RasterGrid, bool]:
     if min(array.shape) < 2:
         raise TaskError(f"{name} has {array.shape[0]} x {array.shape[1]} cells; give at least 2 x 2")
     if x in array.coords and y in array.coords:
-        # Coordinates tell more than a stored transform, which goes stale when an array is cut.
+        # Coordinates are preferred: a stored transform is out of date after an array was sliced.
         (west, dx), (south, dy) = _axis(name, array[x]), _axis(name, array[y])
     else:
         dx, dy = transform.a, transform.e
@@ -155,16 +155,16 @@ def _lattice(name: str, array: xr.DataArray) -> tuple[RasterGrid, bool]:
 
 
 def _axis(name: str, centres: xr.DataArray) -> tuple[float, float]:
-    """Return the lower edge of an axis and its signed step (m), without the rounding of float arithmetic."""
-    at = np.asarray(centres.values, dtype=np.float64)
-    steps = np.diff(at)
-    step = float(at[-1] - at[0]) / steps.size
+    """Return the lower edge of an axis and its signed step (m), rounded to remove floating-point errors."""
+    values = np.asarray(centres.values, dtype=np.float64)
+    steps = np.diff(values)
+    step = float(values[-1] - values[0]) / steps.size
     if not step or not np.allclose(steps, step, rtol=LATTICE_TOLERANCE, atol=0):
         raise TaskError(
             f"{name} has {centres.name} in steps of {steps.min():.6g} to {steps.max():.6g} m, not equal; "
             f"resample it, e.g. {name}.rio.reproject({name}.rio.crs)"
         )
-    return round(float(at.min()) - abs(step) / 2, 6), round(step, 9)
+    return round(float(values.min()) - abs(step) / 2, 6), round(step, 9)
 
 
 def _values(name: str, array: xr.DataArray) -> Floats:
@@ -180,18 +180,20 @@ def _values(name: str, array: xr.DataArray) -> Floats:
     values = raw.astype(np.float64)
     nodata = array.rio.nodata
     if nodata is not None and raw.dtype.kind != "b":
-        # Compared as the array has it: -3.4e38 is another number in float32 than in float64.
+        # Compare in the array's dtype: -3.4e38 is not the same number in float32 and float64.
         values[values == np.float64(np.asarray(nodata).astype(raw.dtype))] = np.nan
     return values
 
 
 def _grid(dsm: RasterWindow) -> Grid:
-    at = dsm.lattice
-    return Grid(in_plan(dsm.crs or ""), at.west, at.north, at.dx, at.width, at.height)
+    lattice = dsm.lattice
+    return Grid(
+        in_plan(dsm.crs or ""), lattice.west, lattice.north, lattice.dx, lattice.width, lattice.height
+    )
 
 
 def _absurd(patch: RasterWindow) -> str:
-    """Make heights that can be none NaN, as `load` does; return a note if there were any."""
+    """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none."""
     absurd = (patch.values < LOWEST_M) | (patch.values > HIGHEST_M)
     patch.values[absurd] = np.nan
     if not absurd.any():
@@ -200,21 +202,21 @@ def _absurd(patch: RasterWindow) -> str:
 
 
 def _misfit(patch: RasterWindow, core: Grid) -> str:
-    """Refuse another CRS than the DSM's; return a note if cells do not coincide with the DSM's."""
+    """Check that the CRS is the DSM's; return a note if the cells do not coincide with the DSM's, else ""."""
     if not same(patch.crs or "", core.crs):
         raise TaskError(
             f"{patch.name} is in {short(patch.crs or '')}, the dsm in {short(core.crs)}; "
             f"reproject it, e.g. {patch.name}.rio.reproject_match(dsm)"
         )
-    why = misalignment(patch.lattice, core).replace("the tile's", "the dsm's")
-    return f"{patch.name} resampled to the grid of the dsm: {why}" if why else ""
+    reason = misalignment(patch.lattice, core).replace("the tile's", "the dsm's")
+    return f"{patch.name} resampled to the grid of the dsm: {reason}" if reason else ""
 
 
 def _onto(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     slices = patch.lattice.window_for(grid)
     if slices is None:
         bounds = " ".join(f"{edge:.10g}" for edge in patch.lattice.bounds)
-        raise TaskError(f"{patch.name} ({bounds}) does not overlap the dsm; give arrays of the same place")
+        raise TaskError(f"{patch.name} ({bounds}) does not overlap the dsm; give arrays of the same area")
     cut = RasterWindow(
         patch.name,
         "",

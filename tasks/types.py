@@ -1,4 +1,4 @@
-"""What travels from stage to stage: frozen, arrays on a `Grid`, metres, degrees."""
+"""Data passed from stage to stage: frozen dataclasses with arrays on a `Grid`; metres and degrees."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Source:
-    """A layer that is read where it is used, at its own resolution."""
+    """A layer that is not read by `load` but by the stage that uses it, at its own resolution."""
 
     name: str
     """One of `catalog.LAYERS`."""
     paths: tuple[Location, ...]
-    """Files that reach the tile; of those that overlap, the first with a value wins."""
+    """Files that reach the tile; where files overlap, the first one with a value is used."""
     crs: str | None = None
-    """CRS of files that carry none."""
+    """CRS of files without one."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """The rasters of one tile on one lattice: what `load` read."""
+    """The rasters of one tile on one lattice: the result of `load`."""
 
     tile_id: str
     grid: Grid
-    """The lattice of all arrays here: the tile's core grown by the halo."""
+    """Grid of all arrays: the tile's core grown by the halo."""
     core: Grid
-    """The tile itself; what is sampled and evaluated."""
+    """Grid of the tile itself, which is sampled and evaluated."""
     dsm: Floats
     """Highest surface per cell, ``(H, W)``, m; NaN where unknown."""
     dtm: Floats
@@ -43,11 +43,11 @@ class TileData:
     road_mask: Bools | None = None
     """Road by the catalog's mask layer, ``(H, W)``, or None if the tile has no such layer."""
     reference: Floats | None = None
-    """True height of road and terrain, ``(H, W)``, m, or None: the DTM then stands in."""
+    """True height of road and terrain, ``(H, W)``, m, or None if the DTM is used instead."""
     reference_road: Bools | None = None
-    """True road cells, ``(H, W)``, or None: the raw segmented mask then stands in."""
+    """True road cells, ``(H, W)``, or None if the raw segmented mask is used instead."""
     notes: tuple[str, ...] = ()
-    """What had to be done to the input (resampling, cut heights), one line each."""
+    """Changes made to the input (resampling, heights taken as nodata), one line each."""
     dop: Source | None = None
     """The orthophoto, or None if the tile has none."""
     roads: Source | None = None
@@ -56,7 +56,7 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class RoadMask:
-    """What `segment` found: the paper's M^r, before the filter."""
+    """The result of `segment`: the paper's M^r, before the filter."""
 
     grid: Grid
     core: Grid
@@ -66,23 +66,23 @@ class RoadMask:
     """Cells beyond the survey, ``(H, W)``: neither DSM nor DTM, in a void that touches the grid's edge.
     Meshes end there; voids inside are bridged."""
     probability: NDArray[np.float32] | None = None
-    """Probability of road, ``(H, W)``, 0 to 1, where the method gives one."""
+    """Probability of road, ``(H, W)``, 0 to 1, or None if the method gives none."""
     bridge: Bools | None = None
-    """Cells of the mask that lie on bridges, ``(H, W)``, where the method knows them."""
+    """Cells of the mask that lie on bridges, ``(H, W)``, or None if the method does not detect bridges."""
     notes: tuple[str, ...] = ()
-    """What to know about the mask (a photo off the heights), one line each."""
+    """Warnings about the mask (such as a photo shifted against the heights), one line each."""
 
 
 @dataclass(frozen=True, eq=False)
 class RoadClusters:
-    """What ECSRC kept: the paper's labels L and, by `mask`, M^{r+}."""
+    """The result of ECSRC: the paper's labels L and, as `mask`, M^{r+}."""
 
     grid: Grid
     labels: NDArray[np.int32]
     """``(H, W)``; 0 is no road, clusters count from 1 in the order of their first cell."""
     dtm_invalid: Bools | None = None
-    """Cells, none of them kept, whose DTM does not count: under what hides a road it may be another ground's,
-    and beside a road it is rounded off, ``(H, W)``; None: nobody asked."""
+    """Dropped cells whose DTM is invalid, ``(H, W)``, or None if the DTM was not checked. Under objects that
+    hide a road the DTM may be that of other ground; beside a road it is smoothed."""
 
     @property
     def mask(self) -> Bools:
@@ -98,7 +98,7 @@ class Surface(Protocol):
     def bounds(self) -> Bounds:
         """The domain: west, south, east, north (m).
 
-        Beyond it, up to the tile's edge, the surface goes on linearly.
+        Beyond it, up to the tile's edge, the surface is extrapolated linearly.
         """
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
@@ -128,7 +128,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Metrics:
-    """The figures of one mesh against the reference; lengths in metres, angles in degrees.
+    """Errors and size of one mesh against the reference; lengths in metres, angles in degrees.
 
     NaN where a class has no cell or no face.
     """
@@ -143,7 +143,7 @@ class Metrics:
     p95_road_m: float
     """95th percentile of the vertical distance."""
     nearest_road_m: float
-    """Mean distance in space from the reference's road cells to the mesh; NaN unless asked for."""
+    """Mean 3-D distance from the reference's road cells to the mesh; NaN if not computed."""
     nearest_terrain_m: float
     mad_road_deg: float
     mad_terrain_deg: float
@@ -157,51 +157,52 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """What a surface tells of itself on the core's road cells by the raw mask; nothing here is ground truth.
+    """Quality figures of a surface without ground truth, on the core's road cells of the raw mask.
 
     Lengths in metres, shares of the road from 0 to 1. NaN where there is nothing to measure.
     """
 
     residual_median_m: float
-    """Surface minus DSM at the kept road points: a shift."""
+    """Median of surface minus DSM at the kept road cells: a vertical shift."""
     residual_nmad_m: float
-    """Spread of the same."""
+    """NMAD (spread) of surface minus DSM."""
     residual_p95_m: float
-    """95th percentile of its absolute value: points the surface does not follow."""
+    """95th percentile of the absolute difference: cells that the surface does not follow."""
     curvature_per_m: float
     """Largest second difference of the surface, per squared cell size (1/m)."""
     edge_step_m: float
-    """95th percentile of the surface's step where the road ends, against the line of the last two cells."""
+    """95th percentile of the surface's step at the road's edge, against the line of the last two cells."""
     measured_road: float
-    """Share of the road where the scan saw the ground."""
+    """Share of the road where the scan measured the ground."""
     dtm_road: float
-    """Share where the DTM stands in."""
+    """Share of the road supported by the DTM only."""
     inferred_road: float
-    """Share where neither supports the surface."""
+    """Share of the road supported by neither."""
     dropped_road: float
     """Share of the mask that the filter dropped."""
     off_dtm_m: float
     """Median of surface minus DTM."""
     off_dtm_road: float
-    """Share of the road, where there is a DTM, that is farther from it than two heights of one ground."""
+    """Share of the road with a DTM whose distance to it exceeds that of two heights of the same ground."""
     bounded_weights: float
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
     error_estimate_m: float
-    """Mean distance of the surface to the nearer witness, scan or DTM: what its error may be."""
+    """Mean distance of the surface to the nearer of scan and DTM: an estimate of its error."""
     suspect_m2: float
-    """Largest patch of road farther from its witness than two heights of one ground may be (m2), or 0."""
+    """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
+    ground (m2), or 0."""
     flags: tuple[str, ...]
-    """What stands out, by `tasks.quality.assess.FLAGS`."""
+    """Names of problems, from `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]
-    """The core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
+    """Class of the core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Orthophoto:
-    """An orthophoto of a piece of ground."""
+    """A part of an orthophoto."""
 
     grid: Grid
-    """Its pixels."""
+    """Grid of the pixels."""
     colour: NDArray[np.uint8]
     """Red, green, blue, ``(3, h, w)``."""
     known: Bools

@@ -1,4 +1,4 @@
-"""Photographs of a made hill from known places, with the tags a drone writes."""
+"""Rendered photographs of a synthetic hill from given positions, with the tags that a drone writes."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -31,19 +31,19 @@ class Made:
 
     def pixels(self, points):
         """Return column and row of world points, ``(n, 2)``."""
-        seen = (points - self.centre) @ self.rotation.T
-        return FOCAL * seen[:, :2] / seen[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+        local = (points - self.centre) @ self.rotation.T
+        return FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)
 
 
 def ground(easting, northing):
-    """Return the true height (m): hills of 3 m and 30 m across, and a slope."""
+    """Return the true height (m): waves 3 m high, about 30 m long, on a slope."""
     x, y = easting - CORNER[0], northing - CORNER[1]
     return DATUM_M + 1.5 * np.sin(x / 5) * np.cos(y / 6) + 0.03 * x
 
 
 @cache
 def texture():
-    """Return colours of the ground, ``(n, n, 3)``, row 0 in the south: speckle of several sizes."""
+    """Return colours of the ground, ``(n, n, 3)``, row 0 in the south: noise of several scales."""
     rng = np.random.default_rng(0)
     n = round(SIDE_M / TEXEL_M)
     grey = sum(gaussian_filter(rng.standard_normal((n, n)), s) * s for s in (1, 3, 9))
@@ -52,7 +52,7 @@ def texture():
 
 
 def photographs(folder, **tags):
-    """Write two strips of four photographs looking down, turned and tilted a little; return them."""
+    """Write two strips of four nadir photographs with small rotations; return them."""
     rng = np.random.default_rng(5)
     colours, made = texture(), []
     for number in range(8):
@@ -68,23 +68,23 @@ def photographs(folder, **tags):
 
 
 def render(centre, rotation, colours):
-    """Return what a camera sees of the ground, ``(h, w, 3)``."""
+    """Return the image of the ground from a camera, ``(h, w, 3)``."""
     col, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = (
         np.stack([(col - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones(col.shape)], -1) @ rotation
     )
     height = np.full(col.shape, DATUM_M)
     for _ in range(25):
-        # The ground is less steep than the rays: where they meet is a fixed point.
+        # The ground is less steep than the rays, so this fixed-point iteration converges.
         place = centre + rays * ((height - centre[2]) / rays[..., 2])[..., None]
         height = ground(place[..., 0], place[..., 1])
-    at = [(place[..., axis] - CORNER[axis]) / TEXEL_M - 0.5 for axis in (1, 0)]
-    bands = [map_coordinates(colours[..., band], at, order=1, mode="mirror") for band in range(3)]
+    texel = [(place[..., axis] - CORNER[axis]) / TEXEL_M - 0.5 for axis in (1, 0)]
+    bands = [map_coordinates(colours[..., band], texel, order=1, mode="mirror") for band in range(3)]
     return np.rint(np.stack(bands, -1)).astype(np.uint8)
 
 
 def exif(centre, film_mm=FILM_MM, offset=(0, 0, 0), model="Made"):
-    """Return a drone's tags for a camera at ``centre`` whose receiver is off by ``offset`` (m)."""
+    """Return a drone's tags for a camera at ``centre`` whose GNSS position has the error ``offset`` (m)."""
     tags = Image.Exif()
     tags[ExifTags.Base.Make], tags[ExifTags.Base.Model] = "Test", model
     detail = tags.get_ifd(ExifTags.IFD.Exif)
@@ -107,7 +107,7 @@ def exif(centre, film_mm=FILM_MM, offset=(0, 0, 0), model="Made"):
 
 
 def _rotation(roll, pitch, yaw):
-    """Return world to camera: looking down, columns east, rows south, then turned."""
+    """Return the rotation from world to camera: nadir view, columns east, rows south, then rotated."""
     down = np.diag([1.0, -1.0, -1.0])
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])

@@ -1,4 +1,4 @@
-"""Small vector files of roads for the tests."""
+"""Small vector files of roads for tests."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 100, 100)
 
 
 def on_grid(*places: tuple[float, float]) -> list[tuple[float, float]]:
-    """Places given from the grid's south-west corner."""
+    """Return eastings and northings of places relative to the grid's south-west corner."""
     return [(GRID.west + x, GRID.south + y) for x, y in places]
 
 
@@ -25,7 +25,7 @@ def write(path: Path, shapes, crs: str | None = GRID.crs, layer: str | None = No
 
 
 def tile(*paths: Path, grid: Grid = GRID, core: Grid | None = None, crs: str | None = None) -> TileData:
-    """A flat tile whose roads are the files; without any it has no such layer."""
+    """Return a flat tile whose layer ``roads`` has these files; without files it has no such layer."""
     flat = np.zeros(grid.shape)
     source = Source("roads", paths, crs) if paths else None
     return TileData("a", grid, core or grid, flat, flat, roads=source)
@@ -38,13 +38,13 @@ OSM = """<?xml version="1.0"?><osm version="0.6">
 
 
 def write_osm(path: Path, ways: dict[str, list[tuple[float, float]]]) -> Path:
-    """Write OSM's own format: tags as ``k=v;k=v`` -> longitudes and latitudes; equal places are one node."""
+    """Write an OSM file; ways by tags ``k=v;k=v`` as longitudes and latitudes; equal places are one node."""
     numbers = {place: i + 1 for i, place in enumerate(dict.fromkeys(p for way in ways.values() for p in way))}
     nodes = [f'<node id="{i}" lon="{x:.9f}" lat="{y:.9f}"/>' for (x, y), i in numbers.items()]
     lines = []
     for i, (tags, places) in enumerate(ways.items()):
-        told = "".join('<tag k="{}" v="{}"/>'.format(*tag.split("=")) for tag in tags.split(";"))
+        xml_tags = "".join('<tag k="{}" v="{}"/>'.format(*tag.split("=")) for tag in tags.split(";"))
         refs = "".join(f'<nd ref="{numbers[place]}"/>' for place in places)
-        lines.append(f'<way id="{i + 1}">{refs}{told}</way>')
+        lines.append(f'<way id="{i + 1}">{refs}{xml_tags}</way>')
     path.write_text(OSM.format(nodes="\n".join(nodes), ways="\n".join(lines)))
     return path

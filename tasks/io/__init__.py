@@ -1,1 +1,1 @@
-"""Read rasters, orthophotos and vector files of one tile."""
+"""Readers of rasters, orthophotos and vector files for one tile."""

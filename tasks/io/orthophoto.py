@@ -1,7 +1,7 @@
-"""The orthophoto (DOP) of a tile, read where it is used: a window of its files at the resolution asked for.
+"""Read the orthophoto (DOP) of a tile: a window of its files at the requested resolution.
 
 Pixels that coincide with the file's are copied, coarser ones are means of the file's, finer ones are
-interpolated. What a file declares as nodata, masks or makes transparent is unknown.
+interpolated. Pixels that are nodata, masked or transparent in the file are unknown.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from flexroad.tasks.io.raster import RasterGrid, Unreadable, opened, place
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}
-"""Depth of the colours that are understood, where a file does not say it uses fewer."""
+"""Bits per colour of the supported types, unless the file declares fewer."""
 
 
 def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthophoto:
     """Read the orthophoto over a grid's bounds.
 
-    Grey photos are given as three equal bands, of more than three (near infrared) the first three are
-    taken, and 16 bits become 8 by the depth that the file declares, else by all 16.
+    A grey photo is returned as three equal bands; of more than three bands (near infrared) the first three
+    are used. 16-bit colours are scaled to 8 bits by the depth that the file declares, else by 16.
 
     Parameters
     ----------
     source : Source
-        The photo's files; of those that overlap, the first with a value wins.
+        The photo's files; where files overlap, the first one with a value is used.
     grid : Grid
-        The ground: only its bounds and CRS count.
+        The area to read; only its bounds and CRS are used.
     gsd_m : float, optional
         Ground sampling distance of the result (m); by default that of the first file that reaches the grid.
 
     Returns
     -------
-    Photo
+    Orthophoto
         Its pixels start in the grid's north-west corner and cover the grid.
 
     Raises
     ------
     TaskError
-        If a file that the ground needs is missing or broken; if one is rotated, in another CRS, or in
-        colours that are not understood; if none reaches the grid.
+        If a file that the area needs is missing or broken; if a file is rotated, in another CRS, or its
+        colours are not supported; if no file reaches the grid.
     """
     photo: Orthophoto | None = None
     broken: list[Unreadable] = []
@@ -58,25 +58,25 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
     with quiet():
         for path in source.paths:
             try:
-                found = _read(path, f"{source.name} {path.name}", grid, gsd_m, source.crs)
+                part = _read(path, f"{source.name} {path.name}", grid, gsd_m, source.crs)
             except Unreadable as error:
                 broken.append(error)
                 continue
-            if found is None:
+            if part is None:
                 continue
-            piece, lattice = found
+            piece, lattice = part
             photo, gsd_m = _under(photo, piece), piece.grid.cell
             reached = reached | _reached(lattice, piece.grid)
             if photo.known.all():
                 break
-    # Files are named for the ground around a tile, too: a broken one costs the tiles it lies on.
+    # A tile also lists files around it: a broken file fails only the tiles that need it.
     if broken and not reached.all():
         raise TaskError(str(broken[0]), broken[0].file, source.name)
     if photo is None:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         names = ", ".join(path.name for path in source.paths[:3])
         raise TaskError(
-            f"no {source.name} file overlaps the tile ({bounds}): {names}; build the catalog anew",
+            f"no {source.name} file overlaps the tile ({bounds}): {names}; build the catalog again",
             str(source.paths[0]),
             source.name,
         )
@@ -84,7 +84,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
 
 
 def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
-    """Return the first photo, filled with the second where it knows nothing."""
+    """Return the first photo, filled with the second where its pixels are unknown."""
     if first is None:
         return second
     colour = np.where(first.known, first.colour, second.colour)
@@ -92,7 +92,7 @@ def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
 
 
 def _reached(lattice: RasterGrid, grid: Grid) -> Bools:
-    """Return the cells whose centres lie on the file, with a value or not, ``(H, W)``."""
+    """Return the cells whose centres lie within the file's bounds, ``(H, W)``."""
     west, south, east, north = lattice.bounds
     inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
         (west < grid.eastings) & (grid.eastings < east)
@@ -103,7 +103,7 @@ def _reached(lattice: RasterGrid, grid: Grid) -> Bools:
 def _read(
     path: Location, name: str, grid: Grid, gsd_m: float | None, crs: str | None
 ) -> tuple[Orthophoto, RasterGrid] | None:
-    """Return what one file shows of the ground, and where the file lies; None if it lies elsewhere."""
+    """Return a file's pixels over the grid, and the file's lattice; None if it does not overlap the grid."""
     with opened(path, name) as src:
         lattice = place(src, path, name, grid, grid, crs)
         if lattice is None or lattice.window_for(grid) is None:
@@ -118,7 +118,7 @@ def _read(
 
 
 def _depth(src: Any, path: Location, name: str) -> int:
-    """Return how many bits the colours have."""
+    """Return the number of bits per colour."""
     kind = src.dtypes[0]
     if src.colorinterp[0] == ColorInterp.palette:
         raise TaskError(
@@ -133,13 +133,13 @@ def _depth(src: Any, path: Location, name: str) -> int:
 
 
 def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.float32], Bools]:
-    """Return the file's colours on the pixels, ``(1 or 3, h, w)`` in its own counts, and which are known."""
+    """Return the file's colours on the pixels, ``(1 or 3, h, w)``, not scaled, and which pixels are known."""
     coarser = pixels.cell > max(lattice.dx, lattice.dy) * (1 + LATTICE_TOLERANCE)
     bands = (1, 2, 3) if src.count >= 3 else (1,)
     has_alpha = ColorInterp.alpha in src.colorinterp
     with WarpedVRT(
         src,
-        # The two are one CRS by another name: nothing is to be reprojected.
+        # The file's CRS is the same one by another name: prevent a reprojection.
         src_crs=pixels.crs,
         crs=pixels.crs,
         src_transform=_transform(lattice),
@@ -149,12 +149,12 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
         resampling=Resampling.average if coarser else Resampling.bilinear,
         dtype="float32",
         add_alpha=not has_alpha,
-        # A pixel is unknown where all bands say so: pure red has two bands at nodata 0.
+        # A pixel is unknown only if all bands are nodata: pure red has two bands at 0.
         UNIFIED_SRC_NODATA="YES",
-    ) as seen:
-        alpha = src.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else seen.count
-        known: Bools = seen.read(alpha) > 0
-        colour: NDArray[np.float32] = seen.read(bands)
+    ) as vrt:
+        alpha = src.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else vrt.count
+        known: Bools = vrt.read(alpha) > 0
+        colour: NDArray[np.float32] = vrt.read(bands)
     return np.where(known, colour, np.float32(0)), known
 
 

@@ -1,4 +1,4 @@
-"""The cells of one raster file that lie under a grid: cut out, then laid onto the grid's own cells."""
+"""Read the window of a raster file that covers a grid, and resample it to the grid's cells."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from flexroad.tasks.types import Floats
 
 
 class Unreadable(TaskError):
-    """A file that is missing or broken, so that nobody knows where it lies."""
+    """A file that is missing or broken, so that its position is unknown."""
 
 
 @dataclass(frozen=True)
 class RasterGrid:
-    """Where a file's cells lie; like a `Grid`, but as the file has it."""
+    """The lattice of a file's cells; unlike in a `Grid`, cells need not be square (m)."""
 
     west: float
     north: float
@@ -54,13 +54,13 @@ class RasterGrid:
         return self.west, self.north - self.height * self.dy, self.west + self.width * self.dx, self.north
 
     def offset(self, grid: Grid) -> tuple[float, float]:
-        """Return how far (m, east and north) this lattice is from the grid's, modulo its cells."""
+        """Return the offset (m, east and north) of this lattice from the grid's, modulo its cell size."""
         east = math.remainder(self.west - grid.west, self.dx)
         north = math.remainder(self.north - grid.north, self.dy)
         return east, north
 
     def fits(self, grid: Grid) -> bool:
-        """Return whether cells coincide to `LATTICE_TOLERANCE` all over the grid."""
+        """Return whether cells coincide to within `LATTICE_TOLERANCE` over the whole grid."""
         west, north, east, south = self._in_cells(grid)
         off = max(abs(edge - round(edge)) for edge in (west, north, east, south))
         same_count = (round(east) - round(west), round(south) - round(north)) == (grid.width, grid.height)
@@ -72,7 +72,7 @@ class RasterGrid:
         if self.fits(grid):
             west, north, east, south = round(west), round(north), round(east), round(south)
         else:
-            # As many cells around as interpolation onto the grid's border cells looks at.
+            # The margin that interpolation at the grid's border cells needs.
             pad_x, pad_y = 1 + grid.cell / self.dx, 1 + grid.cell / self.dy
             west, east, north, south = west - pad_x, east + pad_x, north - pad_y, south + pad_y
         rows = slice(max(0, math.floor(north)), min(self.height, math.ceil(south)))
@@ -99,34 +99,38 @@ class RasterWindow:
     """The cells of one file under a grid."""
 
     name: str
-    """How messages call the file: ``dsm a.tif``."""
+    """Name of the file in messages: ``dsm a.tif``."""
     file: str
+    """Full path or address."""
     values: Floats
     """``(rows, cols)``, row 0 in the north; NaN where the file has nodata."""
     lattice: RasterGrid
     unit: str
-    """Unit of the values as the band declares it, or nothing."""
+    """Unit of the values declared by the band, or empty."""
     crs: str | None
-    """CRS of the file, else the one it was given."""
+    """CRS of the file, else the one given by the caller."""
 
 
 def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterWindow | None:
-    """Read what a file has under a grid.
+    """Read the part of a file that covers a grid.
 
     Parameters
     ----------
-    path, name : Place, str
-        The file, and how messages call it: ``dsm a.tif``.
+    path : Location
+        The file.
+    name : str
+        Name of the file in messages: ``dsm a.tif``.
     grid : Grid
+        The grid to cover.
     core : Grid
-        Where a file that carries no georeference lies, if it has as many cells.
+        Position of a file without georeference, if it has as many cells.
     crs : str, optional
-        CRS of a file that carries none.
+        CRS of a file without one.
 
     Returns
     -------
-    Patch or None
-        None if no cell lies under the grid.
+    RasterWindow or None
+        None if the file does not overlap the grid.
 
     Raises
     ------
@@ -147,42 +151,42 @@ def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | No
 
 @contextmanager
 def opened(path: Location, name: str) -> Iterator[Any]:
-    """Open a raster; what goes wrong with it inside is `Unreadable`; in a bucket, a `TaskError`.
+    """Open a raster; errors inside the block become `Unreadable` or, for a file in a bucket, `TaskError`.
 
-    Of a file in a bucket nobody can tell whether it is broken or the storage was, so that a tile had better
-    fail and be tried again than do without it.
+    For a file in a bucket the cause may be the file or the storage. So the tile fails and can be run again;
+    the file is not left out.
     """
     try:
-        with _surroundings(path, name), rasterio.open(gdal_name(path)) as src:
+        with _sidecar_env(path, name), rasterio.open(gdal_name(path)) as src:
             yield src
     except (RasterioError, OSError) as error:
         if not is_remote(path) and stat(path) is None:
             raise _missing(path, name) from error
         reason = str(error.__cause__ or error).partition("\n")[0]
         if is_remote(path):
-            raise TaskError(f"{name} cannot be read: {reason}; run again, or mend it", str(path)) from error
+            raise TaskError(f"{name} cannot be read: {reason}; run again, or repair it", str(path)) from error
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
 
 
-def _surroundings(path: Location, name: str) -> AbstractContextManager[Any]:
-    """Let GDAL look for files beside one in a bucket only where there are some."""
+def _sidecar_env(path: Location, name: str) -> AbstractContextManager[Any]:
+    """Stop GDAL from searching side-car files of a file in a bucket that has none."""
     if isinstance(path, Path):
         return nullcontext()
-    there = sidecars(path)
-    if path.name not in there:
+    names = sidecars(path)
+    if path.name not in names:
         raise _missing(path, name)
-    return nullcontext() if there - {path.name} else rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
+    return nullcontext() if names - {path.name} else rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
 
 
 def _missing(path: Location, name: str) -> Unreadable:
-    return Unreadable(f"{name} is missing; restore it or build the catalog anew", str(path))
+    return Unreadable(f"{name} is missing; restore it or build the catalog again", str(path))
 
 
 def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     """Return the patch on the grid's cells, ``(H, W)``; NaN where it has no value.
 
     Cells that coincide are copied. Others are resampled: source cells without a value have no weight, and
-    a cell whose centre lies in one gets no value, so that voids keep their size.
+    a cell whose centre lies in such a cell gets no value, so that voids keep their size.
     """
     values = np.full(grid.shape, np.nan)
     lattice = patch.lattice
@@ -206,7 +210,7 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
 
 
 def misalignment(lattice: RasterGrid, grid: Grid) -> str:
-    """Return in words why cells do not coincide, or nothing if they do."""
+    """Return the reason why cells do not coincide, for a note; empty if they do."""
     if lattice.fits(grid):
         return ""
     if not math.isclose(lattice.dx, grid.cell, rel_tol=1e-5) or not math.isclose(lattice.dy, lattice.dx):
@@ -219,40 +223,40 @@ def misalignment(lattice: RasterGrid, grid: Grid) -> str:
 
 
 def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterGrid | None:
-    """Return where a file lies, or None if it is in another CRS and elsewhere; see `read_window`.
+    """Return the lattice of a file, or None if it is in another CRS and outside the grid; see `read_window`.
 
     Raises
     ------
     TaskError
-        If it is rotated, or overlaps the grid in another CRS, or nobody knows where it lies.
+        If the file is rotated, overlaps the grid in another CRS, or its position is unknown.
     """
     if src.transform.is_identity:
         if src.shape == core.shape:
             return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
         raise TaskError(
-            f"{name} carries no georeference and has {src.width} x {src.height} cells, "
+            f"{name} has no georeference and has {src.width} x {src.height} cells, "
             f"the tile {core.width} x {core.height}; give it a world file",
             str(path),
         )
     if src.transform.b or src.transform.d:
         raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
     lattice = RasterGrid.of(src.transform, src.width, src.height)
-    theirs = src.crs.to_wkt() if src.crs else crs
-    if theirs is None:
-        raise TaskError(f"{name} carries no CRS; build the catalog anew with --crs", str(path))
-    if same(theirs, grid.crs):
+    file_crs = src.crs.to_wkt() if src.crs else crs
+    if file_crs is None:
+        raise TaskError(f"{name} has no CRS; build the catalog again with --crs", str(path))
+    if same(file_crs, grid.crs):
         return lattice
-    if not _meet(transform_bounds(theirs, grid.crs, *lattice.bounds), grid.bounds):
+    if not _overlap(transform_bounds(file_crs, grid.crs, *lattice.bounds), grid.bounds):
         return None
     raise TaskError(
-        f"{name} is in {short(theirs)}, the tile in {short(grid.crs)}; "
+        f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
         f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}",
         str(path),
     )
 
 
-def _meet(a: Bounds, b: Bounds) -> bool:
-    # Written so that bounds that cannot be transformed (inf, NaN) count as met: they are an error.
+def _overlap(a: Bounds, b: Bounds) -> bool:
+    # Written so that bounds that cannot be transformed (inf, NaN) count as overlapping: they are an error.
     return not (a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1])
 
 

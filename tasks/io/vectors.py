@@ -1,8 +1,8 @@
-"""Features of a vector file near a tile: one spatial index per file and process, not one reading per tile.
+"""Read the features of a vector file near a tile; a file is read and indexed once per process, not per tile.
 
-Files with an index of their own (GeoPackage, FlatGeobuf) are read by large squares, of which a process keeps
-a few: memory does not grow with the file. Others (GeoJSON, OSM) are read once, as a whole. A file in a
-bucket is copied once per process: read where it is, a GeoPackage asks hundreds of times.
+Files with a spatial index (GeoPackage, FlatGeobuf) are read by large squares, of which a process keeps a few,
+so that memory does not grow with the file. Others (GeoJSON, OSM) are read once, as a whole. A file in a
+bucket is copied once per process, because reading a GeoPackage in place takes hundreds of requests.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from flexroad.catalog.storage.paths import FileStat, Location, fetch, stat
 from flexroad.tasks.errors import TaskError
 
 SQUARE_M = 4000.0
-"""Side of the squares that indexed files are read by (m)."""
-KEPT = 8
-"""Squares, or whole files, that a process keeps in memory."""
+"""Side of the squares in which indexed files are read (m)."""
+CACHE_SIZE = 8
+"""Number of squares, or whole files, that a process keeps in memory."""
 OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highway%'"}
-"""Layers of OSM's own format that hold roads, and which of their features may be some."""
+"""Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
 """Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
 TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
@@ -42,19 +42,19 @@ TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 @dataclass(frozen=True)
 class Query:
-    """What is asked of a file."""
+    """A request for features of a file."""
 
     path: Location
     layer: str | None
-    """None where the file has only one, or is of OSM's own format."""
+    """Layer to read; None if the file has only one, or is in the OSM format."""
     where: str | None
-    """Which features, in SQL."""
+    """SQL condition that features must meet, or None."""
     columns: tuple[str, ...]
     """Names of columns or OSM tags, in lower case; those the file lacks are left out."""
     bare_crs: str | None
     """CRS if the file carries none."""
     crs: str
-    """CRS to have the features in (m)."""
+    """CRS of the result (m)."""
 
 
 @dataclass(frozen=True)
@@ -66,39 +66,39 @@ class _Layer:
     where: str | None
 
 
-def read_near(asked: Query, bounds: Bounds) -> Any:
-    """Return the features whose boxes touch ``bounds`` (m, in ``asked.crs``).
+def read_near(request: Query, bounds: Bounds) -> Any:
+    """Return the features whose bounding boxes touch ``bounds`` (m, in ``request.crs``).
 
     Returns
     -------
     GeoDataFrame
-        In ``asked.crs``, with those of the columns that exist, named in lower case.
+        In ``request.crs``, with those of the columns that exist, named in lower case.
 
     Raises
     ------
     TaskError
-        If the file is missing or cannot be read, has no such layer or column, or carries no CRS.
+        If the file is missing or cannot be read, has no such layer or column, or has no CRS.
     """
     import pandas
 
     try:
-        version = stat(asked.path)
+        version = stat(request.path)
     except OSError as error:
-        raise _fault(asked, f"cannot be read: {error.strerror}; run again") from error
+        raise _error(request, f"cannot be read: {error.strerror}; run again") from error
     if version is None:
-        raise _fault(asked, "cannot be opened (no such file); put it back, or build the catalog anew")
-    found = []
-    for layer in _layers(asked, version):
+        raise _error(request, "cannot be opened (no such file); put it back, or build the catalog again")
+    tables = []
+    for layer in _layers(request, version):
         squares = list(_squares(bounds)) if layer.indexed else [None]
-        parts = [_touching(_part(asked, version, layer, square), bounds) for square in squares]
+        parts = [_touching(_part(request, version, layer, square), bounds) for square in squares]
         whole = pandas.concat(parts)
-        # A feature that reaches into several squares has one number in all of them.
-        found.append(whole[~whole.index.duplicated()])
-    return pandas.concat(found, ignore_index=True)
+        # A feature that reaches into several squares has the same index in all of them.
+        tables.append(whole[~whole.index.duplicated()])
+    return pandas.concat(tables, ignore_index=True)
 
 
-def _fault(asked: Query, what: str) -> TaskError:
-    return TaskError(f"{asked.path} {what}", str(asked.path), "roads")
+def _error(request: Query, message: str) -> TaskError:
+    return TaskError(f"{request.path} {message}", str(request.path), "roads")
 
 
 def _squares(bounds: Bounds) -> Iterator[Bounds]:
@@ -113,37 +113,37 @@ def _touching(part: Any, bounds: Bounds) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _layers(asked: Query, version: FileStat) -> tuple[_Layer, ...]:
-    """Return the layers to read; ``version`` tells a changed file from the one that was seen before."""
+def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
+    """Return the layers to read; ``version`` is in the cache key, so that a changed file is read again."""
     import pyogrio
 
     try:
-        file = _file(asked, version)
+        file = _file(request, version)
         kinds = dict(pyogrio.list_layers(file))
-        # Styles and other tables may lie beside the features.
+        # The file may also hold styles and other tables without geometries.
         spatial = [name for name, kind in kinds.items() if kind is not None]
-        names = [asked.layer] if asked.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
-        if asked.layer and asked.layer not in kinds:
-            raise _fault(asked, f"has no layer {asked.layer!r}; there are {', '.join(kinds)}")
+        names = [request.layer] if request.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
+        if request.layer and request.layer not in kinds:
+            raise _error(request, f"has no layer {request.layer!r}; there are {', '.join(kinds)}")
         if not names or (len(names) > 1 and names != list(OSM)):
-            raise _fault(asked, f"has the layers {', '.join(kinds)}; name one with segment.layer")
-        return tuple(_described(asked, name, pyogrio.read_info(file, layer=name)) for name in names)
+            raise _error(request, f"has the layers {', '.join(kinds)}; name one with segment.layer")
+        return tuple(_described(request, name, pyogrio.read_info(file, layer=name)) for name in names)
     except (RuntimeError, ValueError) as error:
-        raise _fault(asked, f"cannot be read as vectors: {error}") from error
+        raise _error(request, f"cannot be read as vectors: {error}") from error
 
 
-def _file(asked: Query, version: FileStat) -> Path:
-    """Return the file, or a copy of one in a bucket."""
-    if isinstance(asked.path, Path):
-        return asked.path
+def _file(request: Query, version: FileStat) -> Path:
+    """Return the path of the file, or of a local copy if it is in a bucket."""
+    if isinstance(request.path, Path):
+        return request.path
     try:
-        return _copied(asked.path, version).path
+        return _copied(request.path, version).path
     except OSError as error:
-        raise _fault(asked, f"cannot be read: {error.strerror}; run again") from error
+        raise _error(request, f"cannot be read: {error.strerror}; run again") from error
 
 
 class _Copy:
-    """A copy of a file in a bucket, which goes when it is forgotten."""
+    """A local copy of a file in a bucket, deleted when this object is garbage-collected."""
 
     def __init__(self, path: UPath) -> None:
         folder = Path(mkdtemp(prefix="flexroad-"))
@@ -151,50 +151,50 @@ class _Copy:
         self.path = fetch(path, folder)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def _copied(path: UPath, version: FileStat) -> _Copy:
-    """Return a copy of that version."""
+    """Return a local copy; ``version`` is part of the cache key."""
     return _Copy(path)
 
 
-def _described(asked: Query, name: str, info: Any) -> _Layer:
-    crs = info["crs"] or asked.bare_crs
+def _described(request: Query, name: str, info: Any) -> _Layer:
+    crs = info["crs"] or request.bare_crs
     if crs is None:
-        remedy = f"give it one, e.g. ogr2ogr -a_srs {short(asked.crs)} NEW {asked.path.name}"
-        raise _fault(asked, f"carries no CRS; {remedy}")
-    wanted = {*asked.columns, OTHER_TAGS}
-    where = asked.where
+        remedy = f"give it one, e.g. ogr2ogr -a_srs {short(request.crs)} NEW {request.path.name}"
+        raise _error(request, f"carries no CRS; {remedy}")
+    columns = {*request.columns, OTHER_TAGS}
+    where = request.where
     if info["driver"] == "OSM" and name in OSM:
         where = f"({where}) AND {OSM[name]}" if where else OSM[name]
     return _Layer(
         name=name,
         crs=crs,
         indexed=info["capabilities"]["fast_spatial_filter"],
-        columns=tuple(field for field in info["fields"] if field.lower() in wanted),
+        columns=tuple(field for field in info["fields"] if field.lower() in columns),
         where=where,
     )
 
 
-@lru_cache(maxsize=KEPT)
-def _part(asked: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
-    """Return a layer's features, or those that touch a square of the tiles' plane, with their index."""
+@lru_cache(maxsize=CACHE_SIZE)
+def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
+    """Return a layer's features, or those that touch a square (m, in ``request.crs``), in ``request.crs``."""
     try:
-        bbox = square and transformer(asked.crs, layer.crs).transform_bounds(*square, densify_pts=21)
-        found = _read(asked, _file(asked, version), layer, bbox)
-        if found.crs is None:
-            found = found.set_crs(layer.crs)
-        found = found.to_crs(asked.crs)
+        bbox = square and transformer(request.crs, layer.crs).transform_bounds(*square, densify_pts=21)
+        table = _read(request, _file(request, version), layer, bbox)
+        if table.crs is None:
+            table = table.set_crs(layer.crs)
+        table = table.to_crs(request.crs)
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
-        # A transformation is a RuntimeError, too.
-        hint = "; check segment.where" if asked.where else ""
-        raise _fault(asked, f"cannot be read as roads: {error}{hint}") from error
-    found = found.rename(columns={name: name.lower() for name in layer.columns})
-    # Places that the tiles' CRS does not reach become infinite.
-    there = ~(found.geometry.isna() | found.geometry.is_empty) & np.isfinite(found.bounds).all(axis=1)
-    return _unpacked(found[there], asked.columns)
+        # A failed transformation also raises RuntimeError.
+        hint = "; check segment.where" if request.where else ""
+        raise _error(request, f"cannot be read as roads: {error}{hint}") from error
+    table = table.rename(columns={name: name.lower() for name in layer.columns})
+    # Coordinates that cannot be transformed to the tiles' CRS become infinite.
+    valid = ~(table.geometry.isna() | table.geometry.is_empty) & np.isfinite(table.bounds).all(axis=1)
+    return _unpacked(table[valid], request.columns)
 
 
-def _read(asked: Query, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
+def _read(request: Query, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
     import pyogrio
 
     def read(**more: str) -> Any:
@@ -214,18 +214,18 @@ def _read(asked: Query, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
     except pyogrio.errors.FeatureError as error:
         if "OSM_USE_CUSTOM_INDEXING" not in str(error):
             raise
-        # Editors write nodes in any order, which GDAL's fast way does not take.
+        # GDAL's fast reader needs sorted nodes, but editors write them in any order.
         return read(USE_CUSTOM_INDEXING="NO")
 
 
 def _unpacked(table: Any, columns: tuple[str, ...]) -> Any:
-    """Return the table with columns for the tags that OSM's driver packs into one."""
+    """Return the table with one column per tag that GDAL's OSM driver packs into `OTHER_TAGS`."""
     if OTHER_TAGS not in table:
         return table
     packed = [dict(TAG.findall(text)) if isinstance(text, str) else {} for text in table[OTHER_TAGS]]
-    tags = {name: [_plain(tags.get(name)) for tags in packed] for name in columns if name not in table}
+    tags = {name: [_unescaped(tags.get(name)) for tags in packed] for name in columns if name not in table}
     return table.drop(columns=OTHER_TAGS).assign(**tags)
 
 
-def _plain(value: str | None) -> str | None:
+def _unescaped(value: str | None) -> str | None:
     return value and re.sub(r"\\(.)", r"\1", value)

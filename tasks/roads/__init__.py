@@ -1,1 +1,1 @@
-"""Road masks: rasterise vectors, clean, compare, place, and say where the DTM counts."""
+"""Road masks: rasterise vectors, clean and compare masks, align orthophotos, find invalid DTM cells."""

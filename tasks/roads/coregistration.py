@@ -1,15 +1,16 @@
-"""How far an orthophoto lies off the heights: the plan shift under which the heights explain the photo best.
+"""Estimate the horizontal shift of an orthophoto against the heights.
 
-Edges alone do not tell: in a photo a tree is a dark blob with its shadow to one side, and looks shifted away
-from the sun. So the photo's brightness and greenness are explained by what the DSM lets expect of them
-(what stands high, what is rough like leaves, what faces the sun, what lies in its shadow) by least squares,
-for suns all around the sky and shifts up to `REACH_M`; the sun and the shift that explain the largest share
-of the variance win, to about half a cell. Only detail finer than `DETAIL_M` counts: the rest tells little.
+Matching edges is not enough: in a photo a tree is a dark patch with its shadow on one side, so it appears
+shifted away from the sun. Instead, the photo's brightness and greenness are explained by least squares from
+four layers computed from the DSM: height above ground, roughness (leaves), illumination by the sun, and cast
+shadow. This is done for sun positions all around the sky and for shifts up to `REACH_M`; the result is the
+sun and the shift that explain the largest share of the variance, to about half a cell. Only detail finer than
+`DETAIL_M` is used.
 
-Tiles of one flight have one sun and, mostly, one shift: together they tell more than each alone. What is
-found is a mean: photos that were not made with the surface model lean (roofs and crowns lie outwards of
-their feet), cars drove on, and trees grew; a flat field tells nothing. `Shift.confidence` tells how far the
-best shift stands out.
+Tiles of one flight have the same sun and usually the same shift, so several tiles give a better estimate than
+one. The result is a mean: in photos that are not true orthophotos roofs and crowns lean outwards, cars have
+moved, and trees have grown; a flat field gives no information. `Shift.confidence` measures how clear the best
+shift is.
 """
 
 from __future__ import annotations
@@ -27,43 +28,46 @@ from flexroad.tasks.types import Bools, Floats, Orthophoto, TileData
 
 Singles = NDArray[np.float32]
 Sun = tuple[float, float]
-"""Azimuth from north over east, and height above the horizon (degrees)."""
+"""Azimuth clockwise from north, and height above the horizon (degrees)."""
 
 REACH_M = 5.0
-"""Shifts up to this are looked for, east and north."""
-FINEST_M, MOST_CELLS = 1.0, 320
-"""The working cell is at least this; of a larger tile its middle is taken."""
-EVERY = 3
-"""One cell in so many is compared: neighbours tell much the same."""
+"""Largest shift searched, east and north (m)."""
+FINEST_M, MAX_CELLS = 1.0, 320
+"""Smallest working cell (m), and largest width and height of the working grid; of a larger tile the middle
+is used."""
+STRIDE = 3
+"""Every third cell is compared: neighbouring cells are correlated."""
 DETAIL_M = 4.0
-"""Standard deviation of the smooth part that is taken away."""
+"""Standard deviation of the Gaussian whose smooth part is subtracted (m)."""
 APART_M = 2.0
-"""A second peak counts as another one at this distance."""
+"""Smallest distance of a second peak from the best one (m)."""
 CLEAR = 0.3
-"""Confidence from which on a single tile is believed."""
+"""Smallest confidence at which the shift of a single tile is used."""
 SMALLEST_M = 1.0
-"""Smaller shifts, and those below half a cell of the heights, are none to warn of."""
+"""Smaller shifts (m), and those below half a cell of the heights, give no warning."""
 
 AROUND = tuple((float(azimuth), float(rise)) for azimuth in range(0, 360, 30) for rise in (25, 40, 55))
-"""Suns all around the sky, each within 15 degrees of azimuth and 7.5 of height of any there may be."""
+"""Sun positions tried first, 30 degrees apart in azimuth and 15 in height."""
 CLOSER = (1 / 2, 1 / 4, 1 / 8)
-"""How much of that lies between the suns tried next, around the best so far."""
+"""Factors of `STEP_DEG` in the following refinements around the best sun so far."""
 STEP_DEG = (30.0, 15.0)
+"""Step between the first sun positions in azimuth and height (degrees)."""
 
 
 @dataclass(frozen=True)
 class Shift:
-    """Where the photo lies, seen from the heights."""
+    """Offset of the photo from the heights."""
 
     east_m: float
     north_m: float
     confidence: float
-    """Share of what the best shift explains that no shift `APART_M` away does, 0 to 1."""
+    """1 minus the variance explained by the best shift at least `APART_M` away, as a share of that explained
+    by the best shift; 0 to 1."""
     sun: Sun
 
     @property
     def length_m(self) -> float:
-        """How far it is."""
+        """Length of the shift (m)."""
         return math.hypot(self.east_m, self.north_m)
 
     def __str__(self) -> str:
@@ -74,41 +78,43 @@ class Shift:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Heights and photo of a tile on one lattice, ready to be compared."""
+    """Heights and photo of a tile on one lattice, prepared for comparison."""
 
     cell: float
+    """Cell size (m)."""
     height: Floats
-    """DSM, ``(H, W)``, m, without voids."""
+    """DSM, ``(H, W)``, m; voids are filled."""
     known: Bools
-    """Cells with a height of their own, ``(H, W)``."""
+    """Cells with a DSM height, ``(H, W)``."""
     always: Singles
-    """What is expected whatever the sun, ``(2, n)``: what stands high, and what of it is rough."""
-    seen: Singles
-    """Brightness and greenness at these cells under every shift, ``(2, shifts, n)``; 0 where unknown."""
+    """Layers that do not depend on the sun at the compared cells, ``(2, n)``: height above ground, and
+    roughness of high cells."""
+    photo: Singles
+    """Brightness and greenness at the compared cells for every shift, ``(2, shifts, n)``; 0 where unknown."""
 
 
 def note(data: TileData, photo: Orthophoto) -> str | None:
-    """Return a warning of a photo that clearly lies off the heights of its tile, or None."""
+    """Return a warning if a photo is clearly shifted against the heights of its tile, else None."""
     if not large_enough(data.grid):
         return None
-    found = shift([pair(data, photo)])
-    if found.confidence < CLEAR or not matters(found, data.grid.cell):
+    result = shift([pair(data, photo)])
+    if result.confidence < CLEAR or not matters(result, data.grid.cell):
         return None
-    return f"dop: seems to lie {found} of the heights; `flexroad catalog check` looks at more tiles"
+    return f"dop: seems to lie {result} of the heights; `flexroad catalog check` tests more tiles"
 
 
 def large_enough(grid: Grid) -> bool:
-    """Return whether a tile is so much larger than the shifts looked for that it can tell of them."""
+    """Return whether a tile is large enough to estimate shifts up to `REACH_M`."""
     return min(grid.width, grid.height) * grid.cell >= 8 * REACH_M
 
 
-def matters(found: Shift, cell: float, scatter_m: float = 0.0) -> bool:
+def matters(result: Shift, cell: float, scatter_m: float = 0.0) -> bool:
     """Return whether a shift exceeds its scatter by `SMALLEST_M` and by half a cell of the heights."""
-    return found.length_m > max(SMALLEST_M, cell / 2) + scatter_m
+    return result.length_m > max(SMALLEST_M, cell / 2) + scatter_m
 
 
 def pair(data: TileData, photo: Orthophoto) -> Pair:
-    """Return a tile's heights and its photo, which covers the tile's grid, ready to be compared."""
+    """Return a tile's heights and photo prepared for comparison; the photo must cover the tile's grid."""
     grid = _working(data.grid)
     height, ground = (_onto(values, data.grid, grid) for values in (data.dsm, data.dtm))
     known = np.isfinite(height)
@@ -119,26 +125,28 @@ def pair(data: TileData, photo: Orthophoto) -> Pair:
     high = np.clip((above - 0.5) / 2, 0, 1)
     n = _reach(grid.cell)
     always = [_expected(values, known, grid.cell) for values in (high, high * np.clip(2 * rough, 0, 1))]
-    seen = [_shifted(_detail(values, grid.cell), n) for values in _targets(photo, grid)]
-    return Pair(grid.cell, height, known, np.stack(always), np.stack(seen))
+    targets = [_shifted(_detail(values, grid.cell), n) for values in _targets(photo, grid)]
+    return Pair(grid.cell, height, known, np.stack(always), np.stack(targets))
 
 
 def shift(pairs: Sequence[Pair], sun: Sun | None = None) -> Shift:
-    """Return the one shift, under one sun, that explains the photos of all pairs best.
+    """Return the common shift and sun that explain the photos of all pairs best.
 
     Parameters
     ----------
     pairs : sequence of Pair
         Tiles of one flight, at least one, with the same cell.
     sun : Sun, optional
-        Where it stood, if that is known.
+        Position of the sun; searched if None.
     """
     cell, n = pairs[0].cell, _reach(pairs[0].cell)
-    known = sun is not None
+    refinements = CLOSER if sun is None else ()
     sun, explained = _best(pairs, AROUND if sun is None else [sun])
-    for part in () if known else CLOSER:
+    for factor in refinements:
         steps = [
-            (east * part * STEP_DEG[0], up * part * STEP_DEG[1]) for east in (-1, 0, 1) for up in (-1, 0, 1)
+            (east * factor * STEP_DEG[0], up * factor * STEP_DEG[1])
+            for east in (-1, 0, 1)
+            for up in (-1, 0, 1)
         ]
         sun, explained = _best(pairs, [(sun[0] + azimuth, sun[1] + rise) for azimuth, rise in steps])
     row, col = np.unravel_index(np.argmax(explained), explained.shape)
@@ -152,7 +160,7 @@ def shift(pairs: Sequence[Pair], sun: Sun | None = None) -> Shift:
 
 
 def _best(pairs: Sequence[Pair], suns: Sequence[Sun]) -> tuple[Sun, Floats]:
-    """Return the sun that explains most, and what it explains by shift, rows from the north."""
+    """Return the sun that explains most, and the variance it explains for each shift, rows from the north."""
     n = _reach(pairs[0].cell)
     explained = np.sum([_explained(pair, suns) for pair in pairs], axis=0)
     best = int(np.argmax(explained.max(axis=1)))
@@ -164,19 +172,20 @@ def _explained(pair: Pair, suns: Sequence[Sun]) -> Floats:
     light = [_expected(v, pair.known, pair.cell) for sun in suns for v in _light(pair.height, pair.cell, sun)]
     expected = np.stack([*pair.always, *light])
     gram = (expected @ expected.T).astype(np.float64)
-    against = [(seen @ expected.T).astype(np.float64) for seen in pair.seen]
-    variance = [np.maximum(np.einsum("sn,sn->s", seen, seen), 1e-9) for seen in pair.seen]
-    found = np.zeros((len(suns), pair.seen.shape[1]))
+    products = [(target @ expected.T).astype(np.float64) for target in pair.photo]
+    variances = [np.maximum(np.einsum("sn,sn->s", target, target), 1e-9) for target in pair.photo]
+    explained = np.zeros((len(suns), pair.photo.shape[1]))
     for i in range(len(suns)):
-        which = [0, 1, 2 + 2 * i, 3 + 2 * i]
-        inverse = np.linalg.inv(gram[np.ix_(which, which)] + 1e-6 * np.eye(4))
-        for one, total in zip(against, variance, strict=True):
-            found[i] += np.einsum("sj,jk,sk->s", one[:, which], inverse, one[:, which]) / total
-    return found
+        layers = [0, 1, 2 + 2 * i, 3 + 2 * i]
+        inverse = np.linalg.inv(gram[np.ix_(layers, layers)] + 1e-6 * np.eye(4))
+        for product, variance in zip(products, variances, strict=True):
+            part = product[:, layers]
+            explained[i] += np.einsum("sj,jk,sk->s", part, inverse, part) / variance
+    return explained
 
 
 def _light(height: Floats, cell: float, sun: Sun) -> tuple[Floats, Floats]:
-    """Return how far a cell lies in the cast shadow and how squarely it faces the sun, both 0 to 1."""
+    """Return cast shadow and illumination (cosine of the angle of incidence) of each cell, both 0 to 1."""
     azimuth, rise = math.radians(sun[0]), math.radians(sun[1])
     east, north = math.sin(azimuth), math.cos(azimuth)
     shade = scipy.ndimage.gaussian_filter(
@@ -188,40 +197,40 @@ def _light(height: Floats, cell: float, sun: Sun) -> tuple[Floats, Floats]:
 
 
 def _shadow(height: Floats, cell: float, east: float, north: float, slope: float) -> Bools:
-    """Return the cells that something between them and the sun hides, by steps of one cell toward it."""
+    """Return the cells in cast shadow, ``(H, W)``, by ray casting in steps of one cell towards the sun."""
     rows, cols = height.shape
     shade = np.zeros(height.shape, bool)
     longest = (height.max() - height.min()) / slope / cell
     for step in range(1, math.ceil(min(longest, max(rows, cols))) + 1):
         down, right = round(-step * north), round(step * east)
-        here = _overlap(rows, down), _overlap(cols, right)
-        there = _overlap(rows, -down), _overlap(cols, -right)
-        shade[here] |= height[there] - step * cell * slope > height[here]
+        cells = _overlap(rows, down), _overlap(cols, right)
+        towards_sun = _overlap(rows, -down), _overlap(cols, -right)
+        shade[cells] |= height[towards_sun] - step * cell * slope > height[cells]
     return shade
 
 
 def _overlap(count: int, by: int) -> slice:
-    """Return the indices that stay within the count when ``by`` is added."""
+    """Return the indices that stay in ``range(count)`` when ``by`` is added."""
     return slice(max(0, -by), max(0, min(count, count - by)))
 
 
 def _working(grid: Grid) -> Grid:
     cell = max(grid.cell, FINEST_M)
-    width, height = (min(MOST_CELLS, int(count * grid.cell / cell)) for count in (grid.width, grid.height))
+    width, height = (min(MAX_CELLS, int(count * grid.cell / cell)) for count in (grid.width, grid.height))
     west = grid.west + (grid.width * grid.cell - width * cell) / 2
     north = grid.north - (grid.height * grid.cell - height * cell) / 2
     return Grid(grid.crs, west, north, cell, width, height)
 
 
 def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
-    """Return the mean of the values under each cell of the grid, ``(H, W)``; NaN where there is none."""
+    """Return the mean of the values under each cell of the grid, ``(H, W)``; NaN where there are none."""
     from rasterio.enums import Resampling
     from rasterio.warp import reproject
 
-    found = np.full(grid.shape, np.nan)
+    means = np.full(grid.shape, np.nan)
     reproject(
         values.astype(np.float64),
-        found,
+        means,
         src_transform=source.transform,
         dst_transform=grid.transform,
         src_crs=grid.crs,
@@ -230,11 +239,11 @@ def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
         dst_nodata=np.nan,
         resampling=Resampling.average,
     )
-    return found
+    return means
 
 
 def _targets(photo: Orthophoto, grid: Grid) -> tuple[Floats, Floats]:
-    """Return brightness, white walls and roofs cut off, and greenness on the grid, ``(H, W)``."""
+    """Return brightness (clipped, because of white walls and roofs) and greenness on the grid, ``(H, W)``."""
     red, green, blue = photo.colour.astype(np.float64)
     bright = np.where(photo.known, 0.299 * red + 0.587 * green + 0.114 * blue, np.nan)
     leafy = np.where(photo.known, (2 * green - red - blue) / (red + green + blue + 30), np.nan)
@@ -245,7 +254,7 @@ def _targets(photo: Orthophoto, grid: Grid) -> tuple[Floats, Floats]:
 
 
 def _detail(values: Floats, cell: float) -> Floats:
-    """Return the values less their smooth part, ``(H, W)``; 0 where unknown."""
+    """Return the values minus their smooth part, ``(H, W)``; 0 where unknown."""
     known = np.isfinite(values)
     weight = scipy.ndimage.gaussian_filter(known.astype(float), DETAIL_M / cell)
     smooth = scipy.ndimage.gaussian_filter(np.where(known, values, 0.0), DETAIL_M / cell)
@@ -253,31 +262,31 @@ def _detail(values: Floats, cell: float) -> Floats:
 
 
 def _expected(values: Floats, known: Bools, cell: float) -> Singles:
-    """Return the detail of what is expected where every shift of the photo reaches, ``(n,)``."""
+    """Return the detail of a layer at the compared cells, ``(n,)``: those inside the grid for every shift."""
     n = _reach(cell)
-    inner = np.where(known, _detail(values, cell), 0.0)[n:-n, n:-n].ravel()[::EVERY]
+    inner = np.where(known, _detail(values, cell), 0.0)[n:-n, n:-n].ravel()[::STRIDE]
     expected: Singles = (inner - inner.mean()).astype(np.float32)
     return expected
 
 
 def _shifted(values: Floats, n: int) -> Singles:
-    """Return what the photo shows at every inner cell under every shift, ``(shifts, n)``."""
+    """Return the photo's values at the compared cells for every shift, ``(shifts, n)``, less their mean."""
     rows, cols = values.shape[0] - 2 * n, values.shape[1] - 2 * n
     windows = np.lib.stride_tricks.sliding_window_view(values.astype(np.float32), (rows, cols))
-    seen: Singles = np.stack([window.ravel()[::EVERY] for line in windows for window in line])
-    seen -= seen.mean(axis=1, keepdims=True)
-    return seen
+    shifted: Singles = np.stack([window.ravel()[::STRIDE] for line in windows for window in line])
+    shifted -= shifted.mean(axis=1, keepdims=True)
+    return shifted
 
 
 def _reach(cell: float) -> int:
-    """Return the largest shift in cells; one more than asked, for the peak's other side."""
+    """Return the largest shift in cells, plus one so that a peak at `REACH_M` has a neighbour."""
     return math.ceil(REACH_M / cell) + 1
 
 
-def _vertex(values: Floats, at: int) -> float:
-    """Return how far the top of the parabola through a peak and its neighbours lies beside it (cells)."""
-    if not 0 < at < len(values) - 1:
+def _vertex(values: Floats, index: int) -> float:
+    """Return the offset (cells) from a peak to the vertex of the parabola through it and its neighbours."""
+    if not 0 < index < len(values) - 1:
         return 0.0
-    before, peak, after = values[at - 1 : at + 2]
+    before, peak, after = values[index - 1 : index + 2]
     bend = before - 2 * peak + after
     return float((before - after) / (2 * bend)) if bend < 0 else 0.0

@@ -1,4 +1,4 @@
-"""Where the DTM is not the road's: the road that can be seen beside a gap says how it goes on."""
+"""Find road cells with an invalid DTM by comparing it with the plane through the kept road cells nearby."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ import scipy
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 AGREE_M = 0.3
-"""Two heights tell of one ground up to this difference (m)."""
+"""Largest difference of two heights of the same ground (m)."""
 
 
 NEAR_M = 5.0
-"""Standard deviation of the Gaussian by which road beside a gap says how it goes on (m)."""
+"""Standard deviation of the Gaussian weights of the kept cells around a gap (m)."""
 
 
 REACH_M = 3 * NEAR_M
-"""Farther than this from any kept cell nothing can gainsay the DTM (m)."""
+"""Farther than this from any kept cell the DTM is not checked (m)."""
 
 
 CREST_M = 100.0
-"""Radius of the sharpest crest or sag to be expected where a road is not seen (m)."""
+"""Smallest radius of crests and sags expected where a road is hidden (m)."""
 
 
 THIN_M2 = 0.2
-"""What scatters less in some direction (m2) lies on a line, and no plane goes on from it."""
+"""Cells whose variance in some direction is below this (m2) lie on a line and define no plane."""
 
 
 def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
-    """Return the road cells the filter dropped where the DTM is off the road's continuation, ``(H, W)``.
+    """Return the road cells dropped by the filter whose DTM does not continue the road, ``(H, W)``.
 
-    The plane through the kept cells around says where the road should be. The DTM may be off it by
-    `AGREE_M`, what those cells scatter, and what a crest rises on the way to the next of them. Farther than
-    `REACH_M` from all of them the DTM is believed.
+    The expected height is that of the plane through the kept cells around. The DTM may differ from it by
+    `AGREE_M`, plus the scatter of those cells, plus the rise of a crest over the distance to the nearest of
+    them. Farther than `REACH_M` from all kept cells the DTM is taken as valid.
 
     Parameters
     ----------
@@ -46,31 +46,31 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
         The filtered mask.
     """
     kept = kept & np.isfinite(data.dsm)
-    asked = road.mask & ~kept & np.isfinite(data.dtm)
-    if not (asked.any() and kept.any()):
-        return np.zeros_like(asked)
+    checked = road.mask & ~kept & np.isfinite(data.dtm)
+    if not (checked.any() and kept.any()):
+        return np.zeros_like(checked)
     away = scipy.ndimage.distance_transform_edt(~kept) * data.grid.cell
     expected, scatter = extrapolated_plane(data.dsm, kept, data.grid.cell)
     off = np.abs(data.dtm - expected)
-    return np.asarray(asked & (away <= REACH_M) & (off > AGREE_M + scatter + rise(away)))
+    return np.asarray(checked & (away <= REACH_M) & (off > AGREE_M + scatter + rise(away)))
 
 
 def rise(away: Floats) -> Floats:
-    """Return how far a road may be from its tangent (m), so far away (m) from where it was seen."""
+    """Return the largest deviation of a road from its tangent (m) at the distance ``away`` (m)."""
     return away**2 / (2 * CREST_M)
 
 
 def without_invalid_dtm(data: TileData, clusters: RoadClusters) -> TileData:
-    """Return the data without DTM where that is not sound, so that neither loss nor start see it."""
+    """Return the data with NaN for the invalid DTM, so that neither the loss nor the start uses it."""
     if clusters.dtm_invalid is None:
         return data
     return replace(data, dtm=np.where(clusters.dtm_invalid, np.nan, data.dtm))
 
 
 def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Floats]:
-    """Return height and scatter (m) of the plane through the known cells around each cell, ``(H, W)`` each.
+    """Return height and scatter (m) of the plane through the given cells around each cell, ``(H, W)`` each.
 
-    Moving least squares with Gaussian weights; NaN where within `REACH_M` there is no known cell, or all of
+    Moving least squares with Gaussian weights; NaN where there is no given cell within `REACH_M`, or all of
     them lie on a line.
 
     Parameters
@@ -78,7 +78,7 @@ def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floa
     heights : (H, W) array
         Heights (m).
     known : (H, W) array of bool
-        Which of them count; at least one.
+        Cells whose heights are used; at least one.
     cell : float
         Size of a cell (m).
     """
@@ -89,7 +89,7 @@ def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floa
     with np.errstate(invalid="ignore", divide="ignore"):
         r, c, rr, rc, cc = (_moment(known.astype(np.float64), cell, *order) / total for order in orders)
         m, mr, mc = (_moment(z, cell, *order) / total for order in ((0, 0), (1, 0), (0, 1)))
-        # Central moments: two equations for the slopes, then the level where the offsets are 0.
+        # Central moments give two equations for the slopes, then the height at offset 0.
         rr, rc, cc = rr - r * r, rc - r * c, cc - c * c
         mr, mc = mr - m * r, mc - m * c
         determinant = np.where(_least_spread(rr, rc, cc) >= THIN_M2, rr * cc - rc * rc, np.nan)
@@ -99,12 +99,12 @@ def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floa
 
 
 def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
-    """Return the smaller eigenvalue of symmetric matrices of two rows."""
+    """Return the smaller eigenvalue of symmetric 2 x 2 matrices."""
     return np.asarray((rr + cc) / 2 - np.hypot((rr - cc) / 2, rc))
 
 
 def _moment(values: Floats, cell: float, row_power: int, col_power: int) -> Floats:
-    """Return the sum over each cell's neighbours: value, Gaussian weight, and powers of the offsets (m)."""
+    """Return the sum of value x Gaussian weight x powers of the offsets (m) over each cell's neighbours."""
     n = int(REACH_M / cell)
     offset = np.arange(-n, n + 1) * cell
     bell = np.exp(-0.5 * (offset / NEAR_M) ** 2)

@@ -1,4 +1,4 @@
-"""Where the survey ends: the cells that no mesh should reach."""
+"""The extent of the survey: cells beyond it get no mesh."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from flexroad.tasks.types import Bools, TileData
 def beyond_extent(data: TileData) -> Bools:
     """Return the cells beyond the survey, ``(H, W)``.
 
-    Cells with neither DSM nor DTM, in a void (joined over cells' sides) that touches the grid's edge.
-    A void inside, as water or deep shade leave one, is no end of the survey: meshes bridge it.
+    These are the cells with neither DSM nor DTM in a void (4-connected) that touches the grid's edge. A void
+    inside, as in water or deep shade, is not beyond the survey: meshes bridge it.
     """
     void = np.isnan(data.dsm) & np.isnan(data.dtm)
     labels, _ = scipy.ndimage.label(void)

@@ -1,7 +1,7 @@
-"""Tidy a mask of roads: join it with a second source, close gaps, fill holes, drop specks.
+"""Clean a road mask: combine it with a second source, close gaps, fill holes, drop small pieces.
 
-Widths and areas are metres and m2, whatever the cell. What touches the edge of the grid is cut off there:
-a speck may be the end of a road and a hole the mouth of a square, so both stay as they are.
+Widths and areas are in metres and m2 for any cell size. Pieces and holes that touch the edge of the grid may
+continue beyond it, so they are kept.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import Bools, TileData
 
 SLACK = 1e-9
-"""Sizes count as reached within this part of a cell: 0.6 m is three cells of 0.2 m."""
+"""Tolerance of sizes as a fraction of a cell, so that 0.6 m is three cells of 0.2 m."""
 
 
 class Cleanup(options.Options):
-    """What is done to a mask, in this order; 0 or none leaves it out."""
+    """Steps of the cleanup, in this order; 0 or none skips a step."""
 
     fuse: Literal["none", "union", "intersection", "corridor"] = Field(
         "none",
-        description="joined with a second source: road in either, road in both, or the mask as far as it "
-        "lies within corridor_m of the other",
+        description="combine with a second source: union: road in either; intersection: road in both; "
+        "corridor: the mask within corridor_m of the second source",
     )
     fuse_with: Literal["roads", "road_mask"] = Field(
         "roads", description="the second source: the catalog's vectors or its road mask"
     )
     roads: rasterise.Options = Field(
-        rasterise.DEFAULTS, description="which of the vectors, and how wide: as with method: vector"
+        rasterise.DEFAULTS, description="selection and width of the vectors: as with method: vector"
     )
-    corridor_m: float = Field(5.0, ge=0, le=100, description="reach of the corridor around it (m)")
+    corridor_m: float = Field(5.0, ge=0, le=100, description="width of the corridor around it (m)")
     close_m: float = Field(2.0, ge=0, le=50, description="close gaps up to this width (m)")
     fill_m2: float = Field(10.0, ge=0, description="fill holes up to this area (m2)")
     drop_m2: float = Field(25.0, ge=0, description="drop pieces smaller than this area (m2)")
 
 
 NOTHING = Cleanup(close_m=0, fill_m2=0, drop_m2=0)
-"""Leaves every mask as it is."""
+"""Options that leave every mask unchanged."""
 
 
 def clean(mask: Bools, data: TileData, options: Cleanup) -> Bools:
-    """Return the tidied mask, ``(H, W)``; cells beyond the survey are never added.
+    """Return the cleaned mask, ``(H, W)``; cells beyond the survey are never added.
 
-    Gaps are closed before pieces are weighed, so that a road in fragments counts as one.
+    Gaps are closed before areas are measured, so that a road in fragments counts as one piece.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def clean(mask: Bools, data: TileData, options: Cleanup) -> Bools:
 
 
 def fuse(mask: Bools, second: Bools, cell: float, options: Cleanup) -> Bools:
-    """Return the mask joined with a second one as ``options.fuse`` says, ``(H, W)``."""
+    """Return the mask combined with a second one by ``options.fuse``, ``(H, W)``."""
     match options.fuse:
         case "union":
             return mask | second
@@ -83,14 +83,14 @@ def within(mask: Bools, cell: float, reach_m: float) -> Bools:
     if not mask.any():
         return mask
     distance = cv2.distanceTransform(_bytes(~mask), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near: Bools = distance <= reach_m / cell + 1e-4  # OpenCV counts in float32
+    near: Bools = distance <= reach_m / cell + 1e-4  # OpenCV's distances are float32
     return near
 
 
 def close(mask: Bools, cell: float, width_m: float) -> Bools:
     """Close gaps and notches up to ``width_m`` wide, ``(H, W)``; cells are only added.
 
-    A morphological closing by a disc one cell wider than the gap. Beyond the grid nothing is road.
+    A morphological closing with a disc one cell wider than the gap. Outside the grid there is no road.
     """
     import cv2
 
@@ -99,29 +99,29 @@ def close(mask: Bools, cell: float, width_m: float) -> Bools:
         return mask
     centre = np.arange(n) - (n - 1) / 2
     disc = (centre[:, None] ** 2 + centre**2 <= (n / 2) ** 2).astype(np.uint8)
-    # A disc of an even number of cells has its centre between cells: the way back mirrors the way there.
-    there, back = (n // 2, n // 2), (n - 1 - n // 2, n - 1 - n // 2)
-    wide = cv2.dilate(np.pad(_bytes(mask), n), disc, anchor=there)
-    closed: Bools = cv2.erode(wide, disc, anchor=back)[n:-n, n:-n].astype(bool)
+    # The centre of a disc of even size lies between cells, so the erosion needs the mirrored anchor.
+    anchor, mirrored = (n // 2, n // 2), (n - 1 - n // 2, n - 1 - n // 2)
+    wide = cv2.dilate(np.pad(_bytes(mask), n), disc, anchor=anchor)
+    closed: Bools = cv2.erode(wide, disc, anchor=mirrored)[n:-n, n:-n].astype(bool)
     return closed
 
 
 def fill(mask: Bools, cell: float, area_m2: float) -> Bools:
-    """Fill holes of at most ``area_m2``, ``(H, W)``; cells of one hole join over their sides."""
+    """Fill holes of at most ``area_m2``, ``(H, W)``; holes are 4-connected."""
     pieces, areas, inner = _pieces(~mask, cell, connectivity=4)
     small: Bools = inner & (areas <= area_m2 + SLACK)
     return np.logical_or(mask, small[pieces])
 
 
 def drop(mask: Bools, cell: float, area_m2: float) -> Bools:
-    """Drop pieces smaller than ``area_m2``, ``(H, W)``; cells of one piece join over sides or corners."""
+    """Drop pieces smaller than ``area_m2``, ``(H, W)``; pieces are 8-connected."""
     pieces, areas, inner = _pieces(mask, cell, connectivity=8)
     small: Bools = inner & (areas < area_m2 - SLACK)
     return np.logical_and(mask, ~small[pieces])
 
 
 def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int32], Any, Bools]:
-    """Return each cell's piece (0: not in the mask), and of each piece its area (m2) and if it is whole."""
+    """Return each cell's piece (0: not in the mask), the pieces' areas (m2), and which touch no grid edge."""
     import cv2
 
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=connectivity)

@@ -1,4 +1,4 @@
-"""How good a mask is: counts of cells against the truth, and distances between edges in metres."""
+"""Quality of a road mask: counts of cells against the truth, and distances between edges in metres."""
 
 from __future__ import annotations
 
@@ -13,40 +13,41 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.types import Bools, Floats
 
 STEPS = 100
-"""Thresholds of the precision-recall curve: every hundredth."""
+"""Number of threshold steps of the precision-recall curve: every hundredth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """What was counted on some cells; adds up over tiles."""
+    """Counts of cells of one or more tiles; counts of tiles can be added."""
 
     right: int
-    """Road that was found."""
+    """True positives: cells that are road in mask and truth."""
     wrong: int
-    """Found, but no road."""
+    """False positives: cells that are road in the mask only."""
     missed: int
-    """Road that was not found."""
+    """False negatives: cells that are road in the truth only."""
     ground: int
-    """No road, and none found."""
+    """True negatives: cells that are road in neither."""
     road_by_probability: NDArray[np.int64]
-    """Road cells with a probability in each hundredth, ``(101,)``; zeros where there was none."""
+    """True road cells per hundredth of probability, ``(101,)``; zeros if there is no probability."""
     ground_by_probability: NDArray[np.int64]
+    """Cells that are not road in the truth, likewise."""
     edge_m: Floats
-    """From each piece of the found edge to the nearest of the true one and the other way round (m)."""
+    """Distances from edge points of the mask to the nearest of the truth, and vice versa, ``(n,)``, m."""
 
     @property
     def iou(self) -> float:
-        """Intersection over union of the road; NaN where there is none."""
+        """Intersection over union of the road; NaN if there is no road."""
         return _ratio(self.right, self.right + self.wrong + self.missed)
 
     @property
     def precision(self) -> float:
-        """Share of what was found that is road."""
+        """Share of the mask's road cells that are road in the truth."""
         return _ratio(self.right, self.right + self.wrong)
 
     @property
     def recall(self) -> float:
-        """Share of the road that was found."""
+        """Share of the true road cells that are in the mask."""
         return _ratio(self.right, self.right + self.missed)
 
     @property
@@ -56,7 +57,7 @@ class Quality:
 
     @property
     def edge_mean_m(self) -> float:
-        """Mean distance between the edges, both ways; NaN where one mask has none."""
+        """Mean distance between the edges, both ways; NaN if one of them has no edge."""
         return float(self.edge_m.mean()) if self.edge_m.size else float("nan")
 
     @property
@@ -65,7 +66,7 @@ class Quality:
         return float(np.percentile(self.edge_m, 95)) if self.edge_m.size else float("nan")
 
     def curve(self) -> tuple[Floats, Floats, Floats]:
-        """Return thresholds, precision and recall, ``(101,)`` each, for masks of what reaches a threshold."""
+        """Return thresholds, precision and recall, ``(101,)`` each; road is probability >= threshold."""
         right, wrong = (
             np.cumsum(counts[::-1])[::-1] for counts in (self.road_by_probability, self.ground_by_probability)
         )
@@ -74,67 +75,66 @@ class Quality:
 
 
 def judge(
-    found: Bools, probability: Floats | NDArray[np.float32] | None, truth: Bools, known: Bools, grid: Grid
+    mask: Bools, probability: Floats | NDArray[np.float32] | None, truth: Bools, valid: Bools, grid: Grid
 ) -> Quality:
-    """Hold a mask against the truth.
+    """Compare a mask with the truth.
 
     Parameters
     ----------
-    found, truth : Bools
+    mask, truth : Bools
         Road cells, ``(H, W)``.
     probability : array, optional
-        Of road, ``(H, W)``, 0 to 1.
-    known : Bools
-        Cells that count, ``(H, W)``; edges count between two of them.
+        Probability of road, ``(H, W)``, 0 to 1.
+    valid : Bools
+        Cells to compare, ``(H, W)``; an edge counts if both its cells are valid.
     grid : Grid
-        The cells.
+        Grid of the arrays.
     """
     none = np.zeros(STEPS + 1, np.int64)
     road = ground = none
     if probability is not None:
         share = np.nan_to_num(np.asarray(probability, np.float64))
         level = np.floor(share * STEPS + 1e-4).astype(np.intp).clip(0, STEPS)
-        road = np.bincount(level[known & truth], minlength=STEPS + 1)
-        ground = np.bincount(level[known & ~truth], minlength=STEPS + 1)
+        road = np.bincount(level[valid & truth], minlength=STEPS + 1)
+        ground = np.bincount(level[valid & ~truth], minlength=STEPS + 1)
     return Quality(
-        right=int(np.count_nonzero(known & found & truth)),
-        wrong=int(np.count_nonzero(known & found & ~truth)),
-        missed=int(np.count_nonzero(known & ~found & truth)),
-        ground=int(np.count_nonzero(known & ~found & ~truth)),
+        right=int(np.count_nonzero(valid & mask & truth)),
+        wrong=int(np.count_nonzero(valid & mask & ~truth)),
+        missed=int(np.count_nonzero(valid & ~mask & truth)),
+        ground=int(np.count_nonzero(valid & ~mask & ~truth)),
         road_by_probability=road,
         ground_by_probability=ground,
-        edge_m=_between(edges(found, known), edges(truth, known)) * grid.cell,
+        edge_m=_between(edges(mask, valid), edges(truth, valid)) * grid.cell,
     )
 
 
 def together(parts: Iterable[Quality]) -> Quality:
-    """Return what was counted on several tiles, at least one, as one."""
-    of = list(parts)
+    """Return the sum of the counts of several tiles, at least one."""
+    tiles = list(parts)
     return Quality(
-        right=sum(part.right for part in of),
-        wrong=sum(part.wrong for part in of),
-        missed=sum(part.missed for part in of),
-        ground=sum(part.ground for part in of),
-        road_by_probability=np.sum([part.road_by_probability for part in of], axis=0),
-        ground_by_probability=np.sum([part.ground_by_probability for part in of], axis=0),
-        edge_m=np.concatenate([part.edge_m for part in of]),
+        right=sum(tile.right for tile in tiles),
+        wrong=sum(tile.wrong for tile in tiles),
+        missed=sum(tile.missed for tile in tiles),
+        ground=sum(tile.ground for tile in tiles),
+        road_by_probability=np.sum([tile.road_by_probability for tile in tiles], axis=0),
+        ground_by_probability=np.sum([tile.ground_by_probability for tile in tiles], axis=0),
+        edge_m=np.concatenate([tile.edge_m for tile in tiles]),
     )
 
 
-def edges(mask: Bools, known: Bools) -> Floats:
+def edges(mask: Bools, valid: Bools) -> Floats:
     """Return the middles of the sides between road and no road, ``(n, 2)``: row and column in cells."""
-    upright = (mask[:, 1:] != mask[:, :-1]) & known[:, 1:] & known[:, :-1]
-    level = (mask[1:] != mask[:-1]) & known[1:] & known[:-1]
+    upright = (mask[:, 1:] != mask[:, :-1]) & valid[:, 1:] & valid[:, :-1]
+    level = (mask[1:] != mask[:-1]) & valid[1:] & valid[:-1]
     beside, below = np.array([0.0, 0.5]), np.array([0.5, 0.0])
     return np.concatenate([np.argwhere(upright) + beside, np.argwhere(level) + below])
 
 
 def _between(a: Floats, b: Floats) -> Floats:
-    """Return the distance from each point to the nearest of the others, both ways; empty if one is."""
+    """Return the distances from each point to the nearest one of the other set; empty if a set is empty."""
     if not (len(a) and len(b)):
         return np.zeros(0)
-    there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-    return np.concatenate([there, back])
+    return np.concatenate([cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]])
 
 
 def _ratio(part: int, whole: int) -> float:

@@ -1,6 +1,6 @@
-"""Roads as vectors on a tile: areas as they are, centre lines as wide as they say.
+"""Rasterise the roads of a vector file: areas as they are, centre lines buffered to their width.
 
-Lines end flat, as roads do; where ends of lines meet, a disc closes the wedge between them.
+Lines have flat ends; where ends of lines meet, a disc closes the wedge between them.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 CLASS_TAGS = ("highway", "area:highway")
-"""OSM's tags of a road's class: in tables that have them, features without are no roads."""
+"""OSM's tags of a road's class: in tables with such a column, features without a value are not roads."""
 HIDDEN_TAGS = ("tunnel", "covered")
-"""What lies under something is not what the heights show."""
+"""Tags of roads under something, whose heights are not in the DSM."""
 BRIDGE, AREA = "bridge", "area"
 NO = ("", "no", "false", "f", "n", "0", "0.0", "nan", "<na>", "none")
-"""How tables say that something is not so."""
+"""Values that mean no, or no value, in lower case."""
 SAME_M = 0.01
-"""Ends of lines so close are one."""
+"""Ends of lines within this distance are the same (m)."""
 
 
 class Options(widths.Options):
-    """Which features are roads, and how wide lines are."""
+    """Selection of road features, and the width of lines."""
 
     layer: str | None = Field(
-        None, description="layer of a file with several; of OSM's own format, lines and areas are both taken"
+        None, description="layer of a file with several; of the OSM format, lines and areas are both used"
     )
-    where: str | None = Field(None, description="which features, in SQL: class = 'road'")
+    where: str | None = Field(None, description="SQL condition that selects features: class = 'road'")
     class_columns: tuple[str, ...] = Field(
         (*CLASS_TAGS, "fclass", "class"),
         description="columns (or OSM tags) with a road's class; the first with a value wins",
@@ -57,9 +57,9 @@ class Options(widths.Options):
                 "rest_area",
             ),
         ),
-        description="classes that are no carriageway, or none yet, or none any more",
+        description="classes that are not carriageways, or planned or removed ones",
     )
-    tunnels: bool = Field(False, description="keep what lies in tunnels, passages and under roofs")
+    tunnels: bool = Field(False, description="keep roads in tunnels, passages and under roofs")
 
 
 DEFAULTS = Options()
@@ -100,9 +100,9 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     source : Source or None
         The tile's layer ``roads``.
     grid : Grid
-        The ground wanted; what touches it is returned whole.
+        The area to read; roads that touch it are returned whole.
     options : Options
-        What is a road, and how wide.
+        Selection and widths.
 
     Raises
     ------
@@ -118,39 +118,39 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
     columns = _columns(options)
-    found = [
-        _of_table(
+    parts = [
+        _from_table(
             read_near(Query(path, options.layer, options.where, columns, source.crs, grid.crs), bounds),
             options,
         )
         for path in source.paths
     ]
     return Roads(
-        np.concatenate([part.areas for part in found]),
-        np.concatenate([part.bridge for part in found]),
-        tuple(note for part in found for note in part.notes),
+        np.concatenate([part.areas for part in parts]),
+        np.concatenate([part.bridge for part in parts]),
+        tuple(note for part in parts for note in part.notes),
     )
 
 
 def _columns(options: Options) -> tuple[str, ...]:
-    told = (*options.width_columns, *options.class_columns, *CLASS_TAGS, "lanes", BRIDGE, AREA, *HIDDEN_TAGS)
-    return tuple(dict.fromkeys(name.lower() for name in told))
+    names = (*options.width_columns, *options.class_columns, *CLASS_TAGS, "lanes", BRIDGE, AREA, *HIDDEN_TAGS)
+    return tuple(dict.fromkeys(name.lower() for name in names))
 
 
-def _of_table(table: Any, options: Options) -> Roads:
+def _from_table(table: Any, options: Options) -> Roads:
     """Return the roads of one table."""
     classes = _classes(table, options.class_columns)
     chosen = _is_road(table, classes, options)
     table, classes = table[chosen], classes[chosen]
-    # A collection of multi-part features comes apart in two steps.
-    several, of = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
-    parts, again = shapely.get_parts(several, return_index=True)
-    of = of[again]
-    bridge = _says(table, BRIDGE)[of]
-    parts = _closed(parts, _says(table, AREA)[of])
+    # A collection of multi-part features needs two steps to be split into simple parts.
+    members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
+    parts, member = shapely.get_parts(members, return_index=True)
+    row = row[member]
+    bridge = _is_yes(table, BRIDGE)[row]
+    parts = _closed(parts, _is_yes(table, AREA)[row])
     is_line = np.isin(shapely.get_type_id(parts), (1, 2))
     is_area = shapely.get_type_id(parts) == 3
-    lines, of_line = parts[is_line], of[is_line]
+    lines, of_line = parts[is_line], row[is_line]
     rows, row_of = np.unique(of_line, return_inverse=True)
     width, notes = widths.widths(table.iloc[rows], classes[rows], options)
     half = width[row_of] / 2
@@ -164,13 +164,13 @@ def _of_table(table: Any, options: Options) -> Roads:
 
 
 def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
-    """Return each row's class in lower case, ``(n,)``; empty where none of the columns tells."""
-    found = np.full(len(table), "", object)
+    """Return each row's class in lower case, ``(n,)``; empty where no column has a value."""
+    classes = np.full(len(table), "", object)
     for column in map(str.lower, columns):
         if column in table:
-            told = np.array([str(value).strip().lower() for value in table[column]], object)
-            found = np.where((found == "") & ~np.isin(told, NO), told, found)
-    return found
+            values = np.array([str(value).strip().lower() for value in table[column]], object)
+            classes = np.where((classes == "") & ~np.isin(values, NO), values, classes)
+    return classes
 
 
 def _is_road(table: Any, classes: NDArray[np.object_], options: Options) -> Bools:
@@ -179,19 +179,19 @@ def _is_road(table: Any, classes: NDArray[np.object_], options: Options) -> Bool
         road &= _classes(table, CLASS_TAGS) != ""
     if not options.tunnels:
         for tag in HIDDEN_TAGS:
-            road &= ~_says(table, tag)
+            road &= ~_is_yes(table, tag)
     return road
 
 
-def _says(table: Any, column: str) -> Bools:
-    """Return the rows that say yes, or anything but no, in a column, ``(n,)``."""
+def _is_yes(table: Any, column: str) -> Bools:
+    """Return the rows whose value in a column is not one of `NO`, ``(n,)``; none if the column is missing."""
     if column not in table:
         return np.zeros(len(table), bool)
     return np.array([str(value).strip().lower() not in NO for value in table[column]], bool)
 
 
 def _closed(parts: NDArray[np.object_], area: Bools) -> NDArray[np.object_]:
-    """Return the parts with closed lines that say they are areas as such."""
+    """Return the parts with closed lines that are tagged as areas turned into polygons."""
     whole = area & shapely.is_closed(parts) & np.isin(shapely.get_type_id(parts), (1, 2))
     whole &= shapely.get_num_points(parts) > 3
     filled = parts.copy()
@@ -200,10 +200,10 @@ def _closed(parts: NDArray[np.object_], area: Bools) -> NDArray[np.object_]:
 
 
 def _joints(lines: NDArray[np.object_], half: Floats, bridge: Bools) -> tuple[NDArray[np.object_], Bools]:
-    """Return discs where ends of lines meet, and which of them lie on bridges alone.
+    """Return discs where ends of lines meet, ``(n,)``, and which discs have only bridges around them.
 
-    A disc has the second largest half width of the lines that end there: a wide road that goes on as a
-    narrow one bulges no farther than the narrow one is wide.
+    The radius of a disc is the second largest half width of the lines that end there, so that a wide road
+    that continues as a narrow one does not bulge beyond the narrow one's width.
     """
     if not len(lines):
         return np.empty(0, object), np.zeros(0, bool)

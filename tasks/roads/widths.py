@@ -1,4 +1,4 @@
-"""How wide a road is, from what a table of centre lines says of it."""
+"""Widths of roads from the attributes of centre lines: width, lanes or class."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ CLASS_WIDTH_M = {
     "busway": 6.5,
     "track": 3.0,
 }
-"""Carriageways as the German guidelines build them (RAL 2012: RQ 31 per direction, RQ 11; RASt 06), by OSM's
-classes; of dual carriageways OSM draws each one."""
+"""Width of carriageways (m) by OSM class, after the German guidelines (RAL 2012: RQ 31 per direction, RQ 11;
+RASt 06); OSM maps each direction of a dual carriageway separately."""
 
 FOOT_M, INCH_M = 0.3048, 0.0254
 UNITS_M = {
@@ -47,34 +47,39 @@ MOST_LANES = 16
 
 
 class Options(base.Options):
-    """Where a line's width comes from: what it says itself, else its lanes, else its class."""
+    """Source of a line's width: its width attribute, else its number of lanes, else its class."""
 
     width_columns: tuple[str, ...] = Field(
         ("width:carriageway", "width", "width_m", "est_width"),
         description="columns (or OSM tags) with a width, kerb to kerb; the first with a value wins",
     )
-    width_unit: Literal["m", "ft"] = Field("m", description="unit of widths that name none")
-    lane_width_m: float = Field(3.25, gt=0, le=10, description="width of a lane (m), where lanes are told")
+    width_unit: Literal["m", "ft"] = Field("m", description="unit of widths without one")
+    lane_width_m: float = Field(
+        3.25, gt=0, le=10, description="width of a lane (m), if the number of lanes is given"
+    )
     shoulder_m: float = Field(
-        0.25, ge=0, le=10, description="beside the outer lanes on either side (m), where lanes are told"
+        0.25,
+        ge=0,
+        le=10,
+        description="shoulder beside the outer lanes on either side (m), if the number of lanes is given",
     )
     class_width_m: dict[str, float] = Field(
-        CLASS_WIDTH_M, description="width by class (m); what is given here lies over the built-in table"
+        CLASS_WIDTH_M, description="width by class (m); entries replace those of the built-in table"
     )
-    default_width_m: float = Field(6.0, gt=0, le=100, description="width of lines nothing is known of (m)")
-    min_width_m: float = Field(2.0, gt=0, le=100, description="narrower lines are taken as so wide (m)")
-    max_width_m: float = Field(40.0, gt=0, le=100, description="wider lines are taken as so wide (m)")
+    default_width_m: float = Field(6.0, gt=0, le=100, description="width of lines without any of these (m)")
+    min_width_m: float = Field(2.0, gt=0, le=100, description="smallest width; narrower lines get it (m)")
+    max_width_m: float = Field(40.0, gt=0, le=100, description="largest width; wider lines get it (m)")
 
     @field_validator("class_width_m")
     @classmethod
-    def _over_the_table(cls, given: dict[str, float]) -> dict[str, float]:
-        if not all(0 < width <= 100 for width in given.values()):
-            raise ValueError("a width is above 0 and at most 100 m")
-        return {**CLASS_WIDTH_M, **given}
+    def _with_defaults(cls, class_width_m: dict[str, float]) -> dict[str, float]:
+        if not all(0 < width <= 100 for width in class_width_m.values()):
+            raise ValueError("a width must be above 0 and at most 100 m")
+        return {**CLASS_WIDTH_M, **class_width_m}
 
 
 def metres(text: str, bare_m: float = 1.0) -> float:
-    """Return a width in metres, NaN if the text is no length.
+    """Return a width in metres, NaN if the text is not a length.
 
     Parameters
     ----------
@@ -86,14 +91,14 @@ def metres(text: str, bare_m: float = 1.0) -> float:
     text = text.strip().lower().translate(PRIMES)
     if both := FEET_INCHES.fullmatch(text):
         return int(both[1]) * FOOT_M + float(both[2]) * INCH_M
-    one = LENGTH.fullmatch(text)
-    if one is None:
+    length = LENGTH.fullmatch(text)
+    if length is None:
         return float("nan")
-    return float(one[1]) * (UNITS_M.get(one[2], float("nan")) if one[2] else bare_m)
+    return float(length[1]) * (UNITS_M.get(length[2], float("nan")) if length[2] else bare_m)
 
 
 def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[str, ...]]:
-    """Return the width of every row (m), ``(n,)``, and notes on what was not to be read.
+    """Return the width of every row (m), ``(n,)``, and notes on missing or unreadable widths.
 
     Parameters
     ----------
@@ -102,43 +107,46 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
     classes : sequence of str or None
         Class of each row.
     options : Options
-        Where widths come from.
+        Source of widths.
     """
     bare_m = FOOT_M if options.width_unit == "ft" else 1.0
-    found, unread = np.full(len(table), np.nan), []
+    width, unreadable = np.full(len(table), np.nan), []
     for column in map(str.lower, options.width_columns):
         if column in table:
-            told = [(i, str(text)) for i, text in enumerate(table[column]) if _is_told(text)]
-            for i, text in told:
-                width = metres(text, bare_m)
-                unread += [text] if np.isnan(width) else []
-                # Tables write 0 where they do not know.
-                found[i] = width if np.isnan(found[i]) and width > 0 else found[i]
+            values = [(i, str(text)) for i, text in enumerate(table[column]) if _has_value(text)]
+            for i, text in values:
+                value = metres(text, bare_m)
+                unreadable += [text] if np.isnan(value) else []
+                # In many tables 0 means unknown.
+                width[i] = value if np.isnan(width[i]) and value > 0 else width[i]
     by_class = np.array([options.class_width_m.get(str(name), np.nan) for name in classes], float)
-    found = np.where(np.isnan(found), _by_lanes(table, options), found)
-    found = np.where(np.isnan(found), by_class, found)
-    unknown = int(np.isnan(found).sum())
+    width = np.where(np.isnan(width), _by_lanes(table, options), width)
+    width = np.where(np.isnan(width), by_class, width)
+    unknown = int(np.isnan(width).sum())
     notes = []
-    if unread:
-        notes.append(f"{len(unread)} widths of lines cannot be read ({unread[0]!r}): lanes or class stand in")
+    if unreadable:
+        notes.append(
+            f"{len(unreadable)} widths of lines cannot be read ({unreadable[0]!r}): "
+            "lanes or class are used instead"
+        )
     if unknown:
         notes.append(
-            f"{unknown} of {len(found)} lines tell no width, lanes or known class: taken as "
+            f"{unknown} of {len(width)} lines have no width, lanes or known class: taken as "
             f"{options.default_width_m:g} m wide"
         )
-    found = np.where(np.isnan(found), options.default_width_m, found)
-    return np.clip(found, options.min_width_m, options.max_width_m), tuple(notes)
+    width = np.where(np.isnan(width), options.default_width_m, width)
+    return np.clip(width, options.min_width_m, options.max_width_m), tuple(notes)
 
 
 def _by_lanes(table: Any, options: Options) -> Floats:
     lanes = np.full(len(table), np.nan)
     for i, text in enumerate(table.get("lanes", ())):
-        if _is_told(text) and re.fullmatch(NUMBER, str(text).strip()):
+        if _has_value(text) and re.fullmatch(NUMBER, str(text).strip()):
             lanes[i] = float(text)
     lanes[(lanes < 1) | (lanes > MOST_LANES)] = np.nan
     return lanes * options.lane_width_m + 2 * options.shoulder_m
 
 
-def _is_told(value: Any) -> bool:
-    # NaN alone is unlike itself; pandas has several ways to say "nothing".
+def _has_value(value: Any) -> bool:
+    # pandas has several values for "missing".
     return value is not None and str(value).strip().lower() not in ("", "nan", "<na>", "none")

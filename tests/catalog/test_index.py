@@ -117,7 +117,7 @@ def test_read_missing_or_broken_file_names_it(tmp_path):
     for name in ("bad.parquet", "bad.json"):
         with pytest.raises(CatalogError, match=f"{name} is not a FlexRoad catalog"):
             Catalog.read(tmp_path / name)
-    with pytest.raises(CatalogError, match=r"must end in .parquet"):
+    with pytest.raises(CatalogError, match=r"ends in .parquet"):
         Catalog(()).write(tmp_path / "catalog.csv")
 
 

@@ -15,13 +15,13 @@ from flexroad.tasks.load import Options, load
 from tests.make_rasters import UTM, write, write_xyz
 
 GRID = Grid(UTM, 295500.0, 5629480.0, 1.0, 20, 20)
-"""A tile of 20 m; its upper left corner is where `write` puts files."""
+"""A tile of 20 m."""
 NORTH = {"west": GRID.west, "north": GRID.north}
 
 
 @pytest.fixture(autouse=True)
 def quiet():
-    """Nothing may warn: a run of 10,000 tiles would drown in it."""
+    """Turn warnings into errors: a run of 10,000 tiles would repeat them."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", PendingDeprecationWarning)  # affine's, raised inside rasterio
@@ -47,10 +47,10 @@ def plane(grid, a=0.3, b=-0.2):
     return 100 + a * (e - GRID.west) + b * (n - GRID.north)
 
 
-def fails(made, options=None):
-    """Return the one line and the file of the error that loading gives."""
+def fails(tile, options=None):
+    """Load a tile that fails; return the message and the file of the error."""
     with pytest.raises(TaskError) as caught:
-        load(made, options or Options())
+        load(tile, options or Options())
     assert "\n" not in str(caught.value)
     return str(caught.value), caught.value.file
 
@@ -60,10 +60,10 @@ def dtm(tmp_path):
     return write(tmp_path / "dtm.tif", relief(seed=9), **NORTH)
 
 
-# --- what coincides is copied -----------------------------------------------------------------------------
+# --- cells that coincide are copied -----------------------------------------------------------------------
 
 
-def test_coinciding_cells_are_copied_bit_by_bit(tmp_path):
+def test_load_coinciding_cells_are_copied(tmp_path):
     dsm, dtm = relief(30, 40), relief(30, 40, seed=1)
     write(tmp_path / "dsm.tif", dsm, GRID.west - 5, GRID.north + 3)
     write(tmp_path / "dtm.tif", dtm.astype(np.float32), GRID.west - 5, GRID.north + 3)
@@ -75,7 +75,7 @@ def test_coinciding_cells_are_copied_bit_by_bit(tmp_path):
     assert data.road_mask is data.reference is data.reference_road is None
 
 
-def test_a_corner_that_is_off_by_less_than_a_hundredth_is_copied(tmp_path, dtm):
+def test_load_offset_below_tolerance_is_copied(tmp_path, dtm):
     dsm = relief()
     write(tmp_path / "dsm.tif", dsm, GRID.west + 0.009, GRID.north - 0.009, cell=1.00000001)
     data = load(tile(tmp_path), Options())
@@ -85,7 +85,7 @@ def test_a_corner_that_is_off_by_less_than_a_hundredth_is_copied(tmp_path, dtm):
 
 @settings(max_examples=30, deadline=None)
 @given(row=st.integers(-25, 25), col=st.integers(-25, 25), size=st.tuples(*2 * [st.integers(1, 45)]))
-def test_every_cell_lands_where_it_lies(tmp_path_factory, row, col, size):
+def test_load_any_position_puts_cells_in_place(tmp_path_factory, row, col, size):
     root = tmp_path_factory.mktemp("window")
     write(root / "dtm.tif", relief(seed=1), **NORTH)
     dsm = relief(*size)
@@ -99,7 +99,7 @@ def test_every_cell_lands_where_it_lies(tmp_path_factory, row, col, size):
         np.testing.assert_array_equal(load(tile(root), Options(min_valid=0)).dsm, want)
 
 
-def test_files_are_put_together_and_the_first_with_a_value_wins(tmp_path, dtm):
+def test_load_overlapping_files_use_first_value(tmp_path, dtm):
     left, right = relief(20, 12), relief(20, 12, seed=1)
     left[4, 9] = np.nan
     write(tmp_path / "a.tif", left, **NORTH)
@@ -110,7 +110,7 @@ def test_files_are_put_together_and_the_first_with_a_value_wins(tmp_path, dtm):
     np.testing.assert_array_equal(data.dsm, want)
 
 
-def test_a_halo_is_read_from_neighbouring_files(tmp_path):
+def test_load_halo_reads_neighbouring_files(tmp_path):
     whole = relief(40, 40)
     for name, cols in {"a": slice(0, 20), "b": slice(20, 40)}.items():
         write(tmp_path / f"{name}.tif", whole[:, cols], GRID.west + cols.start, GRID.north)
@@ -123,7 +123,7 @@ def test_a_halo_is_read_from_neighbouring_files(tmp_path):
     assert np.isnan(data.dsm[:, :7]).all()
 
 
-def test_other_formats_give_the_same(tmp_path, dtm):
+def test_load_other_formats_give_same_heights(tmp_path, dtm):
     dsm = relief().round(2)
     write_xyz(tmp_path / "down.xyz", dsm, **NORTH)
     write_xyz(tmp_path / "up.xyz", dsm, **NORTH, northward=True)
@@ -138,15 +138,15 @@ def test_other_formats_give_the_same(tmp_path, dtm):
     )
     for name in ("down.xyz", "up.xyz", "a.asc", "a.vrt"):
         data = load(tile(tmp_path, dsm=name, crs=UTM), Options())
-        # Point lists come as float32, the ASCII grid with as many digits as were written.
+        # XYZ files are read as float32, the ASCII grid with the digits that were written.
         np.testing.assert_allclose(data.dsm, dsm, atol=1e-5, err_msg=name)
         assert data.notes == (), name
 
 
-# --- what does not coincide is resampled ------------------------------------------------------------------
+# --- cells that do not coincide are resampled -------------------------------------------------------------
 
 
-def test_heights_on_another_lattice_are_interpolated_and_it_is_said(tmp_path, dtm):
+def test_load_other_lattice_is_interpolated_with_note(tmp_path, dtm):
     off = Grid(UTM, GRID.west - 9.91, GRID.north + 10.31, 1.0, 45, 45)
     write(tmp_path / "dsm.tif", plane(off), off.west, off.north)
     data = load(tile(tmp_path), Options())
@@ -155,7 +155,7 @@ def test_heights_on_another_lattice_are_interpolated_and_it_is_said(tmp_path, dt
 
 
 @pytest.mark.parametrize("cell", [0.25, 0.5, 2.0])
-def test_other_cell_sizes(tmp_path, dtm, cell):
+def test_load_other_cell_size_is_resampled_with_note(tmp_path, dtm, cell):
     n = round(60 / cell)
     other = Grid(UTM, GRID.west - 20, GRID.north + 20, cell, n, n)
     write(tmp_path / "dsm.tif", plane(other), other.west, other.north, cell=cell)
@@ -164,16 +164,16 @@ def test_other_cell_sizes(tmp_path, dtm, cell):
     assert data.notes == (f"dsm resampled: its cells are {cell:g} m, the tile's 1 m",)
 
 
-def test_cells_without_a_value_have_no_weight(tmp_path, dtm):
-    """By definition: bilinear weights, those of voids taken out, the rest summing to one; voids stay."""
+def test_load_resampling_ignores_cells_without_value(tmp_path, dtm):
+    """Bilinear weights without those of voids, normalised to one; voids keep their size."""
     source = relief(24, 24)
     source[8:11, 9] = np.nan
     source[15, 15] = 1e30
     off = 0.25
     write(tmp_path / "dsm.tif", source, GRID.west - 2 + off, GRID.north + 2)
     data = load(tile(tmp_path), Options())
-    known = np.where(source < 1e4, source, np.nan)
-    left, right = known[2:22, 1:21], known[2:22, 2:22]
+    heights = np.where(source < 1e4, source, np.nan)
+    left, right = heights[2:22, 1:21], heights[2:22, 2:22]
     w = np.array([off, 1 - off])[:, None, None] * ~np.isnan([left, right])
     want = np.nansum([w[0] * left, w[1] * right], axis=0) / w.sum(axis=0)
     want[np.isnan(right)] = np.nan
@@ -184,7 +184,7 @@ def test_cells_without_a_value_have_no_weight(tmp_path, dtm):
     )
 
 
-def test_classes_are_never_mixed(tmp_path, dtm):
+def test_load_mask_is_resampled_to_nearest(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     fine = np.repeat(np.repeat(np.array([[1, 3], [2, 1]], np.uint8), 20, 0), 20, 1)
     write(tmp_path / "mask.tif", fine, GRID.west + 0.1, GRID.north, cell=0.5)
@@ -199,7 +199,7 @@ def test_classes_are_never_mixed(tmp_path, dtm):
 
 
 @pytest.mark.parametrize("nodata", [-9999.0, -3.4028234663852886e38, float("nan"), 0.0])
-def test_declared_nodata_is_nan_without_a_word(tmp_path, dtm, nodata):
+def test_load_declared_nodata_is_nan_without_note(tmp_path, dtm, nodata):
     dsm = relief().astype(np.float32)
     dsm[3, 4] = nodata
     write(tmp_path / "dsm.tif", dsm, **NORTH, nodata=nodata)
@@ -208,7 +208,7 @@ def test_declared_nodata_is_nan_without_a_word(tmp_path, dtm, nodata):
     assert data.notes == ()
 
 
-def test_what_is_no_height_is_cut_and_counted(tmp_path, dtm):
+def test_load_invalid_heights_are_nan_with_note(tmp_path, dtm):
     dsm = relief()
     dsm[0, :6] = [np.inf, -np.inf, 1e30, -9999, 9001, np.nan]
     dsm[1, :2] = [-499, 8999]
@@ -221,7 +221,7 @@ def test_what_is_no_height_is_cut_and_counted(tmp_path, dtm):
 @pytest.mark.parametrize(
     ("unit", "metres"), [("ft", 0.3048), ("US survey foot", 1200 / 3937), ("m", 1.0), ("cm", 0.01)]
 )
-def test_heights_come_in_metres(tmp_path, unit, metres):
+def test_load_unit_of_band_is_converted_to_metres(tmp_path, unit, metres):
     dsm = relief()
     write(tmp_path / "dsm.tif", dsm / metres, **NORTH, unit=unit)
     write(tmp_path / "dtm.tif", dsm / metres - 1, **NORTH, unit=unit)
@@ -230,8 +230,8 @@ def test_heights_come_in_metres(tmp_path, unit, metres):
     np.testing.assert_allclose(data.dtm, dsm - metres, rtol=1e-12)
 
 
-def test_feet_by_the_vertical_axis_of_the_crs(tmp_path):
-    """A plan in metres with heights in feet (NAVD88, ftUS) over UTM 10N."""
+def test_load_unit_of_vertical_crs_is_converted_to_metres(tmp_path):
+    """UTM 10N in metres with heights in feet (NAVD88, ftUS)."""
     crs = "EPSG:26910+6360"
     grid = Grid("EPSG:26910", GRID.west, GRID.north, 1.0, 20, 20)
     for name in ("dsm.tif", "dtm.tif"):
@@ -240,13 +240,13 @@ def test_feet_by_the_vertical_axis_of_the_crs(tmp_path):
     np.testing.assert_allclose(data.dsm, 1000 * 1200 / 3937, rtol=1e-12)
 
 
-def test_whole_numbers_with_a_scale(tmp_path, dtm):
+def test_load_scale_and_offset_are_applied(tmp_path, dtm):
     dsm = relief().round(2)
     write(tmp_path / "dsm.tif", (dsm * 100 - 5000).round().astype(np.int16), **NORTH, scale=(0.01, 50.0))
     np.testing.assert_allclose(load(tile(tmp_path), Options()).dsm, dsm, rtol=1e-12)
 
 
-def test_masks(tmp_path, dtm):
+def test_load_masks_use_road_values(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     classes = np.random.default_rng(3).integers(0, 4, (20, 20)).astype(np.uint8)
     write(tmp_path / "mask.tif", classes, **NORTH, nodata=3)
@@ -259,7 +259,7 @@ def test_masks(tmp_path, dtm):
     assert nonzero.road_mask.dtype == np.bool_
 
 
-def test_a_mask_without_georeference_must_have_the_tiles_size(tmp_path, dtm):
+def test_load_mask_without_georeference_needs_tile_size(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     mask = np.tri(20, dtype=np.uint8)
     for name, values in {"same.tif": mask, "other.tif": mask[:19]}.items():
@@ -270,34 +270,34 @@ def test_a_mask_without_georeference_must_have_the_tiles_size(tmp_path, dtm):
     np.testing.assert_array_equal(data.road_mask[1:-1, 1:-1], mask)
     message, file = fails(tile(tmp_path, road_mask="other.tif"))
     assert message.startswith(
-        "road_mask other.tif carries no georeference and has 20 x 19 cells, the tile 20 x 20"
+        "road_mask other.tif has no georeference and has 20 x 19 cells, the tile 20 x 20"
     )
     assert file == str(tmp_path / "other.tif")
 
 
-def test_a_reference_is_read_too(tmp_path, dtm):
+def test_load_reference_is_read(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     truth = relief(seed=5)
     write(tmp_path / "truth.tif", truth, **NORTH)
     np.testing.assert_array_equal(load(tile(tmp_path, reference="truth.tif"), Options()).reference, truth)
 
 
-# --- what cannot be loaded ----------------------------------------------------------------------------------
+# --- tiles that cannot be loaded ----------------------------------------------------------------------------
 
 
-def test_a_missing_layer(tmp_path, dtm):
+def test_load_missing_layer_fails(tmp_path, dtm):
     assert fails(tile(tmp_path, dsm=None))[0].startswith("the tile has no dsm; give its files")
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     assert "with --dtm" in fails(tile(tmp_path, dtm=None))[0]
 
 
-def test_a_missing_file(tmp_path, dtm):
+def test_load_missing_file_fails(tmp_path, dtm):
     message, file = fails(tile(tmp_path))
     assert message.startswith("dsm dsm.tif is missing")
     assert file == str(tmp_path / "dsm.tif")
 
 
-def test_files_that_are_broken(tmp_path, dtm):
+def test_load_broken_file_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(200, 200), **NORTH)
     whole = (tmp_path / "dsm.tif").read_bytes()
     (tmp_path / "dsm.tif").write_bytes(whole[: len(whole) // 20])
@@ -308,19 +308,19 @@ def test_files_that_are_broken(tmp_path, dtm):
     assert "cannot be read" in fails(tile(tmp_path))[0]
 
 
-def test_an_error_survives_the_way_to_another_process():
+def test_task_error_can_be_pickled():
     copy = pickle.loads(pickle.dumps(TaskError("no dsm", "a.tif", "dsm")))
     assert (str(copy), copy.file, copy.layer) == ("no dsm", "a.tif", "dsm")
 
 
-def test_files_elsewhere(tmp_path, dtm):
+def test_load_file_outside_tile_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), GRID.west + 500, GRID.north)
     message, file = fails(tile(tmp_path))
     assert message.startswith("no dsm file overlaps the tile (295500 5629460 295520 5629480): dsm.tif")
     assert file == str(tmp_path / "dsm.tif")
 
 
-def test_layers_in_two_crs(tmp_path, dtm):
+def test_load_layer_in_other_crs_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     from rasterio.warp import transform
 
@@ -333,38 +333,38 @@ def test_layers_in_two_crs(tmp_path, dtm):
     assert file == str(tmp_path / "dtm.tif")
 
 
-def test_a_file_in_another_crs_and_elsewhere_is_no_error(tmp_path, dtm):
+def test_load_file_in_other_crs_outside_tile_is_ignored(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     write(tmp_path / "far.tif", relief(), **NORTH, crs="EPSG:25833")
     made = tile(tmp_path, dtm=("far.tif", "dtm.tif"))
     np.testing.assert_array_equal(load(made, Options()).dtm, relief(seed=9))
 
 
-def test_a_file_without_crs(tmp_path, dtm):
+def test_load_file_without_crs_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, crs=None)
-    assert "dsm dsm.tif carries no CRS; build the catalog anew with --crs" in fails(tile(tmp_path))[0]
+    assert "dsm dsm.tif has no CRS; build the catalog again with --crs" in fails(tile(tmp_path))[0]
     np.testing.assert_array_equal(load(tile(tmp_path, crs=UTM), Options()).dsm, relief())
 
 
-def test_feet_beside_metres(tmp_path, dtm):
+def test_load_mixed_units_fail(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, unit="ft")
     message, file = fails(tile(tmp_path))
-    assert message.startswith("dsm dsm.tif counts heights in ft, dtm dtm.tif in metre; ")
+    assert message.startswith("dsm dsm.tif has heights in ft, dtm dtm.tif in metre; ")
     assert file == str(tmp_path / "dtm.tif")
 
 
-def test_a_unit_of_something_else(tmp_path, dtm):
+def test_load_unsupported_unit_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, unit="decibel")
-    assert "counts in 'decibel'" in fails(tile(tmp_path))[0]
+    assert "has the unit 'decibel'" in fails(tile(tmp_path))[0]
 
 
-def test_a_rotated_file(tmp_path, dtm):
+def test_load_rotated_file_fails(tmp_path, dtm):
     turned = Affine.translation(GRID.west, GRID.north) @ Affine.rotation(10) @ Affine.scale(1, -1)
     write(tmp_path / "dsm.tif", relief(), transform=turned)
     assert "is rotated; turn it north up" in fails(tile(tmp_path))[0]
 
 
-def test_too_few_heights(tmp_path, dtm):
+def test_load_too_few_heights_fails(tmp_path, dtm):
     dsm = np.full((20, 20), np.nan)
     write(tmp_path / "dsm.tif", dsm, **NORTH)
     assert "dsm dsm.tif has only nodata on this tile" in fails(tile(tmp_path))[0]
@@ -376,13 +376,13 @@ def test_too_few_heights(tmp_path, dtm):
     assert np.isfinite(load(tile(tmp_path), Options(min_valid=0.1)).dsm).sum() == 49
 
 
-def test_a_halo_does_not_count_as_covered(tmp_path):
+def test_load_data_only_in_halo_fails(tmp_path):
     for name in ("dsm.tif", "dtm.tif"):
         write(tmp_path / name, relief(40, 20), GRID.west - 20, GRID.north + 10)
     assert "has only nodata" in fails(tile(tmp_path), Options(halo_m=10))[0]
 
 
-def test_a_terrain_model_of_nodata(tmp_path):
+def test_load_dtm_of_nodata_fails(tmp_path):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     write(tmp_path / "dtm.tif", np.full((20, 20), -9999.0), **NORTH, nodata=-9999)
     message, file = fails(tile(tmp_path))
@@ -390,7 +390,7 @@ def test_a_terrain_model_of_nodata(tmp_path):
     assert file == str(tmp_path / "dtm.tif")
 
 
-def test_options_have_bounds():
+def test_options_out_of_bounds_raise_error():
     for bad in ({"halo_m": -1}, {"halo_m": 501}, {"min_valid": 1.5}, {"halo": 3}):
         with pytest.raises(ValidationError):
             Options(**bad)

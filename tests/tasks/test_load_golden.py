@@ -1,4 +1,4 @@
-"""What `load` and `segment` give for one small case, pinned: a change needs a new VERSION and new figures."""
+"""Pinned output of `load` and `segment` for one small tile: a change needs a new VERSION and new figures."""
 
 from datetime import UTC, datetime
 
@@ -25,7 +25,7 @@ PINNED = {
 
 
 def case(root) -> Tile:
-    """Two DSM files off the lattice with a void and a wild value, a DTM at 0.5 m, a land cover on it."""
+    """Two DSM files off the lattice with a void and an outlier, a DTM at 0.5 m, a land-cover mask."""
     grid = Grid(UTM, 295500.0, 5629500.0, 1.0, 30, 30)
     row, col = np.mgrid[:40, :40].astype(float)
     dsm = 120 + 3 * np.sin(row / 5) + 2 * np.cos(col / 7)
@@ -44,14 +44,14 @@ def case(root) -> Tile:
 
 
 def summary(heights) -> tuple[int, float, float]:
-    """Return the number of values, their mean and a sum that knows where they lie."""
-    known = np.where(np.isnan(heights), 0.0, heights)
-    weights = np.arange(known.size).reshape(known.shape) / known.size
-    mean, placed = float(np.nanmean(heights)), float((known * weights).mean())
-    return int(np.isfinite(heights).sum()), round(mean, 6), round(placed, 6)
+    """Return the number of values, their mean, and a mean weighted by position."""
+    filled = np.where(np.isnan(heights), 0.0, heights)
+    weights = np.arange(filled.size).reshape(filled.shape) / filled.size
+    mean, weighted = float(np.nanmean(heights)), float((filled * weights).mean())
+    return int(np.isfinite(heights).sum()), round(mean, 6), round(weighted, 6)
 
 
-def test_golden(tmp_path):
+def test_load_and_segment_output_is_pinned(tmp_path):
     data = load.load(case(tmp_path), load.Options(halo_m=5))
     road = mask.segment(data, mask.Options())
     got = {

@@ -139,15 +139,15 @@ class Fault:
 
 
 FAULTS = (
-    Fault(_absent, "dsm", "is missing; restore it or build the catalog anew"),
+    Fault(_absent, "dsm", "is missing; restore it or build the catalog again"),
     Fault(_zero_bytes, "dtm", "cannot be read: .*; fetch it again"),
     Fault(_truncated, "dsm", "cannot be read: .*; fetch it again"),
     Fault(_a_folder, "dsm", "cannot be read: .*; fetch it again"),
     Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
-    Fault(_elsewhere, "dsm", r"no dsm file overlaps the tile \(.*\): .*; build the catalog anew"),
+    Fault(_elsewhere, "dsm", r"no dsm file overlaps the tile \(.*\): .*; build the catalog again"),
     Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),
-    Fault(_in_feet, "dtm", "counts heights in metre, dtm .* in ft; convert one, or correct its unit"),
-    Fault(_in_fathoms, "dsm", "counts in 'fathom', which is no unit of height known here; convert it"),
+    Fault(_in_feet, "dtm", "has heights in metre, dtm .* in ft; convert one, or correct its unit"),
+    Fault(_in_fathoms, "dsm", "has the unit 'fathom', which is not a supported unit of height; convert it"),
     Fault(_void, "dsm", "has only nodata on this tile; leave the tile out"),
     Fault(_thin, "dsm", r"has 10.0% valid cells on this tile, below 25%; lower load.min_valid"),
     Fault(_absurd, "dsm", "has only nodata on this tile; leave the tile out"),
@@ -209,7 +209,8 @@ def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, f
     other = Catalog.read(catalog).tiles[3].id
     item = json.loads((tmp_path / "run" / "tiles" / other / "item.json").read_text())
     (note,) = item["properties"]["flexroad:notes"]
-    assert note.startswith(f"the tile is whole without it: {name} {name}/{first.id}.tif cannot be read")
+    line = f"a file that the tile does not need was left out: {name} {name}/{first.id}.tif cannot be read"
+    assert note.startswith(line)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from flexroad.tasks.types import Source
 
 UTM = "EPSG:25832"
 GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, 20, 12)
-"""The ground asked for; photos of 40 x 24 pixels at 0.5 m cover it."""
+"""The area to read; photos of 40 x 24 pixels at 0.5 m cover it."""
 
 
 def bands(count=3, kind=np.uint8, top=255, seed=0):
@@ -51,7 +51,7 @@ def means(values, n=2):
     return values.reshape(count, height // n, n, width // n, n).mean((2, 4))
 
 
-def test_pixels_that_coincide_are_copied(tmp_path):
+def test_read_photo_coinciding_pixels_are_copied(tmp_path):
     values = bands()
     photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID)
     assert photo.grid == Grid(UTM, GRID.west, GRID.north, 0.5, 40, 24)
@@ -60,30 +60,30 @@ def test_pixels_that_coincide_are_copied(tmp_path):
 
 
 @pytest.mark.parametrize("cell", [1.0, 2.0])
-def test_coarser_pixels_are_means(tmp_path, cell):
+def test_read_photo_coarser_pixels_are_means(tmp_path, cell):
     values = bands()
     photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID, cell)
     assert photo.grid.cell == cell
     assert np.abs(photo.colour - means(values, round(cell / 0.5))).max() <= 0.5
 
 
-def test_finer_pixels_interpolate(tmp_path):
+def test_read_photo_finer_pixels_are_interpolated(tmp_path):
     ramp = np.broadcast_to(np.arange(40, dtype=np.uint8) * 4, (3, 24, 40))
     photo = read_photo(source(write(tmp_path / "a.tif", ramp)), GRID, 0.25)
     want = np.clip((photo.grid.eastings - GRID.west) / 0.5 - 0.5, 0, 39) * 4
     assert np.abs(photo.colour - want).max() <= 0.5
 
 
-def test_a_window_does_not_depend_on_the_ground_around(tmp_path):
+def test_read_photo_window_equals_part_of_larger_one(tmp_path):
     path = source(write(tmp_path / "a.tif", bands()))
     inner = Grid(UTM, GRID.west + 4, GRID.north - 2, 1.0, 9, 7)
     small, large = read_photo(path, inner, 1.0), read_photo(path, GRID, 1.0)
     np.testing.assert_array_equal(small.colour, large.colour[(slice(None), *large.grid.window(small.grid))])
 
 
-def test_what_the_file_does_not_know_is_unknown(tmp_path):
+def test_read_photo_nodata_mask_and_alpha_are_unknown(tmp_path):
     values = bands()
-    values[0, :2] = 0  # no red alone is a colour
+    values[0, :2] = 0  # a pixel without red is still a colour
     hole = np.zeros((24, 40), bool)
     hole[10:14, 20:26] = True
     values[:, hole] = 0
@@ -101,7 +101,7 @@ def test_what_the_file_does_not_know_is_unknown(tmp_path):
         )
 
 
-def test_the_first_file_with_a_value_wins(tmp_path):
+def test_read_photo_overlapping_files_use_first_value(tmp_path):
     first, second = bands(seed=1), bands(seed=2)
     first[:, 4:9, 4:9] = 0
     a = write(tmp_path / "a.tif", first[:, :, :30], nodata=0)
@@ -128,17 +128,17 @@ def test_the_first_file_with_a_value_wins(tmp_path):
     ],
     ids=["grey", "infrared", "16 bits", "12 bits", "northward"],
 )
-def test_other_photos(tmp_path, values, more, want):
+def test_read_photo_other_bands_and_depths(tmp_path, values, more, want):
     photo = read_photo(source(write(tmp_path / "a.tif", values, **more)), GRID)
     np.testing.assert_array_equal(photo.colour, want(values))
 
 
-def test_ground_beyond_the_photo_is_unknown(tmp_path):
+def test_read_photo_area_outside_file_is_unknown(tmp_path):
     photo = read_photo(source(write(tmp_path / "a.tif", bands(), west=GRID.west + 10)), GRID)
     np.testing.assert_array_equal(photo.known, np.broadcast_to(np.arange(40) >= 20, (24, 40)))
 
 
-def test_files_that_cannot_be_used(tmp_path):
+def test_read_photo_unusable_file_fails(tmp_path):
     whole = write(tmp_path / "whole.tif", bands())
     torn = tmp_path / "torn.tif"
     torn.write_bytes(whole.read_bytes()[:900])
@@ -156,7 +156,7 @@ def degrees(path):
     return write(path, bands(), crs="EPSG:4326", transform=Affine(1e-5, 0, west, 0, -1e-5, north))
 
 
-def test_a_broken_file_costs_only_the_ground_it_alone_shows(tmp_path):
+def test_read_photo_broken_file_fails_only_where_needed(tmp_path):
     half = write(tmp_path / "half.tif", bands()[:, :, :20])
     gone = tmp_path / "gone.tif"
     west = Grid(UTM, GRID.west, GRID.north, 1.0, 10, 12)

@@ -24,7 +24,7 @@ def scene(seed=3):
 
 
 def moved(photo: Orthophoto, east_m: float, north_m: float) -> Orthophoto:
-    """What a camera saw, laid down elsewhere; unknown where that leaves nothing."""
+    """Return the photo shifted by whole pixels; pixels without content become unknown."""
     grid = photo.grid
     col, row = round(east_m / grid.cell), round(-north_m / grid.cell)
     known = np.roll(photo.known, (row, col), (0, 1))
@@ -37,21 +37,21 @@ def moved(photo: Orthophoto, east_m: float, north_m: float) -> Orthophoto:
 @pytest.mark.parametrize(
     ("by", "to_m"), [((0.0, 0.0), 0.2), ((2.0, -1.0), 0.2), ((2.0, -1.5), 0.5), ((-3.5, 4.0), 0.5)]
 )
-def test_a_made_shift_is_found_to_half_a_cell_and_so_is_the_sun(seed, by, to_m):
+def test_shift_and_sun_are_recovered(seed, by, to_m):
     data, photo = scene(seed)
-    found = shift([pair(data, moved(photo, *by))])
-    assert (found.east_m, found.north_m) == pytest.approx(by, abs=to_m)
-    assert found.sun == pytest.approx((SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG), abs=5)
-    assert found.confidence > 0.3
+    result = shift([pair(data, moved(photo, *by))])
+    assert (result.east_m, result.north_m) == pytest.approx(by, abs=to_m)
+    assert result.sun == pytest.approx((SUN_AZIMUTH_DEG, SUN_HEIGHT_DEG), abs=5)
+    assert result.confidence > 0.3
 
 
-def test_only_a_shift_is_noted():
+def test_note_only_for_shifted_photo():
     data, photo = scene()
     assert note(data, photo) is None
     assert note(data, moved(photo, 2.0, 0.0)).startswith("dop: seems to lie 2.0 m east")
 
 
-def test_a_photo_that_shows_nothing_tells_nothing():
+def test_note_photo_without_content_is_none():
     data, photo = scene()
     blank = replace(photo, colour=np.full_like(photo.colour, 90))
     assert note(data, blank) is None
@@ -60,15 +60,15 @@ def test_a_photo_that_shows_nothing_tells_nothing():
     assert note(data, replace(photo, colour=random)) is None
 
 
-def test_voids_and_a_halo_without_photo_do_not_move_it():
+def test_shift_ignores_voids_and_missing_photo():
     data, photo = scene()
     dsm, known = data.dsm.copy(), photo.known.copy()
     dsm[60:90, 20:50] = np.nan
     known[:, :60] = False
-    found = shift([pair(replace(data, dsm=dsm), moved(replace(photo, known=known), 2.0, -1.5))])
-    assert (found.east_m, found.north_m) == pytest.approx((2.0, -1.5), abs=0.5)
+    result = shift([pair(replace(data, dsm=dsm), moved(replace(photo, known=known), 2.0, -1.5))])
+    assert (result.east_m, result.north_m) == pytest.approx((2.0, -1.5), abs=0.5)
 
 
-def test_two_tiles_of_a_flight_agree_with_each():
+def test_shift_of_two_unshifted_tiles_is_small():
     pairs = [pair(*scene(seed)) for seed in (3, 4)]
     assert shift(pairs).length_m < 0.3

@@ -26,13 +26,13 @@ def tile(shape, cell=1.0, void=None, **layers) -> TileData:
     return TileData("t", grid, grid, heights, heights, **layers)
 
 
-def drawn(text):
+def parse_mask(text):
     return np.array([[letter == "#" for letter in line] for line in text.split()])
 
 
 @given(arrays.arrays(bool, st.tuples(st.integers(1, 10), st.integers(1, 10))), cells, widths)
 @settings(deadline=None, max_examples=60)
-def test_ground_stays_ground_where_a_disc_wider_than_the_gap_lies_in_it(mask, cell, width):
+def test_close_keeps_ground_that_holds_a_disc(mask, cell, width):
     n = int(width / cell + 1e-9) + 1
     rows, cols = np.indices((n, n)) - (n - 1) / 2
     disc = rows**2 + cols**2 <= (n / 2) ** 2
@@ -47,19 +47,19 @@ def test_ground_stays_ground_where_a_disc_wider_than_the_gap_lies_in_it(mask, ce
 
 @given(masks, cells, widths, areas)
 @settings(deadline=None)
-def test_every_step_adds_or_takes_and_does_so_once(mask, cell, width, area):
+def test_steps_are_monotonic_and_idempotent(mask, cell, width, area):
     for step, size in ((close, width), (fill, area)):
-        found = step(mask, cell, size)
-        assert (found | mask == found).all()
-        np.testing.assert_array_equal(step(found, cell, size), found)
-    found = drop(mask, cell, area)
-    assert (found & mask == found).all()
-    np.testing.assert_array_equal(drop(found, cell, area), found)
+        result = step(mask, cell, size)
+        assert (result | mask == result).all()
+        np.testing.assert_array_equal(step(result, cell, size), result)
+    result = drop(mask, cell, area)
+    assert (result & mask == result).all()
+    np.testing.assert_array_equal(drop(result, cell, area), result)
 
 
 @given(masks, cells, areas)
 @settings(deadline=None)
-def test_pieces_and_holes_are_weighed_as_scipy_labels_them(mask, cell, area):
+def test_drop_and_fill_match_scipy_labels(mask, cell, area):
     def small(cells, joined, limit):
         labels, count = ndimage.label(cells, joined)
         cut = {*labels[0], *labels[-1], *labels[:, 0], *labels[:, -1]}
@@ -73,7 +73,7 @@ def test_pieces_and_holes_are_weighed_as_scipy_labels_them(mask, cell, area):
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.5, 0.2])
-def test_sizes_are_metres_at_every_cell(cell):
+def test_sizes_do_not_depend_on_cell_size(cell):
     def metres(n):
         return round(n / cell)
 
@@ -81,7 +81,7 @@ def test_sizes_are_metres_at_every_cell(cell):
     road[:, metres(10) : metres(12)] = False  # a gap of 2 m
     road[:, metres(25) : metres(28)] = False  # one of 3 m
     closed = close(road, cell, 2.0)
-    # Where a gap leaves the grid, nothing says that it ends.
+    # A gap that leaves the grid is not closed at the grid's edge.
     inner = slice(metres(3), metres(-3))
     assert closed[inner, metres(10) : metres(12)].all()
     assert not closed[:, metres(25) : metres(28)].any()
@@ -94,13 +94,13 @@ def test_sizes_are_metres_at_every_cell(cell):
     np.testing.assert_array_equal(fill(~speck, cell, 11.5), ~speck)
 
 
-def test_what_the_edge_cuts_stays():
-    mask = drawn("#...## ....#. ..#..#")
+def test_pieces_at_grid_edge_are_kept():
+    mask = parse_mask("#...## ....#. ..#..#")
     np.testing.assert_array_equal(drop(mask, 1.0, 100), mask)
     np.testing.assert_array_equal(fill(~mask, 1.0, 100), ~mask)
 
 
-def test_a_road_in_fragments_counts_as_one():
+def test_clean_closes_gaps_before_dropping_pieces():
     mask = np.zeros((40, 60), bool)
     mask[18:22, 5:55] = True
     mask[:, 10::6] = False  # joints of one metre
@@ -110,28 +110,28 @@ def test_a_road_in_fragments_counts_as_one():
     assert whole[18:22, 6:54].all()
 
 
-def test_nothing_is_added_beyond_the_survey():
+def test_clean_adds_no_cells_beyond_survey():
     mask = np.ones((20, 20), bool)
     mask[:, 9:11] = False
     void = np.zeros_like(mask)
     void[:, 9] = True
-    found = clean(mask, tile(mask.shape, void=void), Cleanup(close_m=3))
-    np.testing.assert_array_equal(found[5:-5], ~void[5:-5])
+    result = clean(mask, tile(mask.shape, void=void), Cleanup(close_m=3))
+    np.testing.assert_array_equal(result[5:-5], ~void[5:-5])
 
 
 @given(masks)
 @settings(deadline=None)
-def test_nothing_asked_is_nothing_done(mask):
+def test_clean_without_steps_changes_nothing(mask):
     np.testing.assert_array_equal(clean(mask, tile(mask.shape), NOTHING), mask)
 
 
-def test_fusion_with_a_second_source():
+def test_clean_fuse_combines_with_second_source():
     mask, second = np.zeros((30, 30), bool), np.zeros((30, 30), bool)
     mask[10:20], second[:, 14] = True, True
     data = tile(mask.shape, cell=0.5, road_mask=second)
 
-    def fused(how, **more):
-        options = NOTHING.model_copy(update={"fuse": how, "fuse_with": "road_mask", **more})
+    def fused(fuse, **more):
+        options = NOTHING.model_copy(update={"fuse": fuse, "fuse_with": "road_mask", **more})
         return clean(mask, data, options)
 
     np.testing.assert_array_equal(fused("union"), mask | second)
@@ -143,7 +143,7 @@ def test_fusion_with_a_second_source():
 
 @given(masks, cells, st.sampled_from([0.0, 0.7, 1.0, 2.5]))
 @settings(deadline=None)
-def test_a_corridor_is_measured_between_cell_centres(mask, cell, reach):
+def test_within_measures_between_cell_centres(mask, cell, reach):
     if mask.any():
         distance = ndimage.distance_transform_edt(~mask) * cell
         np.testing.assert_array_equal(within(mask, cell, reach), distance <= reach + 1e-6)
@@ -151,13 +151,13 @@ def test_a_corridor_is_measured_between_cell_centres(mask, cell, reach):
         assert not within(mask, cell, reach).any()
 
 
-def test_a_second_source_that_is_missing_is_named():
+def test_clean_missing_second_source_fails():
     mask = np.ones((4, 4), bool)
     with pytest.raises(TaskError, match=r"union needs roads.*--roads"):
         clean(mask, tile(mask.shape), Cleanup(fuse="union"))
 
 
-def test_roads_of_the_catalog_are_such_a_source(tmp_path):
+def test_clean_fuse_accepts_roads_of_catalog(tmp_path):
     import geopandas
     from shapely.geometry import box
 
@@ -166,6 +166,6 @@ def test_roads_of_the_catalog_are_such_a_source(tmp_path):
     west, south, east, _ = data.grid.bounds
     path = tmp_path / "roads.gpkg"
     geopandas.GeoDataFrame(geometry=[box(west, south + 5, east, south + 9)], crs=data.grid.crs).to_file(path)
-    found = clean(mask, replace(data, roads=Source("roads", (path,))), Cleanup(fuse="union"))
-    np.testing.assert_array_equal(found[:, 0], [*[False] * 11, *[True] * 4, *[False] * 5])
-    assert (found == found[:, :1]).all()
+    result = clean(mask, replace(data, roads=Source("roads", (path,))), Cleanup(fuse="union"))
+    np.testing.assert_array_equal(result[:, 0], [*[False] * 11, *[True] * 4, *[False] * 5])
+    assert (result == result[:, :1]).all()

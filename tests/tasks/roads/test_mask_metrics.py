@@ -18,36 +18,36 @@ def grid(shape, cell=1.0):
 @st.composite
 def cases(draw):
     shape = draw(shapes)
-    found, truth, known = (draw(arrays.arrays(bool, shape)) for _ in range(3))
+    result, truth, known = (draw(arrays.arrays(bool, shape)) for _ in range(3))
     probability = draw(arrays.arrays(np.float32, shape, elements=st.integers(0, 100).map(lambda p: p / 100)))
-    return found, truth, known, probability
+    return result, truth, known, probability
 
 
 @given(cases())
 @settings(deadline=None)
-def test_figures_and_curve_are_those_of_scikit_learn(case):
-    found, truth, known, probability = case
-    quality = judge(found, probability, truth, known, grid(found.shape))
+def test_judge_figures_and_curve_match_scikit_learn(case):
+    result, truth, known, probability = case
+    quality = judge(result, probability, truth, known, grid(result.shape))
     for name, peer in (
         ("iou", jaccard_score),
         ("precision", precision_score),
         ("recall", recall_score),
         ("f1", f1_score),
     ):
-        # Where there is nothing to divide by they say 0 and we NaN.
-        expected = peer(truth[known], found[known], zero_division=0) if known.any() else 0
+        # For a division by 0 scikit-learn gives 0, FlexRoad NaN.
+        expected = peer(truth[known], result[known], zero_division=0) if known.any() else 0
         assert np.nan_to_num(getattr(quality, name)) == pytest.approx(expected), name
     thresholds, precision, recall = quality.curve()
     for i in (0, 37, 100):
         mask = probability >= thresholds[i] - 1e-6
-        there = judge(mask, None, truth, known, grid(found.shape))
-        assert precision[i] == pytest.approx(there.precision, nan_ok=True)
-        assert recall[i] == pytest.approx(there.recall, nan_ok=True)
+        at_threshold = judge(mask, None, truth, known, grid(result.shape))
+        assert precision[i] == pytest.approx(at_threshold.precision, nan_ok=True)
+        assert recall[i] == pytest.approx(at_threshold.recall, nan_ok=True)
 
 
 @given(cases(), cases())
 @settings(deadline=None)
-def test_tiles_add_up(a, b):
+def test_together_adds_counts_of_tiles(a, b):
     parts = [judge(f, p, t, k, grid(f.shape)) for f, t, k, p in (a, b)]
     whole = together(parts)
     assert whole.right == sum(part.right for part in parts)
@@ -56,7 +56,7 @@ def test_tiles_add_up(a, b):
 
 
 @pytest.mark.parametrize("cell", [1.0, 0.2])
-def test_a_road_found_aside_has_its_edges_off_by_that(cell):
+def test_judge_shifted_road_edge_distance_is_shift(cell):
     truth = np.zeros((40, 40), bool)
     truth[:, 10:18] = True
     known = np.ones_like(truth)
@@ -65,7 +65,7 @@ def test_a_road_found_aside_has_its_edges_off_by_that(cell):
     assert quality.edge_p95_m == pytest.approx(3 * cell)
 
 
-def test_where_nothing_is_known_is_no_edge():
+def test_edges_need_two_valid_cells():
     mask = np.zeros((4, 6), bool)
     mask[:, 3:] = True
     known = np.ones_like(mask)

@@ -1,4 +1,4 @@
-"""Which features are roads, how they are made areas, and how files are read."""
+"""Selection of road features, conversion to areas, and reading of vector files."""
 
 from pathlib import Path
 
@@ -21,11 +21,11 @@ WEST_EAST = LineString(on_grid((10, 50), (90, 50)))
 
 
 def area(*paths, **options):
-    """Area under all roads of the files (m2), near the tile."""
+    """Area of the union of all roads of the files near the tile (m2)."""
     return shapely.union_all(roads(tile(*paths).roads, GRID, Options(**options)).areas).area
 
 
-def test_a_line_is_as_wide_as_it_says_and_ends_where_it_ends(tmp_path):
+def test_line_is_buffered_to_its_width_with_flat_ends(tmp_path):
     path = write(tmp_path / "r.gpkg", [WEST_EAST], width=["24'"])
     assert area(path) == pytest.approx(80 * 7.3152)
     mask = rasterise_roads(tile(path))
@@ -36,30 +36,30 @@ def test_a_line_is_as_wide_as_it_says_and_ends_where_it_ends(tmp_path):
 
 @settings(max_examples=30, deadline=None)
 @given(turn=st.floats(-2.5, 2.5), wide=st.floats(2, 20), narrow=st.floats(2, 20))
-def test_where_lines_meet_no_wedge_is_left(tmp_path_factory, turn, wide, narrow):
-    """All within the narrower half width of the common end is road, and nothing beyond the round buffers."""
+def test_joined_lines_leave_no_wedge(tmp_path_factory, turn, wide, narrow):
+    """Everything within the narrower half width of the joint is road, nothing beyond the round buffers."""
     middle = (50.0, 50.0)
     far = (50 + 40 * np.cos(turn), 50 + 40 * np.sin(turn))
     lines = [LineString(on_grid((10, 50), middle)), LineString(on_grid(middle, far))]
     path = tmp_path_factory.mktemp("joint") / "r.geojson"
     write(path, lines, width_m=[wide, narrow])
-    found = shapely.union_all(roads(tile(path).roads, GRID, Options()).areas)
+    result = shapely.union_all(roads(tile(path).roads, GRID, Options()).areas)
     disc = Point(*on_grid(middle)[0]).buffer(min(wide, narrow) / 2, quad_segs=8)
-    assert disc.difference(found).area < 1e-6
+    assert disc.difference(result).area < 1e-6
     round_ended = shapely.union_all(shapely.buffer(lines, np.array([wide, narrow]) / 2, quad_segs=64))
-    assert found.difference(round_ended.buffer(0.01)).area < 1e-6
+    assert result.difference(round_ended.buffer(0.01)).area < 1e-6
 
 
-def test_a_ring_closes(tmp_path):
+def test_closed_line_has_no_gap(tmp_path):
     ring = LineString(on_grid((30, 30), (70, 30), (70, 70), (30, 70), (30, 30)))
-    found = shapely.union_all(
+    result = shapely.union_all(
         roads(tile(write(tmp_path / "r.gpkg", [ring], width=[6])).roads, GRID, Options()).areas
     )
-    assert found.contains(Point(*on_grid((28, 28))[0])) is True
-    assert len(found.interiors) == 1
+    assert result.contains(Point(*on_grid((28, 28))[0])) is True
+    assert len(result.interiors) == 1
 
 
-def test_areas_are_taken_as_they_are_and_collections_come_apart(tmp_path):
+def test_areas_and_collections_are_split_into_parts(tmp_path):
     shapes = [
         GeometryCollection([box(*on_grid((0, 0))[0], *on_grid((10, 10))[0]), MultiLineString([WEST_EAST])]),
         LineString(on_grid((60, 60), (80, 60), (80, 90), (60, 60))),
@@ -71,7 +71,7 @@ def test_areas_are_taken_as_they_are_and_collections_come_apart(tmp_path):
 
 
 def strips(tmp_path, column, values, **more):
-    """Lines 2 m wide, 10 m apart, one for each value; those that are road."""
+    """Write lines 2 m wide, 10 m apart, one for each value of a column."""
     lines = [LineString(on_grid((10, 5 + 10 * i), (90, 5 + 10 * i))) for i in range(len(values))]
     path = tmp_path / "r.gpkg"
     path.unlink(missing_ok=True)
@@ -84,7 +84,7 @@ def kept(mask, n):
 
 
 @pytest.mark.parametrize("column", ["highway", "class", "fclass", "HIGHWAY"])
-def test_ways_for_walkers_and_ways_to_come_are_out(tmp_path, column):
+def test_left_out_classes_are_not_road(tmp_path, column):
     classes = [
         "residential",
         "footway",
@@ -102,12 +102,12 @@ def test_ways_for_walkers_and_ways_to_come_are_out(tmp_path, column):
     assert kept(chosen, 9) == [True] * 8 + [False]
 
 
-def test_features_of_osm_without_highway_are_no_roads_others_need_no_class(tmp_path):
+def test_osm_features_need_highway_tag(tmp_path):
     assert kept(rasterise_roads(tile(strips(tmp_path, "highway", ["service", None]))), 2) == [True, False]
     assert kept(rasterise_roads(tile(strips(tmp_path, "class", ["lane", None]))), 2) == [True, True]
 
 
-def test_what_lies_under_something_is_out_unless_asked_for(tmp_path):
+def test_tunnels_are_left_out_unless_enabled(tmp_path):
     values = ["yes", "building_passage", "no", None, "culvert", "F", "T"]
     path = strips(tmp_path, "tunnel", values)
     assert kept(rasterise_roads(tile(path)), 7) == [False, False, True, True, False, True, False]
@@ -115,24 +115,24 @@ def test_what_lies_under_something_is_out_unless_asked_for(tmp_path):
     assert kept(rasterise_roads(tile(strips(tmp_path, "covered", ["yes", "no"]))), 2) == [False, True]
 
 
-def test_bridges_are_kept_and_flagged(tmp_path):
+def test_bridges_are_road_and_flagged(tmp_path):
     path = strips(tmp_path, "bridge", ["yes", "viaduct", "no", None, "1", "0"])
-    found = roads(tile(path).roads, GRID, Options())
-    deck = cells(found.areas[found.bridge], GRID)
+    result = roads(tile(path).roads, GRID, Options())
+    deck = cells(result.areas[result.bridge], GRID)
     assert kept(deck, 6) == [True, True, False, False, True, False]
-    assert kept(cells(found.areas, GRID), 6) == [True] * 6
+    assert kept(cells(result.areas, GRID), 6) == [True] * 6
 
 
-def test_a_joint_is_a_bridge_if_all_that_meet_there_are(tmp_path):
+def test_joint_of_bridges_only_is_bridge(tmp_path):
     lines = [LineString(on_grid((10 + 20 * i, 50), (30 + 20 * i, 50))) for i in range(3)]
     path = write(tmp_path / "r.gpkg", lines, width=[6] * 3, bridge=["no", "yes", "yes"])
-    found = roads(tile(path).roads, GRID, Options())
-    deck = shapely.union_all(found.areas[found.bridge])
+    result = roads(tile(path).roads, GRID, Options())
+    deck = shapely.union_all(result.areas[result.bridge])
     assert deck.bounds[0] - GRID.west == pytest.approx(30)
     assert deck.area == pytest.approx(40 * 6)
 
 
-def test_layer_and_condition_choose(tmp_path):
+def test_layer_and_where_select_features(tmp_path):
     path = strips(tmp_path, "class", ["lane", "yard"])
     write(path, [WEST_EAST], layer="more", width=[20])
     with pytest.raises(TaskError, match="has the layers r, more; name one with segment.layer"):
@@ -152,7 +152,7 @@ def degrees(*places):
 
 @pytest.fixture
 def osm(tmp_path):
-    """One way each of a road, tunnel, river, building and footway, and a square for cars."""
+    """Ways: road, bridge, tunnel, footway, river, building, and a service area as polygon."""
     return write_osm(
         tmp_path / "map.osm",
         {
@@ -167,32 +167,32 @@ def osm(tmp_path):
     )
 
 
-def test_osm_files_are_read_lines_and_areas(osm):
-    found = roads(tile(osm).roads, GRID, Options())
-    # 0.9996 is the scale of the UTM zone here; nodes are kept to 1e-7 degrees, a centimetre.
-    assert sorted(shapely.area(found.areas)) == pytest.approx([15 * 20, 80 * 7, 80 * 7], rel=0.01)
-    assert shapely.area(found.areas[found.bridge]).tolist() == pytest.approx([80 * 7], rel=0.01)
+def test_osm_file_gives_lines_and_areas(osm):
+    result = roads(tile(osm).roads, GRID, Options())
+    # The scale of the UTM zone is 0.9996 here; nodes are stored to 1e-7 degrees, about 1 cm.
+    assert sorted(shapely.area(result.areas)) == pytest.approx([15 * 20, 80 * 7, 80 * 7], rel=0.01)
+    assert shapely.area(result.areas[result.bridge]).tolist() == pytest.approx([80 * 7], rel=0.01)
     assert area(osm, layer="lines") == pytest.approx(2 * 80 * 7, rel=0.01)
     assert area(osm, where="highway = 'primary'", layer="lines") == pytest.approx(80 * 7, rel=0.01)
 
 
-def test_nodes_in_any_order_and_pbf():
-    """The sample that comes with pyogrio: its motorway runs in a tunnel below its streets."""
+def test_osm_pbf_with_unsorted_nodes_is_read():
+    """Uses the sample of pyogrio, whose motorway runs in a tunnel below the streets."""
     sample = Path(pyogrio.__file__).parent / "tests" / "fixtures" / "sample.osm.pbf"
     if not sample.exists():
-        pytest.skip("pyogrio came without its tests")
+        pytest.skip("pyogrio is installed without its test data")
     table = pyogrio.read_dataframe(
         sample, layer="lines", where="highway IS NOT NULL", USE_CUSTOM_INDEXING="NO"
     ).to_crs("EPSG:32630")
     grid = Grid.covering("EPSG:32630", tuple(table.total_bounds), 1.0)
-    found = shapely.union_all(roads(tile(sample).roads, grid, Options()).areas)
+    result = shapely.union_all(roads(tile(sample).roads, grid, Options()).areas)
     streets = table[table.highway == "residential"].geometry
     assert len(streets) == 20
-    assert all(found.buffer(0.01).covers(street) for street in streets)
+    assert all(result.buffer(0.01).covers(street) for street in streets)
     (motorway,) = table[table.highway == "motorway"].geometry
-    assert not found.covers(motorway)
-    with_it = shapely.union_all(roads(tile(sample).roads, grid, Options(tunnels=True)).areas)
-    assert with_it.buffer(0.01).covers(motorway)
+    assert not result.covers(motorway)
+    with_tunnels = shapely.union_all(roads(tile(sample).roads, grid, Options(tunnels=True)).areas)
+    assert with_tunnels.buffer(0.01).covers(motorway)
 
 
 # --- one index per file -------------------------------------------------------------------------------
@@ -200,16 +200,16 @@ def test_nodes_in_any_order_and_pbf():
 
 @pytest.fixture
 def readings(monkeypatch):
-    """Counts how often files are read."""
+    """A list that grows by one entry per read of a file."""
     count = []
     read = vectors._read
-    monkeypatch.setattr(vectors, "_read", lambda *given: count.append(1) or read(*given))
+    monkeypatch.setattr(vectors, "_read", lambda *args: count.append(1) or read(*args))
     return count
 
 
 @pytest.mark.parametrize("suffix", ["gpkg", "geojson"])
-def test_a_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
-    """Also where tiles lie in two of the squares that an indexed file is read by."""
+def test_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
+    """Also if the tiles lie in two of the squares in which an indexed file is read."""
     line = LineString([(399_000, 5_699_990), (401_000, 5_699_990)])
     crs = GRID.crs
     path = tmp_path / f"r.{suffix}"
@@ -223,16 +223,16 @@ def test_a_file_is_read_once_for_many_tiles(tmp_path, readings, suffix):
     assert 1 <= len(readings) <= squares
 
 
-def test_a_feature_in_two_squares_is_one(tmp_path):
+def test_feature_in_two_squares_is_returned_once(tmp_path):
     """Squares meet at 400 km east and 5 700 km north."""
     path = write(tmp_path / "r.gpkg", [LineString([(399_950, 5_699_950), (400_050, 5_700_050)])], width=[6])
     grid = Grid(GRID.crs, 399_900, 5_700_100, 1.0, 200, 200)
-    found = roads(tile(path).roads, grid, Options())
-    assert len(found.areas) == 1
-    assert found.areas[0].area == pytest.approx(6 * 100 * 2**0.5)
+    result = roads(tile(path).roads, grid, Options())
+    assert len(result.areas) == 1
+    assert result.areas[0].area == pytest.approx(6 * 100 * 2**0.5)
 
 
-def test_a_file_that_changed_is_read_anew(tmp_path):
+def test_changed_file_is_read_again(tmp_path):
     path = write(tmp_path / "r.geojson", [WEST_EAST], width=[6])
     assert area(path) == pytest.approx(480, rel=1e-3)
     write(path, [WEST_EAST, LineString(on_grid((10, 80), (90, 80)))], width=[10, 10])

@@ -29,36 +29,36 @@ from flexroad.tasks.roads.widths import Options, metres, widths
         ("6.", 6.0),
     ],
 )  # fmt: skip
-def test_widths_as_people_write_them(text, width):
+def test_metres_common_notations(text, width):
     assert metres(text) == pytest.approx(width, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     "text", ["", "wide", "3-4", "3;4", "-5", "~5", "5 km/h", "1e3", "6'7", "m", "5 6", "."]
 )
-def test_what_is_no_width(text):
+def test_metres_not_a_width_is_nan(text):
     assert math.isnan(metres(text))
 
 
 @given(
     st.floats(0.01, 99), st.sampled_from([("", 1), (" m", 1), ("cm", 0.01), ("ft", 0.3048), ("'", 0.3048)])
 )
-def test_any_number_in_any_unit(number, unit):
+def test_metres_any_number_and_unit(number, unit):
     assert metres(f"{number:.3f}{unit[0]}") == pytest.approx(round(number, 3) * unit[1])
 
 
 @given(st.integers(0, 99), st.integers(0, 11))
-def test_feet_and_inches_add_up(feet, inches):
+def test_metres_feet_and_inches_add_up(feet, inches):
     assert metres(f"{feet}'{inches}\"") == pytest.approx((12 * feet + inches) * 0.0254)
 
 
 @given(st.text())
-def test_no_text_breaks_it(text):
+def test_metres_any_text_gives_nan_or_positive(text):
     width = metres(text)
     assert math.isnan(width) or width >= 0
 
 
-def test_width_then_lanes_then_class_then_default():
+def test_widths_from_width_lanes_class_or_default():
     table = pandas.DataFrame(
         {
             "width": ["7.5", None, "0", "wide", None, "80", "0.5"],
@@ -68,24 +68,24 @@ def test_width_then_lanes_then_class_then_default():
     )
     classes = ["primary"] * 3 + ["service", "service", "service", "service"]
     options = Options(lane_width_m=3.0, shoulder_m=0.5, class_width_m={"service": 3.5})
-    found, notes = widths(table, classes, options)
-    assert found.tolist() == [7.5, 10.0, 7.0, 3.5, 4.5, 40.0, 2.0]
-    assert notes == ("1 widths of lines cannot be read ('wide'): lanes or class stand in",)
+    result, notes = widths(table, classes, options)
+    assert result.tolist() == [7.5, 10.0, 7.0, 3.5, 4.5, 40.0, 2.0]
+    assert notes == ("1 widths of lines cannot be read ('wide'): lanes or class are used instead",)
 
 
-def test_lines_nothing_is_known_of_are_told():
-    found, notes = widths(pandas.DataFrame(index=range(3)), ["residential", "", "aisle"], Options())
-    assert found.tolist() == [5.5, 6.0, 6.0]
-    assert notes == ("2 of 3 lines tell no width, lanes or known class: taken as 6 m wide",)
+def test_widths_lines_without_attributes_are_noted():
+    result, notes = widths(pandas.DataFrame(index=range(3)), ["residential", "", "aisle"], Options())
+    assert result.tolist() == [5.5, 6.0, 6.0]
+    assert notes == ("2 of 3 lines have no width, lanes or known class: taken as 6 m wide",)
 
 
-def test_bare_widths_may_be_feet():
+def test_widths_without_unit_may_be_feet():
     table = pandas.DataFrame({"surf_width": [24, 30], "width": ["7 m", "20"]})
-    found, _ = widths(table, ["", ""], Options(width_unit="ft", width_columns=("width", "SURF_WIDTH")))
-    assert found == pytest.approx([7.0, 6.096])
+    result, _ = widths(table, ["", ""], Options(width_unit="ft", width_columns=("width", "SURF_WIDTH")))
+    assert result == pytest.approx([7.0, 6.096])
 
 
-def test_own_class_widths_lie_over_the_table():
+def test_class_widths_replace_built_in_ones():
     options = Options(class_width_m={"service": 3.5})
     assert options.class_width_m["service"] == 3.5
     assert options.class_width_m["residential"] == Options().class_width_m["residential"]
