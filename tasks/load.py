@@ -1,7 +1,7 @@
 """Step A of the paper, geospatial data acquisition: the rasters R^DSM and R^DTM of one tile on one lattice.
 
-All later stages get heights in metres (float64), row 0 in the north and NaN where there is no value,
-whatever the files' extent, lattice, unit and nodata value.
+Files may differ in extent, lattice, unit and nodata value. The result has heights in metres (float64), row 0
+in the north and NaN where there is no value.
 """
 
 from __future__ import annotations

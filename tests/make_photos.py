@@ -20,7 +20,7 @@ FLYING_M = 40.0
 
 
 @dataclass(frozen=True)
-class Made:
+class Photograph:
     """One photograph."""
 
     path: Path
@@ -54,7 +54,7 @@ def texture():
 def photographs(folder, **tags):
     """Write two strips of four nadir photographs with small rotations; return them."""
     rng = np.random.default_rng(5)
-    colours, made = texture(), []
+    colours, photos = texture(), []
     for number in range(8):
         strip, along = divmod(number, 4)
         offset = np.array([28 + 14 * strip, 21 + 9.5 * along]) + rng.uniform(-0.5, 0.5, 2)
@@ -63,8 +63,8 @@ def photographs(folder, **tags):
         path = folder / f"DJI_{number:04}.JPG"
         image = render(centre, rotation, colours)
         Image.fromarray(image).save(path, quality=95, exif=exif(centre, **tags))
-        made.append(Made(path, centre, rotation))
-    return made
+        photos.append(Photograph(path, centre, rotation))
+    return photos
 
 
 def render(centre, rotation, colours):

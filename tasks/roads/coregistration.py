@@ -84,7 +84,7 @@ class Pair:
     """Cell size (m)."""
     height: Floats
     """DSM, ``(H, W)``, m; voids are filled."""
-    known: Bools
+    valid: Bools
     """Cells with a DSM height, ``(H, W)``."""
     always: Singles
     """Layers that do not depend on the sun at the compared cells, ``(2, n)``: height above ground, and
@@ -117,16 +117,16 @@ def pair(data: TileData, photo: Orthophoto) -> Pair:
     """Return a tile's heights and photo prepared for comparison; the photo must cover the tile's grid."""
     grid = _working(data.grid)
     height, ground = (_onto(values, data.grid, grid) for values in (data.dsm, data.dtm))
-    known = np.isfinite(height)
-    height = np.where(known, height, ground)
+    valid = np.isfinite(height)
+    height = np.where(valid, height, ground)
     height = np.where(np.isfinite(height), height, np.nanmin(height, initial=9e9))
     above = np.nan_to_num(height - ground)
     rough = scipy.ndimage.uniform_filter(np.abs(height - scipy.ndimage.median_filter(height, 5)), 5)
     high = np.clip((above - 0.5) / 2, 0, 1)
     n = _reach(grid.cell)
-    always = [_expected(values, known, grid.cell) for values in (high, high * np.clip(2 * rough, 0, 1))]
+    always = [_expected(values, valid, grid.cell) for values in (high, high * np.clip(2 * rough, 0, 1))]
     targets = [_shifted(_detail(values, grid.cell), n) for values in _targets(photo, grid)]
-    return Pair(grid.cell, height, known, np.stack(always), np.stack(targets))
+    return Pair(grid.cell, height, valid, np.stack(always), np.stack(targets))
 
 
 def shift(pairs: Sequence[Pair], sun: Sun | None = None) -> Shift:
@@ -169,7 +169,7 @@ def _best(pairs: Sequence[Pair], suns: Sequence[Sun]) -> tuple[Sun, Floats]:
 
 def _explained(pair: Pair, suns: Sequence[Sun]) -> Floats:
     """Return the explained shares of the variances of brightness and greenness, ``(suns, shifts)``."""
-    light = [_expected(v, pair.known, pair.cell) for sun in suns for v in _light(pair.height, pair.cell, sun)]
+    light = [_expected(v, pair.valid, pair.cell) for sun in suns for v in _light(pair.height, pair.cell, sun)]
     expected = np.stack([*pair.always, *light])
     gram = (expected @ expected.T).astype(np.float64)
     products = [(target @ expected.T).astype(np.float64) for target in pair.photo]
@@ -255,16 +255,16 @@ def _targets(photo: Orthophoto, grid: Grid) -> tuple[Floats, Floats]:
 
 def _detail(values: Floats, cell: float) -> Floats:
     """Return the values minus their smooth part, ``(H, W)``; 0 where unknown."""
-    known = np.isfinite(values)
-    weight = scipy.ndimage.gaussian_filter(known.astype(float), DETAIL_M / cell)
-    smooth = scipy.ndimage.gaussian_filter(np.where(known, values, 0.0), DETAIL_M / cell)
-    return np.where(known, values - smooth / np.maximum(weight, 1e-9), 0.0)
+    valid = np.isfinite(values)
+    weight = scipy.ndimage.gaussian_filter(valid.astype(float), DETAIL_M / cell)
+    smooth = scipy.ndimage.gaussian_filter(np.where(valid, values, 0.0), DETAIL_M / cell)
+    return np.where(valid, values - smooth / np.maximum(weight, 1e-9), 0.0)
 
 
-def _expected(values: Floats, known: Bools, cell: float) -> Singles:
+def _expected(values: Floats, valid: Bools, cell: float) -> Singles:
     """Return the detail of a layer at the compared cells, ``(n,)``: those inside the grid for every shift."""
     n = _reach(cell)
-    inner = np.where(known, _detail(values, cell), 0.0)[n:-n, n:-n].ravel()[::STRIDE]
+    inner = np.where(valid, _detail(values, cell), 0.0)[n:-n, n:-n].ravel()[::STRIDE]
     expected: Singles = (inner - inner.mean()).astype(np.float32)
     return expected
 

@@ -67,7 +67,7 @@ def without_invalid_dtm(data: TileData, clusters: RoadClusters) -> TileData:
     return replace(data, dtm=np.where(clusters.dtm_invalid, np.nan, data.dtm))
 
 
-def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floats, Floats]:
+def extrapolated_plane(heights: Floats, valid: Bools, cell: float) -> tuple[Floats, Floats]:
     """Return height and scatter (m) of the plane through the given cells around each cell, ``(H, W)`` each.
 
     Moving least squares with Gaussian weights; NaN where there is no given cell within `REACH_M`, or all of
@@ -77,17 +77,17 @@ def extrapolated_plane(heights: Floats, known: Bools, cell: float) -> tuple[Floa
     ----------
     heights : (H, W) array
         Heights (m).
-    known : (H, W) array of bool
+    valid : (H, W) array of bool
         Cells whose heights are used; at least one.
     cell : float
         Size of a cell (m).
     """
-    datum = float(heights[known].mean())
-    z = np.where(known, heights - datum, 0.0)
-    total = _moment(known.astype(np.float64), cell, 0, 0)
+    datum = float(heights[valid].mean())
+    z = np.where(valid, heights - datum, 0.0)
+    total = _moment(valid.astype(np.float64), cell, 0, 0)
     orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     with np.errstate(invalid="ignore", divide="ignore"):
-        r, c, rr, rc, cc = (_moment(known.astype(np.float64), cell, *order) / total for order in orders)
+        r, c, rr, rc, cc = (_moment(valid.astype(np.float64), cell, *order) / total for order in orders)
         m, mr, mc = (_moment(z, cell, *order) / total for order in ((0, 0), (1, 0), (0, 1)))
         # Central moments give two equations for the slopes, then the height at offset 0.
         rr, rc, cc = rr - r * r, rc - r * c, cc - c * c

@@ -16,7 +16,7 @@ CORNERS = {"295500_5629250": (295500, 5629270), "295750_5629250": (295750, 56292
 TWO = {"dsm": "{stratum}/{tile}/dsm.tif", "dtm": "{stratum}/{tile}/dtm_*.tif"}
 
 
-def made(root, layers=("dsm.tif", "dtm_2020.tif"), stratum="urban", crs=UTM):
+def write_tiles(root, layers=("dsm.tif", "dtm_2020.tif"), stratum="urban", crs=UTM):
     for tile, (west, north) in CORNERS.items():
         for name in layers:
             write(root / stratum / tile / name, FLAT, west, north, crs=crs)
@@ -24,7 +24,7 @@ def made(root, layers=("dsm.tif", "dtm_2020.tif"), stratum="urban", crs=UTM):
 
 
 def test_read_templates_give_id_layers_and_stratum(tmp_path):
-    made(tmp_path)
+    write_tiles(tmp_path)
     write(tmp_path / "rural" / "one" / "dsm.tif", FLAT, 1000, 2000)
     result = read(tmp_path, Layout(TWO), dataset="mine", date=datetime(2020, 5, 1))
     assert [(tile.id, tile.stratum, tile.dataset) for tile in result.tiles] == [
@@ -54,8 +54,8 @@ def test_read_any_id_is_kept(tmp_path_factory, tile, template):
 
 
 def test_read_layout_sets_road_values_and_missing_crs(tmp_path):
-    made(tmp_path, ("dsm.tif", "dtm_1.tif"))
-    made(tmp_path, ("road.tif",), crs=None)
+    write_tiles(tmp_path, ("dsm.tif", "dtm_1.tif"))
+    write_tiles(tmp_path, ("road.tif",), crs=None)
     layout = Layout.of({"layers": TWO | {"road_mask": "*/{tile}/road.tif"}, "road_values": [2], "crs": UTM})
     layers = {layer.name: layer for layer in read(tmp_path, layout, dataset="").tiles[0].layers}
     assert (layers["road_mask"].values, layers["road_mask"].crs) == ((2,), UTM)
@@ -87,7 +87,7 @@ def test_read_folder_not_matching_layout_raises_error(tmp_path):
         read(tmp_path / "nowhere", Layout(TWO), dataset="")
     with pytest.raises(CatalogError, match=r"no usable file matches '\{stratum\}.*the folder is empty"):
         read(tmp_path, Layout(TWO), dataset="")
-    made(tmp_path)
+    write_tiles(tmp_path)
     with pytest.raises(CatalogError, match="there are urban/.*dsm.tif.*--layout"):
         read(tmp_path, Layout(TWO | {"dsm": "{tile}.tif"}), dataset="")
     with pytest.raises(CatalogError, match="is not a path below"):
@@ -98,13 +98,13 @@ def test_read_folder_not_matching_layout_raises_error(tmp_path):
 
 
 def test_read_crs_in_feet_raises_error(tmp_path):
-    made(tmp_path, crs="EPSG:2994")
+    write_tiles(tmp_path, crs="EPSG:2994")
     with pytest.raises(CatalogError, match="whose unit is feet; reproject"):
         read(tmp_path, Layout(TWO), dataset="")
 
 
 def test_gerod_tile_not_at_its_id_is_noted(tmp_path):
-    made(tmp_path)
+    write_tiles(tmp_path)
     result = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
     assert {tile.dataset for tile in result.tiles} == {"GeRoD"}
     assert result.notes == ("2 of the dataset's 240 tiles are here",)
@@ -114,7 +114,7 @@ def test_gerod_tile_not_at_its_id_is_noted(tmp_path):
 
 
 def test_dsc3d_missing_reference_is_noted(tmp_path):
-    made(tmp_path, ("dsm.tif", "dtm_1.tif", "truth.tif"), stratum="a")
+    write_tiles(tmp_path, ("dsm.tif", "dtm_1.tif", "truth.tif"), stratum="a")
     date = datetime(2023, 1, 1)
     whole = dsc3d.index(tmp_path, {"layers": TWO | {"reference": "a/{tile}/truth.tif"}}, date=date)
     assert whole.notes == ()

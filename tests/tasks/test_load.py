@@ -114,8 +114,8 @@ def test_load_halo_reads_neighbouring_files(tmp_path):
     whole = relief(40, 40)
     for name, cols in {"a": slice(0, 20), "b": slice(20, 40)}.items():
         write(tmp_path / f"{name}.tif", whole[:, cols], GRID.west + cols.start, GRID.north)
-    made = tile(tmp_path, dsm=("a.tif", "b.tif"), dtm=("a.tif", "b.tif"))
-    data = load(made, Options(halo_m=7))
+    tile_with_files = tile(tmp_path, dsm=("a.tif", "b.tif"), dtm=("a.tif", "b.tif"))
+    data = load(tile_with_files, Options(halo_m=7))
     assert (data.grid, data.core) == (GRID.buffered(7), GRID)
     np.testing.assert_array_equal(data.dsm[data.grid.window(data.core)], whole[:20, :20])
     np.testing.assert_array_equal(data.dsm[7:, 7:], whole[:27, :27])
@@ -336,8 +336,8 @@ def test_load_layer_in_other_crs_fails(tmp_path, dtm):
 def test_load_file_in_other_crs_outside_tile_is_ignored(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     write(tmp_path / "far.tif", relief(), **NORTH, crs="EPSG:25833")
-    made = tile(tmp_path, dtm=("far.tif", "dtm.tif"))
-    np.testing.assert_array_equal(load(made, Options()).dtm, relief(seed=9))
+    tile_with_files = tile(tmp_path, dtm=("far.tif", "dtm.tif"))
+    np.testing.assert_array_equal(load(tile_with_files, Options()).dtm, relief(seed=9))
 
 
 def test_load_file_without_crs_fails(tmp_path, dtm):

@@ -177,16 +177,16 @@ def test_index_bridge_points_extend_reference(tmp_path):
     result = index(root, derived=derived)
     assert result.notes == ()
     (tile,) = result.tiles
-    made = derived / "3dm_32_356_5699_1_nw_bridges.tif"
-    assert tile.layer("bridges").files == (str(made),)
+    raster = derived / "3dm_32_356_5699_1_nw_bridges.tif"
+    assert tile.layer("bridges").files == (str(raster),)
     data = load(tile, Options())
     truth = dgm.astype(np.float64)
     truth[5, 10], truth[8, 30] = 200.5, 203.0
     assert np.allclose(data.reference, truth, atol=1e-5)
     assert np.array_equal(data.dtm, dgm)
-    before = made.stat().st_mtime_ns
+    before = raster.stat().st_mtime_ns
     index(root, derived=derived)
-    assert made.stat().st_mtime_ns == before
+    assert raster.stat().st_mtime_ns == before
 
 
 def test_index_cloud_without_bridges_or_broken_keeps_tile(tmp_path):
