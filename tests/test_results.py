@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.reproduce.evidence import FILE, KEPT, read_evidence, write_evidence
+from flexroad.pipeline.reproduce.metrics_data import FILE, KEPT, read_metrics_data, write_metrics_data
 from flexroad.pipeline.reproduce.tables import pages
 
 ROOT = Path(__file__).parent.parent
@@ -19,7 +19,7 @@ QUOTED = re.compile(r"<!-- results -->(.*?)<!-- /results -->", flags=re.DOTALL)
 
 def stale(folder: Path) -> list[str]:
     """Return the pages that are not what the folder's figures give."""
-    made = pages(read_evidence(folder))
+    made = pages(read_metrics_data(folder))
     return [name for name, text in made.items() if (folder / name).read_text() != text]
 
 
@@ -49,7 +49,7 @@ def published(tmp_path):
     """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
     import pandas as pd
 
-    from flexroad.pipeline.reproduce.evidence import Evidence
+    from flexroad.pipeline.reproduce.metrics_data import MetricsData
     from flexroad.pipeline.reproduce.published import TABLE_I
 
     rows = [
@@ -58,9 +58,9 @@ def published(tmp_path):
         for row in TABLE_I
     ]
     keys = ["dataset", "classes", "tile_id", "stratum", "variant"]
-    evidence = Evidence(pd.DataFrame(rows, columns=[*keys, *FIGURES]).astype(dict.fromkeys(FIGURES, KEPT)))
-    write_evidence(evidence, tmp_path)
-    for name, text in pages(evidence).items():
+    data = MetricsData(pd.DataFrame(rows, columns=[*keys, *FIGURES]).astype(dict.fromkeys(FIGURES, KEPT)))
+    write_metrics_data(data, tmp_path)
+    for name, text in pages(data).items():
         (tmp_path / name).write_text(text)
     return tmp_path
 
@@ -73,9 +73,9 @@ def test_a_page_out_of_date_is_noticed(published):
 
 
 def test_figures_out_of_date_are_noticed(published):
-    evidence = read_evidence(published)
-    evidence.rows.loc[0, "l2_road_m"] += 0.01
-    write_evidence(evidence, published)
+    data = read_metrics_data(published)
+    data.rows.loc[0, "l2_road_m"] += 0.01
+    write_metrics_data(data, published)
     assert "tables.md" in stale(published)
 
 

@@ -22,7 +22,7 @@ from flexroad.pipeline.reproduce.claims import (
     percent,
 )
 from flexroad.pipeline.reproduce.dsc3d import of_dsc3d
-from flexroad.pipeline.reproduce.evidence import Evidence
+from flexroad.pipeline.reproduce.metrics_data import MetricsData
 from flexroad.pipeline.reproduce.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
 from flexroad.pipeline.reproduce.sections import Section, beside, numbers, short, shown, verdicts_table
 
@@ -44,7 +44,7 @@ class Comparison:
     """Every claim with its verdict; those about DSC3D once for each reference."""
 
 
-def compare(evidence: Evidence) -> Comparison:
+def compare(data: MetricsData) -> Comparison:
     """Lay the figures of a run beside the paper's.
 
     Raises
@@ -52,10 +52,10 @@ def compare(evidence: Evidence) -> Comparison:
     ConfigError
         If there is nothing to compare FlexRoad with.
     """
-    paper = DSC3D if evidence.dataset == DSC3D else GEROD
+    paper = DSC3D if data.dataset == DSC3D else GEROD
     tables = {"Table I": TABLE_I_DSC3D} if paper == DSC3D else {"Table I": TABLE_I, "Table II": TABLE_II}
-    means = {classes: bootstrap(evidence.part(classes)) for classes in evidence.classes}
-    head = means[evidence.classes[0]]
+    means = {classes: bootstrap(data.part(classes)) for classes in data.classes}
+    head = means[data.classes[0]]
     tables = {
         name: tuple(row for row in rows if row.variant in head.variants) for name, rows in tables.items()
     }
@@ -63,9 +63,9 @@ def compare(evidence: Evidence) -> Comparison:
     tables = {name: rows for name, rows in tables.items() if {row.variant for row in rows} - {BASE}}
     if not tables:
         raise ConfigError("the run has none of the variants FlexRoad is compared with; use --config ablation")
-    other = of_dsc3d(evidence.dsc3d)
+    other = of_dsc3d(data.dsc3d)
     # Claims about DSC3D have a table of their own where there is something to test them on.
-    asked = [claim for claim in CLAIMS if claim.dataset == paper or not evidence.dsc3d]
+    asked = [claim for claim in CLAIMS if claim.dataset == paper or not data.dsc3d]
     verdicts = {classes: [check(claim, made, paper) for claim in asked] for classes, made in means.items()}
     claims = verdicts_table({MASKS[classes]: found for classes, found in verdicts.items()})
     sections = [
@@ -74,25 +74,25 @@ def compare(evidence: Evidence) -> Comparison:
         Section("What the paper claims", claims),
         *other.sections,
         *_other_masks(_union(tables), means),
-        *_per_stratum(_union(tables), evidence),
+        *_per_stratum(_union(tables), data),
     ]
     found = [
-        numbers(name, rows, classes, made, evidence.dataset)
+        numbers(name, rows, classes, made, data.dataset)
         for classes, made in means.items()
         for name, rows in tables.items()
     ]
     return Comparison(
-        evidence.line,
-        (*_notes(evidence, paper, verdicts[evidence.classes[0]]), *other.notes),
+        data.line,
+        (*_notes(data, paper, verdicts[data.classes[0]]), *other.notes),
         tuple(sections),
         pd.concat([*found, *other.numbers], ignore_index=True),
-        pd.concat([claims.assign(data=evidence.dataset), *other.claims], ignore_index=True),
+        pd.concat([claims.assign(data=data.dataset), *other.claims], ignore_index=True),
     )
 
 
-def _notes(evidence: Evidence, paper: str, verdicts: list[Verdict]) -> Iterator[str]:
-    classes = evidence.classes[0]
-    if evidence.dataset != paper:
+def _notes(data: MetricsData, paper: str, verdicts: list[Verdict]) -> Iterator[str]:
+    classes = data.classes[0]
+    if data.dataset != paper:
         yield (
             f"The paper's figures are on {paper}, ours are not: orders and ratios can be compared, metres "
             "and degrees only as far as the data are alike."
@@ -142,9 +142,9 @@ def _other_masks(rows: tuple[Row, ...], means: dict[str, Means]) -> Iterator[Sec
     yield Section("Ours by the segmented and by the true mask", table)
 
 
-def _per_stratum(rows: tuple[Row, ...], evidence: Evidence) -> Iterator[Section]:
-    part = evidence.part(evidence.classes[0])
-    strata = evidence.tiles.stratum
+def _per_stratum(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
+    part = data.part(data.classes[0])
+    strata = data.tiles.stratum
     for stratum in sorted(set(strata) - {""}):
         chosen = part[part.index.get_level_values("tile_id").isin(strata.index[strata == stratum])]
         if chosen.empty:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from flexroad.pipeline.reproduce.bootstrap import bootstrap
 from flexroad.pipeline.reproduce.claims import CLAIMS, check
-from flexroad.pipeline.reproduce.evidence import Evidence
+from flexroad.pipeline.reproduce.metrics_data import MetricsData
 from flexroad.pipeline.reproduce.published import DSC3D, TABLE_I_DSC3D
 from flexroad.pipeline.reproduce.sections import Section, beside, numbers, verdicts_table
 
@@ -30,7 +30,7 @@ class Beside:
     """By reference; their first is the one that counts."""
 
 
-def of_dsc3d(runs: tuple[Evidence, ...]) -> Beside:
+def of_dsc3d(runs: tuple[MetricsData, ...]) -> Beside:
     """Return sections, notes, numbers and claims of the runs for DSC3D; nothing without any."""
     if not runs:
         return Beside((), (), (), ())
@@ -58,7 +58,7 @@ def of_dsc3d(runs: tuple[Evidence, ...]) -> Beside:
     )
 
 
-def _standing_in(run: Evidence) -> str:
+def _standing_in(run: MetricsData) -> str:
     """Return what a title has to add if the data is not DSC3D."""
     if run.dataset == DSC3D:
         return ""
@@ -69,13 +69,13 @@ def _ours(called: str) -> str:
     return f"ours ({called})" if called else "ours"
 
 
-def _line(runs: Mapping[str, Evidence]) -> str:
+def _line(runs: Mapping[str, MetricsData]) -> str:
     return " ".join(
         f"{called.capitalize()}: {run.line}" if called else run.line for called, run in runs.items()
     )
 
 
-def _notes(runs: tuple[Evidence, ...]) -> tuple[str, ...]:
+def _notes(runs: tuple[MetricsData, ...]) -> tuple[str, ...]:
     if runs[0].dataset == DSC3D:
         return ()
     truth = " The figures by the truth stand beside them." if len(runs) > 1 else ""

@@ -10,7 +10,7 @@ from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.pages import are_numbers, markdown, template
 from flexroad.pipeline.reproduce.comparison import Comparison, compare
-from flexroad.pipeline.reproduce.evidence import Evidence, collect, write_evidence
+from flexroad.pipeline.reproduce.metrics_data import MetricsData, collect, write_metrics_data
 from flexroad.pipeline.run.record import Run
 
 TITLE = "The paper's tables, and ours"
@@ -52,11 +52,11 @@ def write_comparison(
         If a run has no figures, mixes data or is about other tiles than the other, or the folder cannot be
         written.
     """
-    evidence = collect(run, true, dsc3d, dsc3d_true)
-    made = pages(evidence)
+    data = collect(run, true, dsc3d, dsc3d_true)
+    made = pages(data)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_evidence(evidence, folder)
+        write_metrics_data(data, folder)
         for name, text in made.items():
             write(folder / name, text.encode())
     except OSError as error:
@@ -64,9 +64,9 @@ def write_comparison(
     return tuple(folder / name for name in made)
 
 
-def pages(evidence: Evidence) -> dict[str, str]:
+def pages(data: MetricsData) -> dict[str, str]:
     """Return the pages by file name; equal figures give equal pages."""
-    found = compare(evidence)
+    found = compare(data)
     return {
         "tables.md": markdown_page(found),
         "tables.tex": latex_page(found),

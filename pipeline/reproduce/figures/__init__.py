@@ -7,16 +7,18 @@ from pathlib import Path
 from matplotlib import rc_context
 
 from flexroad.catalog.storage.paths import write
-from flexroad.pipeline.reproduce.evidence import collect
 from flexroad.pipeline.reproduce.figures import dataset, maps, profile, renders, trade_off
-from flexroad.pipeline.reproduce.figures.cast import Cast, cast_of
-from flexroad.pipeline.reproduce.figures.plate import STYLE, Plate, save
-from flexroad.pipeline.reproduce.figures.view import TileView, typical_tile, view_tile
+from flexroad.pipeline.reproduce.figures.layout import STYLE, FigureFile, save
+from flexroad.pipeline.reproduce.figures.roles import Roles, roles_of
+from flexroad.pipeline.reproduce.figures.tile_view import TileView, read_tile_view, typical_tile
+from flexroad.pipeline.reproduce.metrics_data import collect
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.tables import read_metrics
 
 
-def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast | None = None) -> list[str]:
+def write_figures(
+    run: Run, folder: Path, tile_id: str | None = None, roles: Roles | None = None
+) -> list[str]:
     """Draw every figure the run has the variants for, and ``figures.md`` with their captions.
 
     Parameters
@@ -27,7 +29,7 @@ def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast
         Where NAME.pdf, NAME.png and figures.md are written.
     tile_id : str, optional
         The tile of the maps, renders and profile; by default the one of median road L2.
-    cast : Cast, optional
+    roles : Roles, optional
         Which variant plays which part; by default as its options tell.
 
     Returns
@@ -43,34 +45,36 @@ def write_figures(run: Run, folder: Path, tile_id: str | None = None, cast: Cast
     CatalogError
         If the tile is unknown.
     """
-    cast = cast or cast_of(run.config)
-    evidence = collect(run)
+    roles = roles or roles_of(run.config)
+    data = collect(run)
     rows = read_metrics(run.path)
     # The tiles of the tables: those with every variant.
-    done = rows[rows.tile_id.isin(evidence.tiles.index[evidence.tiles.complete])]
+    done = rows[rows.tile_id.isin(data.tiles.index[data.tiles.complete])]
     with rc_context(STYLE):
-        plates = _plates(run, cast, view_tile(run, tile_id or typical_tile(done, cast.full), cast), done)
-        missing = [f"no figure {plate.name}: {plate.missing}" for plate in plates if plate.figure is None]
-        for plate in plates:
-            if plate.figure is not None:
-                save(plate.figure, folder, plate.name)
-    write(folder / "figures.md", _page(evidence.line, plates).encode())
+        files = _figure_files(
+            run, roles, read_tile_view(run, tile_id or typical_tile(done, roles.full), roles), done
+        )
+        missing = [f"no figure {file.name}: {file.missing}" for file in files if file.figure is None]
+        for file in files:
+            if file.figure is not None:
+                save(file.figure, folder, file.name)
+    write(folder / "figures.md", _page(data.line, files).encode())
     return missing
 
 
-def _plates(run: Run, cast: Cast, view: TileView, done: dataset.Table) -> list[Plate]:
+def _figure_files(run: Run, roles: Roles, view: TileView, done: dataset.Table) -> list[FigureFile]:
     return [
-        profile.plate(view, cast),
-        maps.plate(view, cast),
-        renders.plate(view, cast),
-        trade_off.plate(run.config, cast.full, done),
-        dataset.plate(dataset.statistics(run, cast.full, done)),
+        profile.make_figure(view, roles),
+        maps.make_figure(view, roles),
+        renders.make_figure(view, roles),
+        trade_off.make_figure(run.config, roles.full, done),
+        dataset.make_figure(dataset.statistics(run, roles.full, done)),
     ]
 
 
-def _page(data: str, plates: list[Plate]) -> str:
+def _page(data: str, files: list[FigureFile]) -> str:
     parts = [data, "# Figures"]
-    for plate in plates:
-        drawn = f"![{plate.name}]({plate.name}.png)\n\n{plate.caption}"
-        parts.append(drawn if plate.figure is not None else f"No figure `{plate.name}`: {plate.missing}")
+    for file in files:
+        drawn = f"![{file.name}]({file.name}.png)\n\n{file.caption}"
+        parts.append(drawn if file.figure is not None else f"No figure `{file.name}`: {file.missing}")
     return "\n\n".join(parts) + "\n"

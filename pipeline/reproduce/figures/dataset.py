@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.reproduce.figures.plate import PATH, STRATA, Plate, new_figure
+from flexroad.pipeline.reproduce.figures.layout import PATH, STRATA, FigureFile, new_figure
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -49,14 +49,14 @@ def statistics(run: Run, full: str, done: Table) -> Table:
     return table.reset_index(drop=True)
 
 
-def plate(table: Table) -> Plate:
+def make_figure(table: Table) -> FigureFile:
     """Draw how many tiles each stratum has, and how road share and height range are distributed."""
     caption = (
         f"The {len(table)} tiles: their strata, share of road by the mask of the evaluation, and range of "
         "heights in the DSM, houses and trees included. Dashed: the means, "
         f"{table.road_percent.mean():.1f}% and {table.height_range_m.mean():.1f} m."
     )
-    return Plate(NAME, caption, draw(table))
+    return FigureFile(NAME, caption, draw(table))
 
 
 def draw(table: Table) -> Figure:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.reproduce.figures.cast import Cast
-from flexroad.pipeline.reproduce.figures.plate import Plate, new_figure
+from flexroad.pipeline.reproduce.figures.layout import FigureFile, new_figure
+from flexroad.pipeline.reproduce.figures.roles import Roles
 from flexroad.pipeline.reproduce.figures.scales import (
     ANGLE_COLOURS,
     ANGLE_NORM,
@@ -18,22 +18,22 @@ from flexroad.pipeline.reproduce.figures.scales import (
     ERROR_NORM,
     drawable,
 )
-from flexroad.pipeline.reproduce.figures.view import Result, TileView, absent
+from flexroad.pipeline.reproduce.figures.tile_view import Result, TileView, missing_roles
 
 NAME = "error_and_smoothness"
 
 
-def plate(view: TileView, cast: Cast) -> Plate:
+def make_figure(view: TileView, roles: Roles) -> FigureFile:
     """Draw the vertical error per cell over the mean angle per face of the three methods."""
-    parts = (("Plane", cast.plane), ("RGT", cast.rgt), ("FlexRoad", cast.full))
-    missing = absent(parts)
+    parts = (("Plane", roles.plane), ("RGT", roles.rgt), ("FlexRoad", roles.full))
+    missing = missing_roles(parts)
     caption = (
         f"{view}: vertical distance to {view.against} per cell (top) and mean angle of each face to its "
         "neighbours (bottom) for Plane, RGT and FlexRoad. Both scales are logarithmic; values beyond their "
         "ends have the end's colour. Above each map the tile's means, as in the run's table."
     )
     columns = {label: variant for label, variant in parts if variant is not None}
-    return Plate(NAME, caption, None if missing else draw(view, columns), missing)
+    return FigureFile(NAME, caption, None if missing else draw(view, columns), missing)
 
 
 def draw(view: TileView, columns: dict[str, str]) -> Figure:

@@ -10,10 +10,18 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from flexroad.pipeline.reproduce.figures.cast import Cast
-from flexroad.pipeline.reproduce.figures.plate import FLEXROAD, PATH, PLANE, RAW, TRUTH, Plate, new_figure
-from flexroad.pipeline.reproduce.figures.route import longest_route
-from flexroad.pipeline.reproduce.figures.view import TileView, absent
+from flexroad.pipeline.reproduce.figures.layout import (
+    FLEXROAD,
+    PATH,
+    PLANE,
+    RAW,
+    TRUTH,
+    FigureFile,
+    new_figure,
+)
+from flexroad.pipeline.reproduce.figures.roles import Roles
+from flexroad.pipeline.reproduce.figures.tile_view import TileView, missing_roles
+from flexroad.pipeline.reproduce.figures.trajectory import vehicle_trajectory
 from flexroad.tasks.types import Floats
 
 NAME = "road_profile"
@@ -23,26 +31,26 @@ HEADROOM = 0.25
 """Of the road's own height range, shown above and below it; what stands over the road is cut off there."""
 
 
-def plate(view: TileView, cast: Cast) -> Plate:
+def make_figure(view: TileView, roles: Roles) -> FigureFile:
     """Draw the path, the heights along it and their errors."""
-    row, col = longest_route(view.street)
+    row, col = vehicle_trajectory(view.street)
     caption = (
         f"{view}: heights along a vehicle's path (red: the longest way along the tile's roads, on their "
         f"right) in the raw DSM, on the plane and on FlexRoad, over {view.against} (top), and their "
         f"differences from it (bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are what stands on the "
         "road or hangs over it."
     )
-    missing = absent((("Plane", cast.plane),)) or ("" if row.size > 1 else "the tile has no road")
-    if missing or cast.plane is None:
-        return Plate(NAME, caption, None, missing)
+    missing = missing_roles((("Plane", roles.plane),)) or ("" if row.size > 1 else "the tile has no road")
+    if missing or roles.plane is None:
+        return FigureFile(NAME, caption, None, missing)
     rasters = {
         "truth": view.truth,
         "raw DSM": view.dsm,
-        "Plane": view.results[cast.plane].height,
-        "FlexRoad": view.results[cast.full].height,
+        "Plane": view.results[roles.plane].height,
+        "FlexRoad": view.results[roles.full].height,
     }
     heights = {label: along(raster, row, col) for label, raster in rasters.items()}
-    return Plate(NAME, caption, draw(view, row, col, heights))
+    return FigureFile(NAME, caption, draw(view, row, col, heights))
 
 
 def along(raster: Floats, row: Floats, col: Floats) -> Floats:

@@ -15,10 +15,10 @@ from flexroad.catalog import Grid
 from flexroad.catalog.grid import Bounds
 from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pictures import NO_MESH
-from flexroad.pipeline.reproduce.figures.cast import Cast
-from flexroad.pipeline.reproduce.figures.plate import Plate, new_figure
+from flexroad.pipeline.reproduce.figures.layout import FigureFile, new_figure
+from flexroad.pipeline.reproduce.figures.roles import Roles
 from flexroad.pipeline.reproduce.figures.scales import ERROR_COLOURS, ERROR_NORM, drawable
-from flexroad.pipeline.reproduce.figures.view import TileView, absent
+from flexroad.pipeline.reproduce.figures.tile_view import TileView, missing_roles
 from flexroad.tasks.types import Bools
 
 NAME = "ablation_renders"
@@ -28,9 +28,9 @@ CLOSE_M = 120.0
 """Side of the square that is drawn; of a whole tile too little would be seen."""
 
 
-def plate(view: TileView, cast: Cast) -> Plate:
+def make_figure(view: TileView, roles: Roles) -> FigureFile:
     """Draw the three meshes obliquely; needs OpenGL."""
-    parts = (("w/o NURBS", cast.wo_nurbs), ("w/o ECSRC", cast.wo_ecsrc), ("FlexRoad in full", cast.full))
+    parts = (("w/o NURBS", roles.wo_nurbs), ("w/o ECSRC", roles.wo_ecsrc), ("FlexRoad in full", roles.full))
     caption = (
         f"{view}: meshes without NURBS, without ECSRC and in full, coloured by their vertical distance to "
         f"{view.against} in the colours of the error maps. Drawn is the square of {CLOSE_M:g} m "
@@ -38,16 +38,16 @@ def plate(view: TileView, cast: Cast) -> Plate:
         f"{view.dropped.sum() * view.grid.cell**2:,.0f} m² on the tile."
     )
     columns = {label: variant for label, variant in parts if variant is not None}
-    missing = absent(parts)
+    missing = missing_roles(parts)
     if missing:
-        return Plate(NAME, caption, None, missing)
+        return FigureFile(NAME, caption, None, missing)
     meshes = {variant: view.results[variant].mesh for variant in columns.values()}
     colours = {variant: vertex_colours(view, variant) for variant in columns.values()}
     pictures = render_meshes(meshes, colours, busiest(view.dropped, view.grid), SIZE_PX)
     shown = {label: png for label, variant in columns.items() if (png := pictures[variant]) is not None}
     if len(shown) < len(columns):
-        return Plate(NAME, caption, None, NO_MESH)
-    return Plate(NAME, caption, draw(shown))
+        return FigureFile(NAME, caption, None, NO_MESH)
+    return FigureFile(NAME, caption, draw(shown))
 
 
 def busiest(dropped: Bools, grid: Grid) -> Bounds:

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flexroad.pipeline.config.models import Chain, Config
-from flexroad.pipeline.reproduce.figures.cast import changes
-from flexroad.pipeline.reproduce.figures.plate import FLEXROAD, PATH, TRUTH, Plate, new_figure
+from flexroad.pipeline.reproduce.figures.layout import FLEXROAD, PATH, TRUTH, FigureFile, new_figure
+from flexroad.pipeline.reproduce.figures.roles import changes
 
 NAME = "trade_off"
 SWEEPS: dict[str, tuple[str, ...]] = {
@@ -22,7 +22,7 @@ SWEEPS: dict[str, tuple[str, ...]] = {
 """What is varied, and the options that do it."""
 
 
-def plate(config: Config, full: str, done: pd.DataFrame) -> Plate:
+def make_figure(config: Config, full: str, done: pd.DataFrame) -> FigureFile:
     """Draw road L2 over road MAD, mean over tiles, along each sweep the run has."""
     found = {title: sweep(config.chains, full, options) for title, options in SWEEPS.items()}
     found = {title: names for title, names in found.items() if len(names) > 1}
@@ -35,9 +35,9 @@ def plate(config: Config, full: str, done: pd.DataFrame) -> Plate:
         missing = (
             "no variant changes the control grid, the degree or the sampling alone; `--config ablation` has"
         )
-        return Plate(NAME, caption, None, missing)
+        return FigureFile(NAME, caption, None, missing)
     means = done.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
-    return Plate(NAME, caption, draw(means, found, full))
+    return FigureFile(NAME, caption, draw(means, found, full))
 
 
 def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:

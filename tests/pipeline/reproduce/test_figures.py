@@ -15,17 +15,25 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.reproduce import figures
-from flexroad.pipeline.reproduce.evidence import collect
-from flexroad.pipeline.reproduce.figures import cast as casting
-from flexroad.pipeline.reproduce.figures import dataset, maps, profile, renders, route, trade_off, view
-from flexroad.pipeline.reproduce.figures.plate import DPI
+from flexroad.pipeline.reproduce.figures import (
+    dataset,
+    maps,
+    profile,
+    renders,
+    roles,
+    tile_view,
+    trade_off,
+    trajectory,
+)
+from flexroad.pipeline.reproduce.figures.layout import DPI
+from flexroad.pipeline.reproduce.metrics_data import collect
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 
 pytestmark = pytest.mark.slow
 
-PLATES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
+FIGURE_NAMES = ("road_profile", "error_and_smoothness", "ablation_renders", "trade_off", "dataset")
 BASE = {"fit": {"method": "nurbs", "control_points": [10, 10], "iterations": 30}}
 ABLATION = {
     **BASE,
@@ -42,7 +50,7 @@ ABLATION = {
         "two_things": {"fit": {"degree": 2, "control_points": [8, 8]}},
     },
 }
-CAST = casting.Cast("flexroad", "flat", "cells", "mixed", "bare")
+ROLES = roles.Roles("flexroad", "flat", "cells", "mixed", "bare")
 
 
 def finished(folder, raw, survey) -> Run:
@@ -62,8 +70,8 @@ def rows(run) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def tile(run, rows) -> view.TileView:
-    return view.view_tile(run, view.typical_tile(rows, "flexroad"), CAST)
+def tile(run, rows) -> tile_view.TileView:
+    return tile_view.read_tile_view(run, tile_view.typical_tile(rows, "flexroad"), ROLES)
 
 
 def row_of(rows, tile, variant):
@@ -74,29 +82,29 @@ def row_of(rows, tile, variant):
 
 
 def test_parts_are_told_by_options_not_by_names(run):
-    assert casting.cast_of(run.config) == CAST
+    assert roles.roles_of(run.config) == ROLES
 
 
 def test_the_shipped_configurations_have_their_parts():
-    assert casting.cast_of(load_config("paper")) == casting.Cast("flexroad", "plane", "rgt")
-    whole = casting.cast_of(load_config("ablation"))
-    assert whole == casting.Cast("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
+    assert roles.roles_of(load_config("paper")) == roles.Roles("flexroad", "plane", "rgt")
+    whole = roles.roles_of(load_config("ablation"))
+    assert whole == roles.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
 
 
 def test_changes_name_options_and_methods(run):
     chains = run.config.chains
-    assert casting.changes(chains["flexroad"], chains["flexroad"]) == set()
-    assert casting.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
-    assert casting.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
+    assert roles.changes(chains["flexroad"], chains["flexroad"]) == set()
+    assert roles.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
+    assert roles.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
 
 
 def test_the_typical_tile_is_the_median():
     table = pd.DataFrame(
         {"tile_id": list("abcde"), "variant": "v", "l2_road_m": [0.5, 0.1, np.nan, 0.2, 0.3]}
     )
-    assert view.typical_tile(table, "v") == "d"
+    assert tile_view.typical_tile(table, "v") == "d"
     with pytest.raises(ConfigError, match="--tile"):
-        view.typical_tile(table[table.tile_id == "c"], "v")
+        tile_view.typical_tile(table[table.tile_id == "c"], "v")
 
 
 # --- maps -------------------------------------------------------------------------------------------------
@@ -135,7 +143,7 @@ def test_heights_along_are_bilinear():
 
 
 def test_the_profile_draws_the_rasters_along_the_path(tile):
-    drawn = profile.plate(tile, CAST).figure
+    drawn = profile.make_figure(tile, ROLES).figure
     path, *_ = next(axes for axes in drawn.axes if axes.images).lines
     east, north = tile.grid.west + path.get_xdata(), tile.grid.south + path.get_ydata()
     row, col = tile.grid.cells(east, north)
@@ -157,7 +165,7 @@ def test_the_route_keeps_right_on_a_straight_road():
     road = np.zeros((80, 120), bool)
     road[40:50] = True
     road[40:44, 60] = False  # a hole does not cut the road
-    row, col = route.longest_route(road)
+    row, col = trajectory.vehicle_trajectory(road)
     assert np.ptp(col) > 95
     assert road[row.round().astype(int), col.round().astype(int)].mean() > 0.98
     # Rows count southwards: who drives east has the road's southern half on the right.
@@ -170,7 +178,7 @@ def test_the_route_is_the_longest_of_a_fork():
     road = np.zeros((150, 150), bool)
     road[70:78, :] = True
     road[:75, 40:48] = True
-    row, col = route.longest_route(road)
+    row, col = trajectory.vehicle_trajectory(road)
     along = np.hypot(np.diff(row), np.diff(col)).sum()
     # From the northern end to the eastern one.
     assert abs(along - (74 + 106)) < 30
@@ -181,7 +189,7 @@ def test_the_route_is_the_longest_of_a_fork():
 
 def test_the_route_ends_where_the_lane_leaves_the_tile():
     row, col = np.indices((200, 200))
-    row, col = route.longest_route(np.abs(row - col) < 20)
+    row, col = trajectory.vehicle_trajectory(np.abs(row - col) < 20)
     # Straight from end to end: a lane that ran on along the tile's edge would be longer than its chord.
     along = np.hypot(np.diff(row), np.diff(col)).sum()
     assert along / np.hypot(row[-1] - row[0], col[-1] - col[0]) < 1.001
@@ -192,7 +200,7 @@ def test_the_route_ends_where_the_lane_leaves_the_tile():
 def test_a_route_needs_a_road(cells):
     road = np.zeros((20, 20), bool)
     road[5, 5 : 5 + cells] = True
-    row, col = route.longest_route(road)
+    row, col = trajectory.vehicle_trajectory(road)
     assert row.size == col.size <= 4
 
 
@@ -228,7 +236,7 @@ def test_the_square_that_is_drawn_holds_most_of_what_was_dropped():
 
 
 def test_the_trade_off_draws_the_means_of_the_table(run, rows):
-    drawn = trade_off.plate(run.config, "flexroad", rows).figure
+    drawn = trade_off.make_figure(run.config, "flexroad", rows).figure
     expected = {
         "Control grid": ["coarse", "flexroad", "fine"],
         "Degree p = q": ["quadratic", "flexroad"],
@@ -295,14 +303,14 @@ def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
     for name in ("one", "two"):
         assert figures.write_figures(run, tmp_path / name) == []
     page = (tmp_path / "one" / "figures.md").read_text()
-    for plate in PLATES:
-        with Image.open(tmp_path / "one" / f"{plate}.png") as picture:
+    for name in FIGURE_NAMES:
+        with Image.open(tmp_path / "one" / f"{name}.png") as picture:
             assert picture.width == 7 * DPI
-            assert np.asarray(picture.convert("L")).std() > 10, f"{plate} is blank"
-        assert (tmp_path / "one" / f"{plate}.pdf").read_bytes().startswith(b"%PDF")
-        assert f"({plate}.png)" in page
+            assert np.asarray(picture.convert("L")).std() > 10, f"{name} is blank"
+        assert (tmp_path / "one" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert f"({name}.png)" in page
     assert page.splitlines()[0] == collect(run).line
-    assert view.typical_tile(rows, "flexroad") in page
+    assert tile_view.typical_tile(rows, "flexroad") in page
     for file in (tmp_path / "one").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes(), file.name
 
@@ -313,14 +321,14 @@ def test_without_opengl_the_others_are_drawn(run, tmp_path, monkeypatch):
     assert "ablation_renders" in note
     assert "OpenGL" in note
     assert not list(tmp_path.glob("ablation_renders*"))
-    assert len(list(tmp_path.glob("*.pdf"))) == len(PLATES) - 1
+    assert len(list(tmp_path.glob("*.pdf"))) == len(FIGURE_NAMES) - 1
     assert "OpenGL" in (tmp_path / "figures.md").read_text()
 
 
 def test_a_run_without_variants_says_what_it_lacks(made_survey, tmp_path):
     only = finished(tmp_path / "run", BASE, made_survey)
     notes = figures.write_figures(only, tmp_path / "out", only.catalog.tiles[0].id)
-    assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(PLATES[:4])
+    assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(FIGURE_NAMES[:4])
     assert all("--config ablation" in note for note in notes)
     assert (tmp_path / "out" / "dataset.pdf").exists()
 
@@ -342,10 +350,10 @@ def test_unknown_tiles_and_variants_are_named(run, tmp_path):
     with pytest.raises(CatalogError, match="0_0"):
         figures.write_figures(run, tmp_path, "0_0")
     with pytest.raises(ConfigError, match="no variant 'nobody'"):
-        figures.write_figures(run, tmp_path, cast=casting.Cast("flexroad", plane="nobody"))
+        figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad", plane="nobody"))
 
 
 def test_the_run_is_left_as_it_is(run, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
-    figures.write_figures(run, tmp_path, cast=casting.Cast("flexroad"))
+    figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad"))
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before

@@ -30,7 +30,13 @@ from flexroad.pipeline.reproduce.claims import (
     percent,
 )
 from flexroad.pipeline.reproduce.comparison import compare
-from flexroad.pipeline.reproduce.evidence import KEPT, Evidence, collect, read_evidence, write_evidence
+from flexroad.pipeline.reproduce.metrics_data import (
+    KEPT,
+    MetricsData,
+    collect,
+    read_metrics_data,
+    write_metrics_data,
+)
 from flexroad.pipeline.reproduce.published import TABLE_I_DSC3D, TABLE_II, published
 from flexroad.pipeline.reproduce.tables import pages, write_comparison
 from flexroad.pipeline.run.record import Run
@@ -49,14 +55,14 @@ def figures(values: dict[str, list[float]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["tile_id", "variant", *FIGURES]).set_index(["tile_id", "variant"])
 
 
-def as_published(tiles: int = 3, classes: str = "segmented") -> Evidence:
+def as_published(tiles: int = 3, classes: str = "segmented") -> MetricsData:
     """Tiles whose every figure is the paper's."""
     rows = [
         ("made", classes, f"t{i}", ("urban", "rural")[i % 2], name, *map(published(name).value, FIGURES))
         for i in range(tiles)
         for name in VARIANTS
     ]
-    return Evidence(
+    return MetricsData(
         pd.DataFrame(rows, columns=["dataset", "classes", "tile_id", "stratum", "variant", *FIGURES])
     )
 
@@ -141,14 +147,14 @@ def test_the_papers_own_figures_hold_every_claim_about_its_data():
 
 
 def test_flexroad_alone_is_nothing_to_compare():
-    evidence = as_published()
+    data = as_published()
     with pytest.raises(ConfigError, match="none of the variants FlexRoad is compared with"):
-        compare(Evidence(evidence.rows[evidence.rows.variant == "flexroad"]))
+        compare(MetricsData(data.rows[data.rows.variant == "flexroad"]))
 
 
 def test_the_main_comparison_alone_has_no_table_ii():
     rows = as_published().rows
-    titles = [s.title for s in compare(Evidence(rows[rows.variant.isin(VARIANTS[:3])])).sections]
+    titles = [s.title for s in compare(MetricsData(rows[rows.variant.isin(VARIANTS[:3])])).sections]
     assert "Table I: L2" in titles
     assert not any("Table II" in title for title in titles)
 
@@ -161,10 +167,10 @@ def test_changes_are_those_the_paper_quotes():
 
 
 def test_strata_have_tables_of_their_own():
-    evidence = as_published(3)
-    rural = (evidence.rows.stratum == "rural") & (evidence.rows.variant == "rgt")
-    evidence.rows.loc[rural, "l2_road_m"] = 9.0
-    tables = {s.title: s.table for s in compare(evidence).sections}
+    data = as_published(3)
+    rural = (data.rows.stratum == "rural") & (data.rows.variant == "rgt")
+    data.rows.loc[rural, "l2_road_m"] = 9.0
+    tables = {s.title: s.table for s in compare(data).sections}
     assert tables["Ours, rural: 1 tile"]["L2 road (m)"][1] == "9.000"
     assert tables["Ours, urban: 2 tiles"]["L2 road (m)"][1] == "0.415"
 
@@ -175,27 +181,27 @@ def test_every_page_says_first_what_the_data_is():
         assert line in text.splitlines()[0], name
     assert "The paper's figures are on GeRoD, ours are not" in pages(as_published())["tables.md"]
     real = as_published()
-    real = Evidence(real.rows.assign(dataset="GeRoD"))
+    real = MetricsData(real.rows.assign(dataset="GeRoD"))
     assert "ours are not" not in pages(real)["tables.md"]
 
 
 def test_tiles_that_failed_count_for_nothing_and_are_told_of():
-    evidence = as_published(3)
-    failed = (evidence.rows.tile_id == "t1") & (evidence.rows.variant == "rgt")
-    evidence.rows.loc[failed, list(FIGURES)] = np.nan
-    evidence.rows.loc[evidence.rows.tile_id == "t1", "l2_road_m"] += 100
-    assert evidence.line == "Data: made, 2 tiles (2 urban); 1 more failed and are left out."
-    assert compare(evidence).numbers.ours.max() < 200_000
-    assert abs(compare(evidence).numbers.query("figure == 'l2_road_m'").difference).max() < 1e-12
+    data = as_published(3)
+    failed = (data.rows.tile_id == "t1") & (data.rows.variant == "rgt")
+    data.rows.loc[failed, list(FIGURES)] = np.nan
+    data.rows.loc[data.rows.tile_id == "t1", "l2_road_m"] += 100
+    assert data.line == "Data: made, 2 tiles (2 urban); 1 more failed and are left out."
+    assert compare(data).numbers.ours.max() < 200_000
+    assert abs(compare(data).numbers.query("figure == 'l2_road_m'").difference).max() < 1e-12
 
 
 def test_the_kept_figures_alone_give_the_same_pages(tmp_path):
     rng = np.random.default_rng(0)
-    evidence = as_published(5)
-    evidence.rows[list(FIGURES)] *= rng.random((5 * 21, 1))
-    evidence = Evidence(evidence.rows.astype(dict.fromkeys(FIGURES, KEPT)))
-    write_evidence(evidence, tmp_path)
-    assert pages(read_evidence(tmp_path)) == pages(evidence)
+    data = as_published(5)
+    data.rows[list(FIGURES)] *= rng.random((5 * 21, 1))
+    data = MetricsData(data.rows.astype(dict.fromkeys(FIGURES, KEPT)))
+    write_metrics_data(data, tmp_path)
+    assert pages(read_metrics_data(tmp_path)) == pages(data)
 
 
 def test_csv_is_read_back(tmp_path):
@@ -274,7 +280,7 @@ def test_a_run_and_its_true_classes_stand_side_by_side(tmp_path):
     page = (tmp_path / "out" / "tables.md").read_text()
     assert page.startswith("Data: made, 4 tiles")
     assert "| Full Pipeline | 0.483 | 0.966 |" in page
-    kept = read_evidence(tmp_path / "out")
+    kept = read_metrics_data(tmp_path / "out")
     assert kept.classes == ("segmented", "reference")
     for path in written:
         assert path.read_text() == pages(kept)[path.name]
@@ -303,7 +309,7 @@ STAND_IN = "synthetic photogrammetry, stand-in for DSC3D; "
 CIRCULAR, TRUTH = STAND_IN + "circular", STAND_IN + "true"
 
 
-def stand_in(dataset: str, factor: float = 1.0) -> Evidence:
+def stand_in(dataset: str, factor: float = 1.0) -> MetricsData:
     """Scenes whose every figure is the paper's on DSC3D, but for FlexRoad's roads."""
     rows = [
         (dataset, "segmented", f"s{i}", "urban", row.variant, *map(row.value, FIGURES))
@@ -312,12 +318,12 @@ def stand_in(dataset: str, factor: float = 1.0) -> Evidence:
     ]
     made = pd.DataFrame(rows, columns=["dataset", "classes", "tile_id", "stratum", "variant", *FIGURES])
     made.loc[made.variant == "flexroad", "l2_road_m"] *= factor
-    return Evidence(made.astype(dict.fromkeys(FIGURES, KEPT)))
+    return MetricsData(made.astype(dict.fromkeys(FIGURES, KEPT)))
 
 
 def test_what_stands_in_for_dsc3d_has_tables_and_claims_of_its_own():
-    evidence = replace(as_published(), dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH, factor=3.0)))
-    found = compare(evidence)
+    data = replace(as_published(), dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH, factor=3.0)))
+    found = compare(data)
     sections = {section.title: section for section in found.sections}
     table = sections["Table I, DSC3D rows (synthetic stand-in): L2"].table.set_index("variant")
     assert table.at["FlexRoad", "L2 road (m), ours (circular)"].startswith("0.106 [")
@@ -335,20 +341,20 @@ def test_what_stands_in_for_dsc3d_has_tables_and_claims_of_its_own():
 
 
 def test_every_page_says_that_the_rows_of_dsc3d_are_a_stand_in(tmp_path):
-    main = Evidence(as_published().rows.astype(dict.fromkeys(FIGURES, KEPT)))
-    evidence = replace(main, dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH)))
-    made = pages(evidence)
+    main = MetricsData(as_published().rows.astype(dict.fromkeys(FIGURES, KEPT)))
+    data = replace(main, dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH)))
+    made = pages(data)
     for name, text in made.items():
         assert CIRCULAR in text, name
         assert TRUTH in text, name
-        assert evidence.line in text.splitlines()[0], name
+        assert data.line in text.splitlines()[0], name
     # A table's caption names its own data.
     captions = re.findall(r"\\caption{(.*)}", made["tables.tex"])
     assert [CIRCULAR in caption for caption in captions] == ["DSC3D" in caption for caption in captions]
-    write_evidence(evidence, tmp_path)
-    assert pages(read_evidence(tmp_path)) == made
-    write_evidence(main, tmp_path)
-    assert pages(read_evidence(tmp_path)) == pages(main)
+    write_metrics_data(data, tmp_path)
+    assert pages(read_metrics_data(tmp_path)) == made
+    write_metrics_data(main, tmp_path)
+    assert pages(read_metrics_data(tmp_path)) == pages(main)
 
 
 def test_dsc3d_itself_is_no_stand_in():
@@ -362,8 +368,8 @@ def test_runs_for_dsc3d_are_twins(tmp_path):
     ours = made_run(tmp_path / "ours")
     circular = made_run(tmp_path / "circular", "dsc3d", dataset=(CIRCULAR,))
     true = made_run(tmp_path / "true", "dsc3d", dataset=(TRUTH,), factor=2)
-    evidence = collect(ours, None, circular, true)
-    assert [beside.dataset for beside in evidence.dsc3d] == [CIRCULAR, TRUTH]
+    data = collect(ours, None, circular, true)
+    assert [beside.dataset for beside in data.dsc3d] == [CIRCULAR, TRUTH]
     with pytest.raises(ConfigError, match="is nothing without --dsc3d"):
         collect(ours, None, None, true)
     with pytest.raises(ConfigError, match="is about the same data as"):

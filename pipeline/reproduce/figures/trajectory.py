@@ -17,7 +17,7 @@ SIDE = 0.5
 """Part of the way from the middle of the road to its edge."""
 
 
-def longest_route(road: Bools) -> tuple[Floats, Floats]:
+def vehicle_trajectory(road: Bools) -> tuple[Floats, Floats]:
     """Return the way as rows and columns half a cell apart; empty where there is no road.
 
     The two ends are as far from each other as any on the largest connected road, by the shortest way that

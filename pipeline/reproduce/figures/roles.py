@@ -8,7 +8,7 @@ from flexroad.pipeline.config.models import Chain, Config
 
 
 @dataclass(frozen=True)
-class Cast:
+class Roles:
     """Variants by their part; None where a run has none."""
 
     full: str
@@ -25,7 +25,7 @@ class Cast:
         return tuple(name for name in parts if name is not None)
 
 
-def cast_of(config: Config) -> Cast:
+def roles_of(config: Config) -> Roles:
     """Find the parts in a configuration; FlexRoad is its first exported variant."""
     full = config.export.variants[0]
     found: dict[str, str] = {}
@@ -33,7 +33,7 @@ def cast_of(config: Config) -> Cast:
         part = _part(chain, config.chains[full])
         if part:
             found.setdefault(part, name)
-    return Cast(full, **found)
+    return Roles(full, **found)
 
 
 def _part(chain: Chain, full: Chain) -> str:

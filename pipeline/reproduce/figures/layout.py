@@ -44,7 +44,7 @@ STYLE: dict[RcKeyType, Any] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Plate:
+class FigureFile:
     """A figure with its caption, or why there is none."""
 
     name: str

@@ -23,13 +23,13 @@ UNNAMED = "rasters whose catalog does not name them"
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MetricsData:
     """The rows of one run, or of two that differ in how road is told from terrain, and what stands beside."""
 
     rows: pd.DataFrame
     """`KEYS` and the paper's figures, one row per classes, tile and variant; figures of failed tiles
     are NaN."""
-    dsc3d: tuple[Evidence, ...] = ()
+    dsc3d: tuple[MetricsData, ...] = ()
     """Runs for the rows of DSC3D, one for each reference: the paper's kind first."""
 
     @property
@@ -68,7 +68,7 @@ class Evidence:
 
 def collect(
     run: Run, true: Run | None = None, dsc3d: Run | None = None, dsc3d_true: Run | None = None
-) -> Evidence:
+) -> MetricsData:
     """Return the figures of a run and, if given, of those that stand beside it.
 
     Parameters
@@ -91,7 +91,7 @@ def collect(
         raise ConfigError(f"--dsc3d-true {dsc3d_true.path} is nothing without --dsc3d: name that run, too")
     beside = tuple(_sound(_rows(other), other.path) for other in (dsc3d, dsc3d_true) if other is not None)
     if dsc3d and dsc3d_true:
-        _check_twins(dsc3d, dsc3d_true, *(evidence.rows for evidence in beside))
+        _check_twins(dsc3d, dsc3d_true, *(data.rows for data in beside))
     first = _rows(run)
     if true is None:
         return _sound(first, run.path, beside)
@@ -127,21 +127,23 @@ def _about(rows: pd.DataFrame) -> set[tuple[str, str]]:
     return {*zip(rows.tile_id, rows.variant, strict=True)}
 
 
-def write_evidence(evidence: Evidence, folder: Path) -> None:
+def write_metrics_data(data: MetricsData, folder: Path) -> None:
     """Write the figures; those for DSC3D to a file of their own, if there are any."""
-    write(folder / FILE, _kept(evidence.rows))
-    if evidence.dsc3d:
-        rows = pd.concat([beside.rows for beside in evidence.dsc3d], ignore_index=True)
+    write(folder / FILE, _kept(data.rows))
+    if data.dsc3d:
+        rows = pd.concat([beside.rows for beside in data.dsc3d], ignore_index=True)
         write(folder / DSC3D_FILE, _kept(rows))
     else:
         (folder / DSC3D_FILE).unlink(missing_ok=True)
 
 
-def read_evidence(folder: Path) -> Evidence:
-    """Read what `write_evidence` wrote."""
+def read_metrics_data(folder: Path) -> MetricsData:
+    """Read what `write_metrics_data` wrote."""
     beside = _read(folder / DSC3D_FILE) if (folder / DSC3D_FILE).exists() else pd.DataFrame({"dataset": []})
     parts = [rows for _, rows in beside.groupby("dataset", sort=False)]
-    return Evidence(_read(folder / FILE), tuple(Evidence(rows.reset_index(drop=True)) for rows in parts))
+    return MetricsData(
+        _read(folder / FILE), tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts)
+    )
 
 
 def _kept(rows: pd.DataFrame) -> bytes:
@@ -170,8 +172,8 @@ def _rows(run: Run) -> pd.DataFrame:
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
 
 
-def _sound(rows: pd.DataFrame, run: Location, dsc3d: tuple[Evidence, ...] = ()) -> Evidence:
-    evidence = Evidence(rows, dsc3d)
-    if not evidence.tiles.complete.any():
+def _sound(rows: pd.DataFrame, run: Location, dsc3d: tuple[MetricsData, ...] = ()) -> MetricsData:
+    data = MetricsData(rows, dsc3d)
+    if not data.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")
-    return evidence
+    return data

@@ -11,7 +11,7 @@ import pandas as pd
 from flexroad.catalog import Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import TileGraph
-from flexroad.pipeline.reproduce.figures.cast import Cast
+from flexroad.pipeline.reproduce.figures.roles import Roles
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -69,7 +69,7 @@ def typical_tile(done: pd.DataFrame, variant: str) -> str:
     return str(table.tile_id.iloc[(len(table) - 1) // 2])
 
 
-def view_tile(run: Run, tile_id: str, cast: Cast) -> TileView:
+def read_tile_view(run: Run, tile_id: str, roles: Roles) -> TileView:
     """Read a tile's results from the store, and make those again that are not kept there.
 
     Raises
@@ -82,17 +82,17 @@ def view_tile(run: Run, tile_id: str, cast: Cast) -> TileView:
     (tile,) = run.catalog.select([tile_id]).tiles
     (found,) = peek_statuses(run, [tile])
     graph = found.graph
-    for variant in cast.names:
+    for variant in roles.names:
         if variant not in graph.variants:
             raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
     try:
-        return _view(graph, Evaluator(graph, ArtefactStore(run.store)), cast)
+        return _view(graph, Evaluator(graph, ArtefactStore(run.store)), roles)
     except StageError as error:
         raise ConfigError(f"tile {tile_id}: {error}; name another with --tile") from error
 
 
-def _view(graph: TileGraph, pull: Evaluator, cast: Cast) -> TileView:
-    made = graph.variants[cast.full]
+def _view(graph: TileGraph, pull: Evaluator, roles: Roles) -> TileView:
+    made = graph.variants[roles.full]
     data: TileData = pull(made["load"])
     road: RoadMask = pull(made["segment"])
     clusters: RoadClusters = pull(made["ecsrc"])
@@ -107,7 +107,7 @@ def _view(graph: TileGraph, pull: Evaluator, cast: Cast) -> TileView:
         "the DTM" if data.reference is None else "the reference surface",
         street[window] & ~road.outside[window],
         (road.mask & ~clusters.mask)[window],
-        {variant: _result(graph, pull, variant, core) for variant in cast.names},
+        {variant: _result(graph, pull, variant, core) for variant in roles.names},
     )
 
 
@@ -117,7 +117,7 @@ def _result(graph: TileGraph, pull: Evaluator, variant: str, core: Grid) -> Resu
     return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), metrics)
 
 
-def absent(parts: Iterable[tuple[str, str | None]]) -> str:
+def missing_roles(parts: Iterable[tuple[str, str | None]]) -> str:
     """Return why a figure cannot be drawn: the parts no variant of the run plays; empty if there are none."""
     missing = [label for label, variant in parts if variant is None]
     return f"the run has no variant for {' and '.join(missing)}; `--config ablation` has" if missing else ""
