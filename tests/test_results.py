@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.reproduce.metrics_data import FILE, KEPT, read_metrics_data, write_metrics_data
+from flexroad.pipeline.reproduce.metrics_data import FIGURE_DTYPE, FILE, read_metrics_data, write_metrics_data
 from flexroad.pipeline.reproduce.tables import pages
 
 ROOT = Path(__file__).parent.parent
@@ -58,7 +58,9 @@ def published(tmp_path):
         for row in TABLE_I
     ]
     keys = ["dataset", "classes", "tile_id", "stratum", "variant"]
-    data = MetricsData(pd.DataFrame(rows, columns=[*keys, *FIGURES]).astype(dict.fromkeys(FIGURES, KEPT)))
+    data = MetricsData(
+        pd.DataFrame(rows, columns=[*keys, *FIGURES]).astype(dict.fromkeys(FIGURES, FIGURE_DTYPE))
+    )
     write_metrics_data(data, tmp_path)
     for name, text in pages(data).items():
         (tmp_path / name).write_text(text)

@@ -1,1 +1,1 @@
-"""The paper's tables, claims and figures beside a run's."""
+"""The paper's tables, claims and figures, with a run's results beside them."""

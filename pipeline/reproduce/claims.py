@@ -1,4 +1,4 @@
-"""What the paper's text claims of its tables, and whether a run bears it out."""
+"""The claims that the paper's text makes about its tables, and their test on a run."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from flexroad.pipeline.reproduce.published import BASE, DSC3D, GEROD, published
 
 HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED = "held", "weaker", "stronger", "not held", "not tested"
 REACH = 2.0
-"""A change that goes further than so many times the paper's is stronger; weaker is less than its inverse."""
+"""A change is stronger if its log ratio is more than `REACH` times the paper's, weaker below 1 / `REACH`."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """Variants in ascending order of a figure."""
+    """A claim that variants are in ascending order of a figure."""
 
     text: str
     where: str
-    """The section that says so."""
+    """Section of the paper that makes the claim."""
     figure: str
     ascending: tuple[str, ...]
     slack: float = 0.0
-    """Part by which one may exceed the next: for "without loss"."""
+    """Relative amount by which a value may exceed the next (for claims such as "without loss")."""
     dataset: str = GEROD
 
 
 @dataclass(frozen=True)
 class Change:
-    """A figure's relative change from one variant to another."""
+    """A claim about a figure's relative change from `base` to `variant`."""
 
     text: str
     where: str
     figure: str
     variant: str
     quoted: float
-    """Change in percent, as the text gives it."""
+    """Change in percent, as quoted in the paper's text."""
     base: str = BASE
     dataset: str = GEROD
 
@@ -90,9 +90,13 @@ CLAIMS: tuple[Claim, ...] = (
     Change("w/o DTM support, terrain L2 rises by 786%", ABLATION, TERRAIN, "wo_dtm", 786),
     Change("w/o NURBS, road MAD rises by 1507%", ABLATION, MAD_ROAD, "wo_nurbs", 1507),
     Change("w/o NURBS, triangles rise by 271%", ABLATION, T, "wo_nurbs", 271),
-    Change("Dynamic sampling takes 73% off the triangles", ABLATION, T, BASE, -73, base="wo_dynamic"),
+    Change("Dynamic sampling removes 73% of the triangles", ABLATION, T, BASE, -73, base="wo_dynamic"),
     Order(
-        "Dynamic sampling keeps the road's accuracy (to 5%)", ABLATION, ROAD, (BASE, "wo_dynamic"), slack=0.05
+        "Dynamic sampling keeps the road's accuracy (within 5%)",
+        ABLATION,
+        ROAD,
+        (BASE, "wo_dynamic"),
+        slack=0.05,
     ),
     Change("θz = 0.1 m lowers road L2 by 4%", ABLATION, ROAD, "theta_z_0_1", -4),
     Change("θz = 0.1 m lowers road MAD by 19%", ABLATION, MAD_ROAD, "theta_z_0_1", -19),
@@ -124,7 +128,7 @@ CLAIMS: tuple[Claim, ...] = (
         "sampling_0_5",
         100,
     ),
-    Change("Sampling at 2 m / 20 m takes 75% off the triangles", ABLATION, T, "sampling_2", -75),
+    Change("Sampling at 2 m / 20 m removes 75% of the triangles", ABLATION, T, "sampling_2", -75),
     Change("Sampling at 2 m / 20 m doubles the road's MAD", ABLATION, MAD_ROAD, "sampling_2", 100),
     Order("ECSRC contributes: road L2", CONCLUSION, ROAD, (BASE, "wo_ecsrc")),
     Order("DTM support contributes: terrain L2", CONCLUSION, TERRAIN, (BASE, "wo_dtm")),
@@ -134,58 +138,59 @@ CLAIMS: tuple[Claim, ...] = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim beside what a run gives."""
+    """A claim with the paper's figures, a run's figures and the result of the test."""
 
     claim: Claim
     paper: str
     """The paper's figures, from its tables."""
     ours: str
+    """The run's figures; "–" if not tested."""
     certainty: str
-    """Over resampled tiles: the interval of a change, the share of orders that stand."""
+    """Interval of the change, or share of resamples in which the order holds."""
     verdict: str
 
 
 def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
-    """Return whether a claim holds.
+    """Test a claim on a run.
 
-    An order holds if the means over tiles are so ordered. A change holds if it goes the paper's way and its
-    ratio, as a logarithm, is between half and twice that of the paper's tables; a change that way is
-    weaker or stronger otherwise.
+    An order holds if the means over tiles are in that order. A change holds if it has the paper's sign and
+    the logarithm of its ratio is between half and twice that of the paper's tables; below that range it is
+    weaker, above it stronger.
 
     Parameters
     ----------
     claim : Claim
-        What the paper says.
+        A claim of the paper.
     means : Means
-        What a run gives.
+        Means of the run.
     dataset : str
-        The paper's dataset that the run stands beside; claims about another are not tested.
+        The paper's dataset that the run is compared with; claims about other datasets are not tested.
     """
     names = claim.ascending if isinstance(claim, Order) else (claim.base, claim.variant)
     paper = [_paper(claim, name) for name in names]
     if claim.dataset != dataset or not means.variants.issuperset(names):
-        said = _ordered(claim.figure, paper) if isinstance(claim, Order) else percent(paper[1] / paper[0])
-        return Verdict(claim, said, "–", "–", NOT_TESTED)
+        quoted = _ordered(claim.figure, paper) if isinstance(claim, Order) else percent(paper[1] / paper[0])
+        return Verdict(claim, quoted, "–", "–", NOT_TESTED)
     if isinstance(claim, Order):
         return _check_order(claim, paper, means)
     return _check_change(claim, paper[1] / paper[0], means)
 
 
 def percent(ratio: float) -> str:
-    """Return a ratio as a change: 2.11 is +111%."""
+    """Return a ratio as a change in percent: 2.11 is +111%."""
     change = 100 * (ratio - 1)
     if not math.isfinite(change):
         return "–"
-    # Adding 0 makes a rounded -0.0 plain 0.0.
+    # Adding 0 turns -0.0 into 0.0.
     return f"{change:+.0f}%" if abs(change) >= 10 else f"{round(change, 1) + 0:+.1f}%"
 
 
 def _check_order(claim: Order, paper: list[float], means: Means) -> Verdict:
     ours = [means.mean[name, claim.figure] for name in claim.ascending]
-    drawn = np.array([means.resampled[name, claim.figure] for name in claim.ascending])
+    resampled = np.array([means.resampled[name, claim.figure] for name in claim.ascending])
     within = 1 + claim.slack
     holds = all(a <= b * within for a, b in pairwise(ours))
-    share = float((drawn[:-1] <= drawn[1:] * within).all(axis=0).mean())
+    share = float((resampled[:-1] <= resampled[1:] * within).all(axis=0).mean())
     return Verdict(
         claim,
         _ordered(claim.figure, paper),
@@ -196,19 +201,20 @@ def _check_order(claim: Order, paper: list[float], means: Means) -> Verdict:
 
 
 def _check_change(claim: Change, paper: float, means: Means) -> Verdict:
-    ratio, drawn = means.ratio(claim.variant, claim.base, claim.figure)
-    low, high = interval(drawn)
+    ratio, resampled = means.ratio(claim.variant, claim.base, claim.figure)
+    low, high = interval(resampled)
     certainty = f"{percent(low)} to {percent(high)}"
-    return Verdict(claim, percent(paper), percent(ratio), certainty, _judged(ratio, paper))
+    return Verdict(claim, percent(paper), percent(ratio), certainty, _verdict(ratio, paper))
 
 
-def _judged(ratio: float, paper: float) -> str:
+def _verdict(ratio: float, paper: float) -> str:
+    """Return the verdict on a change from our ratio and the paper's."""
     if not (math.isfinite(ratio) and ratio > 0):
         return NOT_TESTED
-    far = math.log(ratio) / math.log(paper)
-    if far <= 0:
+    relative = math.log(ratio) / math.log(paper)
+    if relative <= 0:
         return NOT_HELD
-    return STRONGER if far > REACH else WEAKER if far < 1 / REACH else HELD
+    return STRONGER if relative > REACH else WEAKER if relative < 1 / REACH else HELD
 
 
 def _paper(claim: Claim, variant: str) -> float:
@@ -219,7 +225,7 @@ def _paper(claim: Claim, variant: str) -> float:
 
 
 def _ordered(figure: str, values: list[float]) -> str:
-    """Return values with the signs of their order between them."""
-    shown = [f"{value:,.0f}" if figure == T else f"{value:.3f}" for value in values]
+    """Return the values with "<", "=" or ">" between neighbours."""
+    texts = [f"{value:,.0f}" if figure == T else f"{value:.3f}" for value in values]
     signs = ["<" if a < b else "=" if a == b else ">" for a, b in pairwise(values)]
-    return " ".join([shown[0], *(part for pair in zip(signs, shown[1:], strict=True) for part in pair)])
+    return " ".join([texts[0], *(part for pair in zip(signs, texts[1:], strict=True) for part in pair)])

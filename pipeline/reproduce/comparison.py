@@ -1,4 +1,4 @@
-"""The paper's Tables I and II with ours beside them: what the pages of `flexroad tables` show."""
+"""The paper's Tables I and II with our figures beside them, as shown by `flexroad tables`."""
 
 from __future__ import annotations
 
@@ -21,36 +21,43 @@ from flexroad.pipeline.reproduce.claims import (
     check,
     percent,
 )
-from flexroad.pipeline.reproduce.dsc3d import of_dsc3d
+from flexroad.pipeline.reproduce.dsc3d import compare_dsc3d
 from flexroad.pipeline.reproduce.metrics_data import MetricsData
 from flexroad.pipeline.reproduce.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
-from flexroad.pipeline.reproduce.sections import Section, beside, numbers, short, shown, verdicts_table
+from flexroad.pipeline.reproduce.sections import (
+    Section,
+    format_figure,
+    label_without_unit,
+    numbers,
+    side_by_side,
+    verdicts_table,
+)
 
 MASKS = {"segmented": "segmented mask", "reference": "true mask"}
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Ours beside the paper's."""
+    """Our figures beside the paper's."""
 
     line: str
-    """What data ours came from."""
+    """The data of our figures, in one line."""
     notes: tuple[str, ...]
     """How to read the tables."""
     sections: tuple[Section, ...]
     numbers: pd.DataFrame
-    """Every number of the tables, one a row, unrounded."""
+    """Every number of the tables, one per row, unrounded."""
     claims: pd.DataFrame
-    """Every claim with its verdict; those about DSC3D once for each reference."""
+    """Every claim with its verdict; claims about DSC3D once per reference."""
 
 
 def compare(data: MetricsData) -> Comparison:
-    """Lay the figures of a run beside the paper's.
+    """Compare the figures of a run with the paper's.
 
     Raises
     ------
     ConfigError
-        If there is nothing to compare FlexRoad with.
+        If the run has FlexRoad only, no variant to compare it with.
     """
     paper = DSC3D if data.dataset == DSC3D else GEROD
     tables = {"Table I": TABLE_I_DSC3D} if paper == DSC3D else {"Table I": TABLE_I, "Table II": TABLE_II}
@@ -59,34 +66,37 @@ def compare(data: MetricsData) -> Comparison:
     tables = {
         name: tuple(row for row in rows if row.variant in head.variants) for name, rows in tables.items()
     }
-    # A table of the full pipeline alone would say nothing that Table I does not.
+    # Table II with the full pipeline only would repeat Table I.
     tables = {name: rows for name, rows in tables.items() if {row.variant for row in rows} - {BASE}}
     if not tables:
         raise ConfigError("the run has none of the variants FlexRoad is compared with; use --config ablation")
-    other = of_dsc3d(data.dsc3d)
-    # Claims about DSC3D have a table of their own where there is something to test them on.
-    asked = [claim for claim in CLAIMS if claim.dataset == paper or not data.dsc3d]
-    verdicts = {classes: [check(claim, made, paper) for claim in asked] for classes, made in means.items()}
-    claims = verdicts_table({MASKS[classes]: found for classes, found in verdicts.items()})
+    dsc3d = compare_dsc3d(data.dsc3d)
+    # Claims about DSC3D have their own table if there is a run to test them on.
+    tested = [claim for claim in CLAIMS if claim.dataset == paper or not data.dsc3d]
+    verdicts = {
+        classes: [check(claim, class_means, paper) for claim in tested]
+        for classes, class_means in means.items()
+    }
+    claims = verdicts_table({MASKS[classes]: results for classes, results in verdicts.items()})
     sections = [
-        *(section for name, rows in tables.items() for section in beside(name, rows, {"ours": head})),
+        *(section for name, rows in tables.items() for section in side_by_side(name, rows, {"ours": head})),
         *([_relative(tables["Table II"], head)] if BASE in head.variants and "Table II" in tables else []),
-        Section("What the paper claims", claims),
-        *other.sections,
+        Section("The paper's claims", claims),
+        *dsc3d.sections,
         *_other_masks(_union(tables), means),
         *_per_stratum(_union(tables), data),
     ]
-    found = [
-        numbers(name, rows, classes, made, data.dataset)
-        for classes, made in means.items()
+    table_numbers = [
+        numbers(name, rows, classes, class_means, data.dataset)
+        for classes, class_means in means.items()
         for name, rows in tables.items()
     ]
     return Comparison(
         data.line,
-        (*_notes(data, paper, verdicts[data.classes[0]]), *other.notes),
+        (*_notes(data, paper, verdicts[data.classes[0]]), *dsc3d.notes),
         tuple(sections),
-        pd.concat([*found, *other.numbers], ignore_index=True),
-        pd.concat([claims.assign(data=data.dataset), *other.claims], ignore_index=True),
+        pd.concat([*table_numbers, *dsc3d.numbers], ignore_index=True),
+        pd.concat([claims.assign(data=data.dataset), *dsc3d.claims], ignore_index=True),
     )
 
 
@@ -94,26 +104,26 @@ def _notes(data: MetricsData, paper: str, verdicts: list[Verdict]) -> Iterator[s
     classes = data.classes[0]
     if data.dataset != paper:
         yield (
-            f"The paper's figures are on {paper}, ours are not: orders and ratios can be compared, metres "
-            "and degrees only as far as the data are alike."
+            f"The paper's figures are for {paper}, ours are for other data. Orders and ratios can be "
+            "compared; metres and degrees only if the data are similar."
         )
     yield (
-        f"Means over tiles; in brackets {LEVEL}% intervals from {RESAMPLES} resamples of the tiles. "
-        f"Road is told from terrain by the {MASKS[classes]}."
+        f"Means over tiles, with {LEVEL}% intervals from {RESAMPLES} resamples of the tiles in brackets. "
+        f"Cells are classed as road or terrain by the {MASKS[classes]}."
     )
     kinds = (HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED)
     counts = [f"{sum(v.verdict == kind for v in verdicts)} {kind}" for kind in kinds]
     about = f" about {paper}" if len(verdicts) < len(CLAIMS) else ""
     yield (
-        f"The paper's {len(verdicts)} claims{about}: {', '.join(counts)}. An order holds if the means are so "
-        "ordered. A change holds if it goes the paper's way and its ratio, as a logarithm, is between half "
-        "and twice that of the paper's tables; beyond it is weaker or stronger. What other data or variants "
-        "would have to show is not tested."
+        f"The paper's {len(verdicts)} claims{about}: {', '.join(counts)}. An order holds if the means are in "
+        "that order. A change holds if it has the paper's sign and the logarithm of its ratio is between "
+        "half and twice that of the paper's tables; below that range it is weaker, above it stronger. A "
+        "claim is not tested if the run has no such data or variants."
     )
 
 
 def _union(tables: dict[str, tuple[Row, ...]]) -> tuple[Row, ...]:
-    """Return the rows of all tables, each variant once under its last name."""
+    """Return the rows of all tables, each variant once, with the label of the last table."""
     return tuple({row.variant: row for rows in tables.values() for row in rows}.values())
 
 
@@ -122,8 +132,10 @@ def _relative(rows: tuple[Row, ...], means: Means) -> Section:
     others = [row for row in rows if row is not base]
     table = pd.DataFrame({"variant": [row.label for row in others]})
     for figure in FIGURES:
-        table[f"{short(figure)}, paper"] = [percent(row.value(figure) / base.value(figure)) for row in others]
-        table[f"{short(figure)}, ours"] = [
+        table[f"{label_without_unit(figure)}, paper"] = [
+            percent(row.value(figure) / base.value(figure)) for row in others
+        ]
+        table[f"{label_without_unit(figure)}, ours"] = [
             percent(means.ratio(row.variant, BASE, figure)[0]) for row in others
         ]
     return Section("Table II: changes from the full pipeline", table)
@@ -136,22 +148,22 @@ def _other_masks(rows: tuple[Row, ...], means: dict[str, Means]) -> Iterator[Sec
     for figure in FIGURES:
         if figure == "triangles":
             continue
-        for classes, made in means.items():
-            values = [shown(made.mean[row.variant, figure], figure) for row in rows]
+        for classes, class_means in means.items():
+            values = [format_figure(class_means.mean[row.variant, figure], figure) for row in rows]
             table[f"{FIGURES[figure]}, {MASKS[classes]}"] = values
-    yield Section("Ours by the segmented and by the true mask", table)
+    yield Section("Our figures by the segmented and by the true mask", table)
 
 
 def _per_stratum(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
     part = data.part(data.classes[0])
     strata = data.tiles.stratum
     for stratum in sorted(set(strata) - {""}):
-        chosen = part[part.index.get_level_values("tile_id").isin(strata.index[strata == stratum])]
-        if chosen.empty:
+        selected = part[part.index.get_level_values("tile_id").isin(strata.index[strata == stratum])]
+        if selected.empty:
             continue
-        means = chosen.groupby("variant").mean().to_dict("index")
+        means = selected.groupby("variant").mean().to_dict("index")
         table = pd.DataFrame({"variant": [row.label for row in rows]})
         for figure, label in FIGURES.items():
-            table[label] = [shown(means[row.variant][figure], figure) for row in rows]
-        tiles = len(chosen.index.unique("tile_id"))
-        yield Section(f"Ours, {stratum}: {tiles} tile{'s' * (tiles != 1)}", table)
+            table[label] = [format_figure(means[row.variant][figure], figure) for row in rows]
+        tiles = len(selected.index.unique("tile_id"))
+        yield Section(f"Our figures, {stratum}: {tiles} tile{'s' * (tiles != 1)}", table)

@@ -1,4 +1,4 @@
-"""The paper's own numbers: its Tables I and II, as printed."""
+"""Tables I and II of the paper, as printed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from flexroad.pipeline.report.content import FIGURES
 
 GEROD, DSC3D = "GeRoD", "DSC3D"
-"""The paper's datasets: airborne laser scanning of Geobasis NRW, and photogrammetry."""
+"""The paper's datasets: airborne laser scans of Geobasis NRW (GeRoD) and photogrammetry (DSC3D)."""
 
 
 @dataclass(frozen=True)
@@ -15,18 +15,18 @@ class Row:
     """One row of a table."""
 
     label: str
-    """As the paper prints it, without mathematics."""
+    """The row's name in the paper, as plain text."""
     variant: str
-    """Its name in configs/ablation.yaml."""
+    """Name of the variant in configs/ablation.yaml."""
     l2_road_m: float
     l2_terrain_m: float
     mad_road_deg: float
     mad_terrain_deg: float
     triangles: int
-    """In Table I rounded to thousands by the paper."""
+    """Table I rounds it to thousands."""
 
     def value(self, figure: str) -> float:
-        """Return one of the figures by its column in a run's metrics."""
+        """Return a figure by its column name in metrics.parquet."""
         if figure not in FIGURES:
             raise KeyError(figure)
         return float(getattr(self, figure))
@@ -70,10 +70,10 @@ TABLE_II = (
 """The ablation study, on GeRoD; the first row is the full pipeline."""
 
 BASE = TABLE_II[0].variant
-"""What the ablation's changes are relative to."""
+"""The variant that the ablation's changes are relative to."""
 
 
 def published(variant: str, dataset: str = GEROD) -> Row | None:
-    """Return a variant's row, the more precise one where both tables have it, or None."""
+    """Return a variant's row, from Table II if it is in both tables; None if it is in neither."""
     rows = TABLE_I_DSC3D if dataset == DSC3D else (*TABLE_II, *TABLE_I)
     return next((row for row in rows if row.variant == variant), None)

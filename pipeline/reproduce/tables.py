@@ -1,4 +1,4 @@
-"""Write the comparison with the paper: Markdown, LaTeX, CSV and HTML, and the figures they rest on."""
+"""Write the comparison with the paper as Markdown, LaTeX, CSV and HTML, and the metrics behind it."""
 
 from __future__ import annotations
 
@@ -23,63 +23,63 @@ LATEX = {
     "<": "$<$",
     ">": "$>$",
 }
-"""What pdflatex does not print, or not as the paper does."""
+"""LaTeX for characters that pdflatex does not print, or prints differently from the paper."""
 NARROW, SENTENCE = 12, 25
-"""Characters of a column of text: fewer never need a second line, more always do."""
+"""Limits of a text column's longest cell (characters) above which it is wrapped; see `_latex`."""
 
 
 def write_comparison(
     run: Run, true: Run | None, folder: Path, dsc3d: Run | None = None, dsc3d_true: Run | None = None
 ) -> tuple[Path, ...]:
-    """Write the tables of a run beside the paper's; return the files.
+    """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
     Parameters
     ----------
     run : Run
-        With variants named as in configs/ablation.yaml; those it lacks are left out.
+        A run with variants named as in configs/ablation.yaml; missing variants are left out.
     true : Run, optional
-        The same with ``evaluate.classes: reference``.
+        The same run with ``evaluate.classes: reference``.
     folder : Path
-        Where to.
+        Folder for the files.
     dsc3d : Run, optional
-        For the rows of DSC3D: its scenes, or what stands in for them.
+        A run over DSC3D or its stand-in, for the DSC3D rows.
     dsc3d_true : Run, optional
-        The same scenes against the truth.
+        A run over the same scenes, measured against the true surface.
 
     Raises
     ------
     ConfigError
-        If a run has no figures, mixes data or is about other tiles than the other, or the folder cannot be
-        written.
+        If a run has no figures or mixes datasets, two runs to compare have different tiles, or the folder
+        cannot be written.
     """
     data = collect(run, true, dsc3d, dsc3d_true)
-    made = pages(data)
+    texts = pages(data)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_metrics_data(data, folder)
-        for name, text in made.items():
+        for name, text in texts.items():
             write(folder / name, text.encode())
     except OSError as error:
         raise ConfigError(f"cannot write the tables to {folder}: {error}; choose another -o") from error
-    return tuple(folder / name for name in made)
+    return tuple(folder / name for name in texts)
 
 
 def pages(data: MetricsData) -> dict[str, str]:
-    """Return the pages by file name; equal figures give equal pages."""
-    found = compare(data)
+    """Return the pages by file name; equal data gives equal pages."""
+    comparison = compare(data)
     return {
-        "tables.md": markdown_page(found),
-        "tables.tex": latex_page(found),
-        "tables.csv": csv_page(found.numbers, found.line),
-        "claims.csv": csv_page(found.claims, found.line),
-        "tables.html": html_page(found),
+        "tables.md": markdown_page(comparison),
+        "tables.tex": latex_page(comparison),
+        "tables.csv": csv_page(comparison.numbers, comparison.line),
+        "claims.csv": csv_page(comparison.claims, comparison.line),
+        "tables.html": html_page(comparison),
     }
 
 
-def markdown_page(found: Comparison) -> str:
-    """Return the comparison as Markdown; the data comes first."""
-    parts = [found.line, f"# {TITLE}", *found.notes]
-    for section in found.sections:
+def markdown_page(comparison: Comparison) -> str:
+    """Return the comparison as Markdown; the first line names the data."""
+    parts = [comparison.line, f"# {TITLE}", *comparison.notes]
+    for section in comparison.sections:
         parts += [f"## {section.title}", *([section.line] if section.line else []), markdown(section.table)]
     return "\n\n".join(parts) + "\n"
 
@@ -89,26 +89,26 @@ def csv_page(table: pd.DataFrame, line: str) -> str:
     return f"# {line}\n{table.to_csv(index=False)}"
 
 
-def html_page(found: Comparison) -> str:
-    """Return one self-contained page."""
-    sections = [(section.title, section.table, section.line) for section in found.sections]
+def html_page(comparison: Comparison) -> str:
+    """Return the comparison as one self-contained HTML page."""
+    sections = [(section.title, section.table, section.line) for section in comparison.sections]
     page = template("tables.html.j2", Path(__file__).parent).render(
-        title=TITLE, line=found.line, notes=found.notes, sections=sections
+        title=TITLE, line=comparison.line, notes=comparison.notes, sections=sections
     )
-    return f"<!-- {found.line} -->\n{page}\n"
+    return f"<!-- {comparison.line} -->\n{page}\n"
 
 
-def latex_page(found: Comparison) -> str:
-    r"""Return tables to ``\input`` into a document with the package booktabs."""
-    parts = [f"% {found.line}", *(f"% {note}" for note in found.notes)]
-    for section in found.sections:
-        parts.append(_latex(section.table, f"{section.title}. {section.line or found.line}"))
+def latex_page(comparison: Comparison) -> str:
+    r"""Return tables for ``\input`` in a document that uses the package booktabs."""
+    parts = [f"% {comparison.line}", *(f"% {note}" for note in comparison.notes)]
+    for section in comparison.sections:
+        parts.append(_latex(section.table, f"{section.title}. {section.line or comparison.line}"))
     return "\n".join(parts) + "\n"
 
 
 def _latex(table: pd.DataFrame, caption: str) -> str:
     lengths = [max(map(len, column), default=0) for _, column in table.items()]
-    # Sentences make a page too wide, unless all the columns of text give way.
+    # A column of sentences makes the page too wide: then every text column over NARROW is wrapped.
     widest = NARROW if max(lengths) > SENTENCE else SENTENCE
     kinds = "".join(
         "r" if number else "l" if length <= widest else "p{0.12\\linewidth}"
@@ -125,7 +125,7 @@ def _latex(table: pd.DataFrame, caption: str) -> str:
 
 
 def _grouped(table: pd.DataFrame) -> pd.DataFrame:
-    """Write "L2 road (m), paper" and "L2 road (m), ours" as two columns below one head."""
+    """Put "L2 road (m), paper" and "L2 road (m), ours" under one heading "L2 road (m)"."""
     first, *others = [str(column).split(", ") for column in table.columns]
     if any(len(parts) != 2 for parts in others):
         return table

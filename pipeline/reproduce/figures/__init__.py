@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from a run: each as vector PDF and PNG, with a page of captions."""
+"""The paper's figures, drawn from a run, as PDF and PNG files with a page of captions."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from flexroad.pipeline.store.tables import read_metrics
 def write_figures(
     run: Run, folder: Path, tile_id: str | None = None, roles: Roles | None = None
 ) -> list[str]:
-    """Draw every figure the run has the variants for, and ``figures.md`` with their captions.
+    """Draw every figure whose variants are in the run, and write ``figures.md`` with the captions.
 
     Parameters
     ----------
     run : Run
         A run with finished tiles.
     folder : Path
-        Where NAME.pdf, NAME.png and figures.md are written.
+        Folder for NAME.pdf, NAME.png and figures.md.
     tile_id : str, optional
-        The tile of the maps, renders and profile; by default the one of median road L2.
+        The tile of the maps, renders and profile; by default the tile with the median road L2.
     roles : Roles, optional
-        Which variant plays which part; by default as its options tell.
+        Which variant is which method; by default derived from the variants' options.
 
     Returns
     -------
     list of str
-        One line per figure that could not be drawn, and why.
+        One line per figure that could not be drawn, with the reason.
 
     Raises
     ------
     ConfigError
-        If no tile of the run has every variant, the run mixes data, or the tile's results cannot be made
-        again.
+        If no tile of the run has every variant, the run mixes datasets, or the tile's results cannot be
+        recomputed.
     CatalogError
-        If the tile is unknown.
+        If the catalog has no such tile.
     """
     roles = roles or roles_of(run.config)
     data = collect(run)
     rows = read_metrics(run.path)
-    # The tiles of the tables: those with every variant.
+    # As in the tables: only tiles with every variant.
     done = rows[rows.tile_id.isin(data.tiles.index[data.tiles.complete])]
     with rc_context(STYLE):
         files = _figure_files(
@@ -75,6 +75,6 @@ def _figure_files(run: Run, roles: Roles, view: TileView, done: dataset.Table) -
 def _page(data: str, files: list[FigureFile]) -> str:
     parts = [data, "# Figures"]
     for file in files:
-        drawn = f"![{file.name}]({file.name}.png)\n\n{file.caption}"
-        parts.append(drawn if file.figure is not None else f"No figure `{file.name}`: {file.missing}")
+        image = f"![{file.name}]({file.name}.png)\n\n{file.caption}"
+        parts.append(image if file.figure is not None else f"No figure `{file.name}`: {file.missing}")
     return "\n\n".join(parts) + "\n"

@@ -1,4 +1,4 @@
-"""What the run's tiles are: strata, share of road, range of heights."""
+"""The figure of the run's tiles: strata, road share and height range."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ Table = pd.DataFrame
 def statistics(run: Run, full: str, done: Table) -> Table:
     """Return ``tile_id, stratum, road_percent, height_range_m`` of the finished tiles.
 
-    The share of road is that of the run's table; heights are the DSM's, houses and trees included.
+    The road share is that of the run's table; heights are those of the DSM, with houses and trees.
 
     Raises
     ------
     ConfigError
-        If a tile's sources cannot be read any more.
+        If a tile's source files can no longer be read.
     """
     table = done.loc[done.variant == full, ["tile_id", "stratum", "road_fraction"]].copy()
     wanted = set(table.tile_id)
     ranges: dict[str, float] = {}
-    for found in peek_statuses(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
-        graph = found.graph
+    for status in peek_statuses(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
+        graph = status.graph
         try:
             data: TileData = Evaluator(graph, ArtefactStore(run.store))(graph.variants[full]["load"])
         except StageError as error:
@@ -50,24 +50,24 @@ def statistics(run: Run, full: str, done: Table) -> Table:
 
 
 def make_figure(table: Table) -> FigureFile:
-    """Draw how many tiles each stratum has, and how road share and height range are distributed."""
+    """Make the figure: tiles per stratum, and histograms of road share and height range."""
     caption = (
-        f"The {len(table)} tiles: their strata, share of road by the mask of the evaluation, and range of "
-        "heights in the DSM, houses and trees included. Dashed: the means, "
+        f"The {len(table)} tiles: number per stratum, road share by the evaluation mask, and height range "
+        "of the DSM, houses and trees included. Dashed: the means, "
         f"{table.road_percent.mean():.1f}% and {table.height_range_m.mean():.1f} m."
     )
     return FigureFile(NAME, caption, draw(table))
 
 
 def draw(table: Table) -> Figure:
-    """Draw a table of `statistics`."""
+    """Draw a table as returned by `statistics`."""
     figure = new_figure(2.1)
     bars, roads, heights = figure.subplots(1, 3, width_ratios=[1, 1.5, 1.5])
     groups = _groups(table)
-    drawn = bars.bar(
+    rectangles = bars.bar(
         list(groups), [len(part) for part in groups.values()], color=[_colour(name) for name in groups]
     )
-    bars.bar_label(drawn, fontsize=7)
+    bars.bar_label(rectangles, fontsize=7)
     bars.set_ylabel("tiles")
     bars.yaxis.set_major_locator(MaxNLocator(integer=True))
     _histogram(roads, table, groups, "road_percent", "share of road (%)")

@@ -1,4 +1,4 @@
-"""What all figures share: the page, the type and the colours they are drawn in, and how they are saved."""
+"""Page size, fonts and colours shared by all figures, and how figures are saved."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from matplotlib.typing import RcKeyType
 from flexroad.catalog.storage.paths import write
 
 WIDTH_IN = 7.0
-"""Width of a page's text."""
+"""Width of a figure: the text width of a page (inches)."""
 DPI = 220
 
 RAW, PLANE, FLEXROAD, TRUTH, PATH = "#f08c00", "#2f9e44", "#1c5fb8", "#8a8f98", "#d6293e"
-"""Colours of the paper's Fig. 1: orange, green, blue, and the vehicle's path in red."""
+"""Colours as in the paper's Fig. 1: raw DSM, plane, FlexRoad, reference (grey) and the vehicle's path."""
 STRATA = {"urban": "#4c6a92", "suburban": "#d99a3d", "rural": "#7a9a5b", "": "#8a8f98"}
 
 STYLE: dict[RcKeyType, Any] = {
@@ -38,30 +38,32 @@ STYLE: dict[RcKeyType, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "figure.constrained_layout.use": True,
-    # Text stays text in the PDF.
+    # Embeds TrueType fonts: text in the PDF stays text.
     "pdf.fonttype": 42,
 }
 
 
 @dataclass(frozen=True, eq=False)
 class FigureFile:
-    """A figure with its caption, or why there is none."""
+    """A figure with its file name and caption, or the reason why it was not drawn."""
 
     name: str
-    """Of its files, without suffix."""
+    """Name of the files, without suffix."""
     caption: str
     figure: Figure | None
+    """None if it was not drawn."""
     missing: str = ""
+    """Why it was not drawn."""
 
 
 def new_figure(height_in: float) -> Figure:
-    """Return an empty figure as wide as a page's text."""
+    """Return an empty figure of width `WIDTH_IN`."""
     return Figure(figsize=(WIDTH_IN, height_in))
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write NAME.pdf and NAME.png; equal figures give equal bytes."""
-    # A date or a version in the file would change it from day to day.
+    # A date or a software version in the metadata would change the bytes.
     for kind, metadata in (("pdf", {"CreationDate": None, "Producer": None}), ("png", {"Software": None})):
         buffer = io.BytesIO()
         with rc_context(STYLE):

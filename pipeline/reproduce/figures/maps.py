@@ -1,4 +1,4 @@
-"""Error and smoothness of Plane, RGT and FlexRoad on one tile: the paper's Fig. 4."""
+"""Maps of error and smoothness of Plane, RGT and FlexRoad on one tile (the paper's Fig. 4)."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ NAME = "error_and_smoothness"
 
 
 def make_figure(view: TileView, roles: Roles) -> FigureFile:
-    """Draw the vertical error per cell over the mean angle per face of the three methods."""
-    parts = (("Plane", roles.plane), ("RGT", roles.rgt), ("FlexRoad", roles.full))
-    missing = missing_roles(parts)
+    """Make the figure: vertical error per cell above mean angle per face, for the three methods."""
+    methods = (("Plane", roles.plane), ("RGT", roles.rgt), ("FlexRoad", roles.full))
+    missing = missing_roles(methods)
     caption = (
         f"{view}: vertical distance to {view.against} per cell (top) and mean angle of each face to its "
-        "neighbours (bottom) for Plane, RGT and FlexRoad. Both scales are logarithmic; values beyond their "
-        "ends have the end's colour. Above each map the tile's means, as in the run's table."
+        "neighbours (bottom) for Plane, RGT and FlexRoad. Both scales are logarithmic; values outside a "
+        "scale have the colour of its end. The titles give the tile's means, as in the run's table."
     )
-    columns = {label: variant for label, variant in parts if variant is not None}
+    columns = {label: variant for label, variant in methods if variant is not None}
     return FigureFile(NAME, caption, None if missing else draw(view, columns), missing)
 
 
 def draw(view: TileView, columns: dict[str, str]) -> Figure:
-    """Draw one column per label and variant."""
+    """Draw one column of two maps per variant; `columns` gives the variant of each label."""
     figure = new_figure(4.6)
     axes = figure.subplots(2, len(columns), sharex=True, sharey=True, squeeze=False)
-    drawn: list[tuple[AxesImage, Collection]] = []
+    artists: list[tuple[AxesImage, Collection]] = []
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
-        found = view.results[variant]
-        drawn.append((_errors(upper, view, variant), _angles(lower, found, view.grid)))
-        _titles(upper, lower, label, found)
-    for row, (artist, text) in enumerate(zip(drawn[0], ("error (m)", "angle (°)"), strict=True)):
+        result = view.results[variant]
+        artists.append((_errors(upper, view, variant), _angles(lower, result, view.grid)))
+        _titles(upper, lower, label, result)
+    for row, (artist, text) in enumerate(zip(artists[0], ("error (m)", "angle (°)"), strict=True)):
         bar = figure.colorbar(artist, ax=list(axes[row]), extend="both", pad=0.015, aspect=22, shrink=0.85)
         bar.set_label(text)
         bar.ax.yaxis.set_major_formatter("{x:g}")
-    _places(axes, view.grid)
+    _frame(axes, view.grid)
     return figure
 
 
@@ -61,16 +61,16 @@ def _errors(axes: Axes, view: TileView, variant: str) -> AxesImage:
     )
 
 
-def _angles(axes: Axes, found: Result, grid: Grid) -> Collection:
-    mesh = found.mesh
+def _angles(axes: Axes, result: Result, grid: Grid) -> Collection:
+    mesh = result.mesh
     x = mesh.vertices[:, 0] + (mesh.origin[0] - grid.west)
     y = mesh.vertices[:, 1] + (mesh.origin[1] - grid.south)
-    # Pixels inside the PDF: a hundred thousand triangles would make it slow to open.
+    # Rasterised in the PDF: a hundred thousand vector triangles would make it slow to open.
     return axes.tripcolor(
         x,
         y,
         mesh.faces,
-        facecolors=drawable(found.angles),
+        facecolors=drawable(result.angles),
         cmap=ANGLE_COLOURS,
         norm=ANGLE_NORM,
         edgecolors="none",
@@ -79,19 +79,19 @@ def _angles(axes: Axes, found: Result, grid: Grid) -> Collection:
     )
 
 
-def _titles(upper: Axes, lower: Axes, label: str, found: Result) -> None:
-    m = found.metrics
+def _titles(upper: Axes, lower: Axes, label: str, result: Result) -> None:
+    m = result.metrics
     upper.set_title(f"{label}\nroad {m.l2_road_m:.3f} m, terrain {m.l2_terrain_m:.3f} m")
     lower.set_title(f"road {m.mad_road_deg:.2f}°, terrain {m.mad_terrain_deg:.2f}°")
 
 
-def _places(axes: np.ndarray, grid: Grid) -> None:
-    for one in axes.flat:
-        one.set_aspect("equal")
-        one.spines[["top", "right"]].set_visible(True)
-        one.set_xlim(0, grid.width * grid.cell)
-        one.set_ylim(0, grid.height * grid.cell)
+def _frame(axes: np.ndarray, grid: Grid) -> None:
+    for panel in axes.flat:
+        panel.set_aspect("equal")
+        panel.spines[["top", "right"]].set_visible(True)
+        panel.set_xlim(0, grid.width * grid.cell)
+        panel.set_ylim(0, grid.height * grid.cell)
     axes[0, 0].set_ylabel("L2 error\nm north")
     axes[1, 0].set_ylabel("MAD\nm north")
-    for one in axes[1]:
-        one.set_xlabel("m east")
+    for panel in axes[1]:
+        panel.set_xlabel("m east")

@@ -1,4 +1,4 @@
-"""Heights along a vehicle's path for the raw surface, a plane and FlexRoad: the paper's Fig. 1."""
+"""Heights along a vehicle's path in the raw DSM, on a plane and on FlexRoad (the paper's Fig. 1)."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from flexroad.tasks.types import Floats
 
 NAME = "road_profile"
 CLOSE_M = 0.5
-"""Half the height of the close view of the errors."""
+"""Limit of the error axis (m)."""
 HEADROOM = 0.25
-"""Of the road's own height range, shown above and below it; what stands over the road is cut off there."""
+"""Margin of the height axis above and below the road, as a fraction of the road's height range."""
 
 
 def make_figure(view: TileView, roles: Roles) -> FigureFile:
-    """Draw the path, the heights along it and their errors."""
+    """Make the figure: map of the path, heights along it and their errors."""
     row, col = vehicle_trajectory(view.street)
     caption = (
-        f"{view}: heights along a vehicle's path (red: the longest way along the tile's roads, on their "
-        f"right) in the raw DSM, on the plane and on FlexRoad, over {view.against} (top), and their "
-        f"differences from it (bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are what stands on the "
-        "road or hangs over it."
+        f"{view}: heights along a vehicle's path (red: the longest path along the tile's roads, in the "
+        f"right-hand lane) of the raw DSM, the plane, FlexRoad and {view.against} (top), and their "
+        f"differences from {view.against} (bottom, cut off at {CLOSE_M:g} m). Peaks of the DSM are objects "
+        "on or above the road."
     )
     missing = missing_roles((("Plane", roles.plane),)) or ("" if row.size > 1 else "the tile has no road")
     if missing or roles.plane is None:
@@ -54,26 +54,36 @@ def make_figure(view: TileView, roles: Roles) -> FigureFile:
 
 
 def along(raster: Floats, row: Floats, col: Floats) -> Floats:
-    """Return a raster's heights at fractional rows and columns, bilinear; NaN beside NaN."""
+    """Return bilinear heights of a raster at fractional rows and columns; NaN next to NaN cells."""
     return np.asarray(ndimage.map_coordinates(raster, [row, col], order=1, mode="nearest"))
 
 
 def draw(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -> Figure:
-    """Draw a map of the path beside the heights along it, one of them ``truth``, and their errors."""
+    """Draw a map of the path, the heights along it and their errors.
+
+    Parameters
+    ----------
+    view : TileView
+        The tile.
+    row, col : Floats
+        The path, in cells.
+    heights : dict of str to Floats
+        Heights along the path (m) by label: ``raw DSM``, ``Plane``, ``FlexRoad`` and ``truth``.
+    """
     figure = new_figure(2.9)
     axes = figure.subplot_mosaic([["map", "heights"], ["map", "errors"]], width_ratios=[1, 2.1])
     cell = view.grid.cell
     at = cell * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(row), np.diff(col)))])
     _map(axes["map"], view, row, col, at)
-    looks: dict[str, dict[str, Any]] = {
+    styles: dict[str, dict[str, Any]] = {
         "raw DSM": {"color": RAW, "linewidth": 0.8},
         "Plane": {"color": PLANE},
         "truth": {"color": TRUTH, "linewidth": 2.4, "alpha": 0.7},
         "FlexRoad": {"color": FLEXROAD, "linestyle": (0, (3.5, 1.2))},
     }
-    for label, look in looks.items():
-        axes["heights"].plot(at, heights[label], label=label, **look)
-        axes["errors"].plot(at, heights[label] - heights["truth"], label=label, **look)
+    for label, style in styles.items():
+        axes["heights"].plot(at, heights[label], label=label, **style)
+        axes["errors"].plot(at, heights[label] - heights["truth"], label=label, **style)
     _frame(axes["heights"], axes["errors"], at, heights)
     return figure
 
@@ -87,7 +97,7 @@ def _map(axes: Axes, view: TileView, row: Floats, col: Floats, at: Floats) -> No
     for distance in np.arange(0, at[-1] + 1, 100):
         i = int(np.searchsorted(at, distance).clip(0, at.size - 1))
         axes.plot(x[i], y[i], "o", color=PATH, markersize=2.5)
-        # Towards the middle of the map, or labels of the ends would stand outside.
+        # Offset towards the middle of the map, so that the labels of the ends stay inside.
         right, up = x[i] < x.max() / 2, y[i] < y.max() / 2
         axes.annotate(
             f"{distance:.0f} m",
@@ -115,5 +125,5 @@ def _frame(upper: Axes, lower: Axes, at: Floats, heights: dict[str, Floats]) -> 
     lower.set_ylim(-CLOSE_M, CLOSE_M)
     lower.set_ylabel("error (m)")
     lower.set_xlabel("distance along the path (m)")
-    for one in (upper, lower):
-        one.set_xlim(0, at[-1])
+    for axes in (upper, lower):
+        axes.set_xlim(0, at[-1])

@@ -1,4 +1,4 @@
-"""Which variant plays which part in the figures: told by its options, whatever its name."""
+"""Which variant of a run is which method of the paper, derived from the variant's options, not its name."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from flexroad.pipeline.config.models import Chain, Config
 
 @dataclass(frozen=True)
 class Roles:
-    """Variants by their part; None where a run has none."""
+    """Names of the variants by method; None if the run has no such variant."""
 
     full: str
-    """FlexRoad itself: what the others are compared with."""
+    """FlexRoad, the full pipeline, which the others are compared with."""
     plane: str | None = None
     rgt: str | None = None
     wo_nurbs: str | None = None
@@ -20,23 +20,24 @@ class Roles:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All variants that play."""
-        parts = (self.full, self.plane, self.rgt, self.wo_nurbs, self.wo_ecsrc)
-        return tuple(name for name in parts if name is not None)
+        """Names of all variants in use."""
+        names = (self.full, self.plane, self.rgt, self.wo_nurbs, self.wo_ecsrc)
+        return tuple(name for name in names if name is not None)
 
 
 def roles_of(config: Config) -> Roles:
-    """Find the parts in a configuration; FlexRoad is its first exported variant."""
+    """Return the roles of a configuration's variants; FlexRoad is the first exported variant."""
     full = config.export.variants[0]
-    found: dict[str, str] = {}
+    roles: dict[str, str] = {}
     for name, chain in config.chains.items():
-        part = _part(chain, config.chains[full])
-        if part:
-            found.setdefault(part, name)
-    return Roles(full, **found)
+        role = _role(chain, config.chains[full])
+        if role:
+            roles.setdefault(role, name)
+    return Roles(full, **roles)
 
 
-def _part(chain: Chain, full: Chain) -> str:
+def _role(chain: Chain, full: Chain) -> str:
+    """Return the name of the field of `Roles` for a variant, or an empty string."""
     fit = chain["fit"].model_dump()
     if fit["method"] == "plane":
         return "plane"
@@ -46,15 +47,15 @@ def _part(chain: Chain, full: Chain) -> str:
 
 
 def changes(chain: Chain, full: Chain) -> set[str]:
-    """Return the options that a variant changes, each as ``stage.option``.
+    """Return the options in which a variant differs from the full pipeline, each as ``stage.option``.
 
-    Of a stage with another method that is its method alone: the options of two methods do not compare.
+    For a stage with another method, that is ``stage.method`` only: options of two methods cannot be compared.
     """
-    found = set()
+    changed = set()
     for stage, options in chain.items():
-        mine, other = options.model_dump(), full[stage].model_dump()
-        if mine.get("method") != other.get("method"):
-            found.add(f"{stage}.method")
+        own, other = options.model_dump(), full[stage].model_dump()
+        if own.get("method") != other.get("method"):
+            changed.add(f"{stage}.method")
         else:
-            found |= {f"{stage}.{key}" for key in mine if mine[key] != other[key]}
-    return found
+            changed |= {f"{stage}.{key}" for key in own if own[key] != other[key]}
+    return changed

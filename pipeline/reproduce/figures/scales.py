@@ -1,4 +1,4 @@
-"""The colours of errors and angles, the same wherever they are drawn."""
+"""Colour scales of errors and angles, shared by all figures."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from matplotlib.colors import LogNorm
 from flexroad.tasks.types import Floats
 
 ERROR_COLOURS, ERROR_NORM = "magma_r", LogNorm(0.01, 10)
-"""Metres; logarithmic, as on one tile errors go from a centimetre to a house."""
+"""Scale of errors (m); logarithmic, because errors on one tile range from a centimetre to several metres."""
 ANGLE_COLOURS, ANGLE_NORM = "viridis_r", LogNorm(0.1, 60)
-"""Degrees; logarithmic for the same reason."""
+"""Scale of angles (degrees), logarithmic."""
 LEAST = 1e-9
+"""Replaces zeros, which have no logarithm."""
 
 
 def drawable(values: Floats) -> np.ma.MaskedArray[tuple[int, ...], np.dtype[np.float64]]:
-    """Return values with NaN masked, and with the zeros, which have no logarithm, just above zero."""
+    """Return values with NaN masked and values below `LEAST` raised to `LEAST`."""
     return np.ma.masked_invalid(np.maximum(values, LEAST))

@@ -1,4 +1,4 @@
-"""One tile as the figures see it: its rasters, and what each variant made of it."""
+"""The data of one tile that the figures show: its rasters and the result of each variant."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, Roa
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a variant made of the tile."""
+    """The result of one variant on the tile."""
 
     mesh: Mesh
     height: Floats
-    """Of the mesh at every cell centre, ``(H, W)``, m; NaN where it has none."""
+    """Height of the mesh at every cell centre, ``(H, W)``, m; NaN outside the mesh."""
     angles: Floats
     """Mean angle of each face to its neighbours, ``(F,)``, degrees."""
     metrics: Metrics
-    """Its row in the run's table."""
+    """The variant's row in the run's table."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileView:
-    """One tile; all rasters on its core, ``(H, W)``."""
+    """One tile with its results; all rasters cover its core, ``(H, W)``."""
 
     tile_id: str
     stratum: str
@@ -45,16 +45,16 @@ class TileView:
     truth: Floats
     """Heights that errors are measured against (m)."""
     against: str
-    """What they are: the catalog's reference, or the DTM in its place."""
+    """Name of `truth` for captions: the reference surface, or the DTM if there is none."""
     street: Bools
-    """Where vehicles drive: the true roads, or the filtered mask where they are not known."""
+    """Road cells: the catalog's reference road mask, or the filtered mask if there is none."""
     dropped: Bools
-    """Cells of the segmented mask that the filter took away."""
+    """Cells of the segmented mask that the filter dropped."""
     results: dict[str, Result]
     """By variant."""
 
     def error(self, variant: str) -> Floats:
-        """Return the vertical distance of a variant's mesh from the truth, ``(H, W)``, m."""
+        """Return the absolute vertical distance of a variant's mesh from `truth`, ``(H, W)``, m."""
         return np.abs(self.results[variant].height - self.truth)
 
     def __str__(self) -> str:
@@ -62,40 +62,40 @@ class TileView:
 
 
 def typical_tile(done: pd.DataFrame, variant: str) -> str:
-    """Return the id of the tile whose road L2 is the median of the variant's finished tiles."""
+    """Return the id of the finished tile with the variant's median road L2."""
     table = done[(done.variant == variant) & done.l2_road_m.notna()].sort_values(["l2_road_m", "tile_id"])
     if table.empty:
-        raise ConfigError(f"variant {variant} has no tile with a road; name a tile to draw with --tile")
+        raise ConfigError(f"variant {variant} has no tile with a road; give the tile to draw with --tile")
     return str(table.tile_id.iloc[(len(table) - 1) // 2])
 
 
 def read_tile_view(run: Run, tile_id: str, roles: Roles) -> TileView:
-    """Read a tile's results from the store, and make those again that are not kept there.
+    """Read a tile's results from the store; results that are not stored are recomputed.
 
     Raises
     ------
     CatalogError
-        If the tile is unknown.
+        If the catalog has no such tile.
     ConfigError
-        If a variant is, or a stage fails on the tile.
+        If the run has no such variant, or a stage fails on the tile.
     """
     (tile,) = run.catalog.select([tile_id]).tiles
-    (found,) = peek_statuses(run, [tile])
-    graph = found.graph
+    (status,) = peek_statuses(run, [tile])
+    graph = status.graph
     for variant in roles.names:
         if variant not in graph.variants:
             raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
     try:
         return _view(graph, Evaluator(graph, ArtefactStore(run.store)), roles)
     except StageError as error:
-        raise ConfigError(f"tile {tile_id}: {error}; name another with --tile") from error
+        raise ConfigError(f"tile {tile_id}: {error}; choose another tile with --tile") from error
 
 
-def _view(graph: TileGraph, pull: Evaluator, roles: Roles) -> TileView:
-    made = graph.variants[roles.full]
-    data: TileData = pull(made["load"])
-    road: RoadMask = pull(made["segment"])
-    clusters: RoadClusters = pull(made["ecsrc"])
+def _view(graph: TileGraph, evaluate: Evaluator, roles: Roles) -> TileView:
+    nodes = graph.variants[roles.full]
+    data: TileData = evaluate(nodes["load"])
+    road: RoadMask = evaluate(nodes["segment"])
+    clusters: RoadClusters = evaluate(nodes["ecsrc"])
     core, window = data.core, data.grid.window(data.core)
     street = clusters.mask if data.reference_road is None else data.reference_road
     return TileView(
@@ -107,17 +107,25 @@ def _view(graph: TileGraph, pull: Evaluator, roles: Roles) -> TileView:
         "the DTM" if data.reference is None else "the reference surface",
         street[window] & ~road.outside[window],
         (road.mask & ~clusters.mask)[window],
-        {variant: _result(graph, pull, variant, core) for variant in roles.names},
+        {variant: _result(graph, evaluate, variant, core) for variant in roles.names},
     )
 
 
-def _result(graph: TileGraph, pull: Evaluator, variant: str, core: Grid) -> Result:
-    mesh: Mesh = pull(graph.variants[variant]["sample"])
-    metrics: Metrics = pull(graph.variants[variant]["evaluate"])
+def _result(graph: TileGraph, evaluate: Evaluator, variant: str, core: Grid) -> Result:
+    mesh: Mesh = evaluate(graph.variants[variant]["sample"])
+    metrics: Metrics = evaluate(graph.variants[variant]["evaluate"])
     return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), metrics)
 
 
-def missing_roles(parts: Iterable[tuple[str, str | None]]) -> str:
-    """Return why a figure cannot be drawn: the parts no variant of the run plays; empty if there are none."""
-    missing = [label for label, variant in parts if variant is None]
-    return f"the run has no variant for {' and '.join(missing)}; `--config ablation` has" if missing else ""
+def missing_roles(methods: Iterable[tuple[str, str | None]]) -> str:
+    """Return which methods have no variant in the run, as a message; empty if all have one.
+
+    Parameters
+    ----------
+    methods : iterable of (str, str or None)
+        Label and variant of each method that a figure needs.
+    """
+    missing = [label for label, variant in methods if variant is None]
+    if not missing:
+        return ""
+    return f"the run has no variant for {' and '.join(missing)}; `--config ablation` has all variants"

@@ -1,4 +1,4 @@
-"""Accuracy against smoothness over the control grid, the degree and the sampling."""
+"""Accuracy against smoothness for different control grids, degrees and sampling distances."""
 
 from __future__ import annotations
 
@@ -19,43 +19,47 @@ SWEEPS: dict[str, tuple[str, ...]] = {
     "Degree p = q": ("fit.degree",),
     "Sampling, road / terrain (m)": ("sample.road_m", "sample.terrain_m"),
 }
-"""What is varied, and the options that do it."""
+"""The options that are varied, by panel title."""
 
 
 def make_figure(config: Config, full: str, done: pd.DataFrame) -> FigureFile:
-    """Draw road L2 over road MAD, mean over tiles, along each sweep the run has."""
-    found = {title: sweep(config.chains, full, options) for title, options in SWEEPS.items()}
-    found = {title: names for title, names in found.items() if len(names) > 1}
+    """Make the figure: road L2 over road MAD, mean over tiles, for each sweep in the run."""
+    sweeps = {title: sweep(config.chains, full, options) for title, options in SWEEPS.items()}
+    sweeps = {title: labels for title, labels in sweeps.items() if len(labels) > 1}
     caption = (
-        "Accuracy against smoothness on roads, mean over tiles: each dot is a variant that changes the "
-        "control grid, the degree or the sampling alone; the red one is the full pipeline. Left is smoother, "
+        "Accuracy against smoothness on roads, mean over tiles. Each dot is a variant that changes only the "
+        "control grid, the degree or the sampling; the red dot is the full pipeline. Left is smoother, "
         "lower is more accurate."
     )
-    if not found:
+    if not sweeps:
         missing = (
-            "no variant changes the control grid, the degree or the sampling alone; `--config ablation` has"
+            "no variant changes only the control grid, the degree or the sampling; `--config ablation` has "
+            "such variants"
         )
         return FigureFile(NAME, caption, None, missing)
     means = done.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
-    return FigureFile(NAME, caption, draw(means, found, full))
+    return FigureFile(NAME, caption, draw(means, sweeps, full))
 
 
 def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> dict[str, str]:
-    """Return the variants that change nothing but these options, and the full one, in their order.
+    """Return the variants that differ from the full pipeline only in these options, and the full one.
 
     Returns
     -------
     dict
-        Label by variant.
+        Label by variant, ordered by the options' values.
     """
     values = {
         variant: tuple(_value(chain, option) for option in options)
         for variant, chain in chains.items()
         if changes(chain, chains[full]) <= set(options)
     }
-    # Another name for the full pipeline is no second dot.
-    once = {variant: v for variant, v in values.items() if variant == full or v != values[full]}
-    return {variant: " / ".join(map(_text, once[variant])) for variant in sorted(once, key=once.__getitem__)}
+    # A variant with the same values as the full pipeline is left out.
+    distinct = {variant: v for variant, v in values.items() if variant == full or v != values[full]}
+    return {
+        variant: " / ".join(map(_text, distinct[variant]))
+        for variant in sorted(distinct, key=distinct.__getitem__)
+    }
 
 
 def _value(chain: Chain, option: str) -> Any:
@@ -75,16 +79,16 @@ def draw(means: pd.DataFrame, sweeps: Mapping[str, Mapping[str, str]], full: str
     means : DataFrame
         ``mad_road_deg`` and ``l2_road_m`` by variant.
     sweeps : Mapping
-        Labels by variant, by title.
+        For each title, the labels by variant.
     full : str
-        The variant all sweeps go through.
+        The full pipeline, part of every sweep.
     """
     figure = new_figure(2.4)
     axes = figure.subplots(1, len(sweeps), sharey=True, squeeze=False)[0]
-    for one, (title, labels) in zip(axes, sweeps.items(), strict=True):
-        _panel(one, means.reindex(list(labels)), labels, full)
-        one.set_title(title)
-        one.set_xlabel("road MAD (°)")
+    for panel, (title, labels) in zip(axes, sweeps.items(), strict=True):
+        _panel(panel, means.reindex(list(labels)), labels, full)
+        panel.set_title(title)
+        panel.set_xlabel("road MAD (°)")
     axes[0].set_ylabel("road L2 (m)")
     axes[0].set_ylim(bottom=0)
     return figure
@@ -95,7 +99,7 @@ def _panel(axes: Axes, means: pd.DataFrame, labels: Mapping[str, str], full: str
     for i, (variant, x, y) in enumerate(means.itertuples(name=None)):
         colour = PATH if variant == full else FLEXROAD
         axes.plot(x, y, "o", color=colour, markersize=4, zorder=3)
-        # Above and below in turn: neighbours on a flat stretch would write over each other.
+        # Alternately above and below, so that the labels of close neighbours do not overlap.
         up = bool(i % 2)
         axes.annotate(
             labels[variant],

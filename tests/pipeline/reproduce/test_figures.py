@@ -1,4 +1,4 @@
-"""The figures draw the run's own numbers."""
+"""The figures show the numbers of the run."""
 
 import io
 
@@ -53,7 +53,7 @@ ABLATION = {
 ROLES = roles.Roles("flexroad", "flat", "cells", "mixed", "bare")
 
 
-def finished(folder, raw, survey) -> Run:
+def finished_run(folder, raw, survey) -> Run:
     run = Run.create(folder, compose(raw, "quick"), Catalog.read(survey / "catalog.parquet"))
     assert run_tiles(run, SerialExecutor()).done == len(run.catalog.tiles)
     return run
@@ -61,7 +61,7 @@ def finished(folder, raw, survey) -> Run:
 
 @pytest.fixture(scope="module")
 def run(made_survey, tmp_path_factory) -> Run:
-    return finished(tmp_path_factory.mktemp("figures") / "run", ABLATION, made_survey)
+    return finished_run(tmp_path_factory.mktemp("figures") / "run", ABLATION, made_survey)
 
 
 @pytest.fixture(scope="module")
@@ -78,27 +78,27 @@ def row_of(rows, tile, variant):
     return rows[(rows.tile_id == tile.tile_id) & (rows.variant == variant)].iloc[0]
 
 
-# --- which variants ---------------------------------------------------------------------------------------
+# --- roles ---------------------------------------------------------------------------------------
 
 
-def test_parts_are_told_by_options_not_by_names(run):
+def test_roles_of_renamed_variants_follow_from_options(run):
     assert roles.roles_of(run.config) == ROLES
 
 
-def test_the_shipped_configurations_have_their_parts():
+def test_roles_of_shipped_configurations_are_complete():
     assert roles.roles_of(load_config("paper")) == roles.Roles("flexroad", "plane", "rgt")
-    whole = roles.roles_of(load_config("ablation"))
-    assert whole == roles.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
+    ablation = roles.roles_of(load_config("ablation"))
+    assert ablation == roles.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
 
 
-def test_changes_name_options_and_methods(run):
+def test_changes_lists_options_or_method(run):
     chains = run.config.chains
     assert roles.changes(chains["flexroad"], chains["flexroad"]) == set()
     assert roles.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
     assert roles.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
 
 
-def test_the_typical_tile_is_the_median():
+def test_typical_tile_is_median_of_tiles_with_road():
     table = pd.DataFrame(
         {"tile_id": list("abcde"), "variant": "v", "l2_road_m": [0.5, 0.1, np.nan, 0.2, 0.3]}
     )
@@ -110,10 +110,10 @@ def test_the_typical_tile_is_the_median():
 # --- maps -------------------------------------------------------------------------------------------------
 
 
-def test_maps_draw_what_the_table_says(run, rows, tile, made_survey):
+def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
     columns = {"Plane": "flat", "RGT": "cells", "FlexRoad": "flexroad"}
-    drawn = maps.draw(tile, columns)
-    axes = np.array(drawn.axes[:6]).reshape(2, 3)
+    figure = maps.draw(tile, columns)
+    axes = np.array(figure.axes[:6]).reshape(2, 3)
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
         row = row_of(rows, tile, variant)
         error = upper.images[0].get_array()
@@ -134,23 +134,23 @@ def test_maps_draw_what_the_table_says(run, rows, tile, made_survey):
 # --- profile ----------------------------------------------------------------------------------------------
 
 
-def test_heights_along_are_bilinear():
+def test_along_is_bilinear_and_nan_next_to_nan():
     rows, cols = np.mgrid[:6, :7]
     at = np.array([0.25, 2.5, 4.75]), np.array([5.5, 0.0, 3.2])
     np.testing.assert_allclose(profile.along(3.0 * rows - 2.0 * cols, *at), 3 * at[0] - 2 * at[1])
-    holed = np.where((rows == 2) & (cols == 0), np.nan, 1.0)
-    assert np.isnan(profile.along(holed, *at)).tolist() == [False, True, False]
+    with_hole = np.where((rows == 2) & (cols == 0), np.nan, 1.0)
+    assert np.isnan(profile.along(with_hole, *at)).tolist() == [False, True, False]
 
 
-def test_the_profile_draws_the_rasters_along_the_path(tile):
-    drawn = profile.make_figure(tile, ROLES).figure
-    path, *_ = next(axes for axes in drawn.axes if axes.images).lines
+def test_profile_shows_rasters_along_path(tile):
+    figure = profile.make_figure(tile, ROLES).figure
+    path, *_ = next(axes for axes in figure.axes if axes.images).lines
     east, north = tile.grid.west + path.get_xdata(), tile.grid.south + path.get_ydata()
     row, col = tile.grid.cells(east, north)
-    assert tile.street[row, col].mean() > 0.95, "the vehicle keeps to the road"
-    heights, errors = (axes for axes in drawn.axes if not axes.images)
+    assert tile.street[row, col].mean() > 0.95, "the path leaves the road"
+    heights, errors = (axes for axes in figure.axes if not axes.images)
     lines = {line.get_label(): line for line in heights.lines}
-    # Between cells heights are interpolated; on a plane that is exact.
+    # Heights are interpolated between cells, which is exact on a plane.
     plane = tile.results["flat"].mesh
     fit = np.linalg.lstsq(np.c_[plane.vertices[:, :2], np.ones(len(plane.vertices))], plane.vertices[:, 2])[0]
     expected = fit @ np.array([east - plane.origin[0], north - plane.origin[1], np.ones(east.size)])
@@ -161,43 +161,43 @@ def test_the_profile_draws_the_rasters_along_the_path(tile):
         np.testing.assert_allclose(line.get_ydata(), whole - lines["truth"].get_ydata())
 
 
-def test_the_route_keeps_right_on_a_straight_road():
+def test_trajectory_on_straight_road_is_right_of_centre():
     road = np.zeros((80, 120), bool)
     road[40:50] = True
-    road[40:44, 60] = False  # a hole does not cut the road
+    road[40:44, 60] = False  # a hole in the mask does not interrupt the road
     row, col = trajectory.vehicle_trajectory(road)
     assert np.ptp(col) > 95
     assert road[row.round().astype(int), col.round().astype(int)].mean() > 0.98
-    # Rows count southwards: who drives east has the road's southern half on the right.
+    # Rows increase southwards: eastbound traffic uses the southern half of the road.
     south = np.median(row) > 44.5
     assert south == (col[-1] > col[0])
     assert 1.5 < abs(np.median(row) - 44.5) < 3.5
 
 
-def test_the_route_is_the_longest_of_a_fork():
+def test_trajectory_at_fork_is_longest_path():
     road = np.zeros((150, 150), bool)
     road[70:78, :] = True
     road[:75, 40:48] = True
     row, col = trajectory.vehicle_trajectory(road)
     along = np.hypot(np.diff(row), np.diff(col)).sum()
-    # From the northern end to the eastern one.
+    # From the northern to the eastern end.
     assert abs(along - (74 + 106)) < 30
     (north, _), (_, east) = sorted((row[i], col[i]) for i in (0, -1))
     assert north < 15
     assert east > 135
 
 
-def test_the_route_ends_where_the_lane_leaves_the_tile():
+def test_trajectory_on_diagonal_road_ends_at_tile_edge():
     row, col = np.indices((200, 200))
     row, col = trajectory.vehicle_trajectory(np.abs(row - col) < 20)
-    # Straight from end to end: a lane that ran on along the tile's edge would be longer than its chord.
+    # The path is straight: one that continued along the tile's edge would be longer than its chord.
     along = np.hypot(np.diff(row), np.diff(col)).sum()
     assert along / np.hypot(row[-1] - row[0], col[-1] - col[0]) < 1.001
     assert along > 250
 
 
 @pytest.mark.parametrize("cells", [0, 1, 2])
-def test_a_route_needs_a_road(cells):
+def test_trajectory_on_tiny_road_is_empty_or_short(cells):
     road = np.zeros((20, 20), bool)
     road[5, 5 : 5 + cells] = True
     row, col = trajectory.vehicle_trajectory(road)
@@ -207,7 +207,7 @@ def test_a_route_needs_a_road(cells):
 # --- renders ----------------------------------------------------------------------------------------------
 
 
-def test_vertices_have_the_colour_of_the_error_under_them(tile):
+def test_vertex_colours_match_error_below(tile):
     colours = renders.vertex_colours(tile, "cells")
     mesh = tile.results["cells"].mesh
     row, col = tile.grid.cells(mesh.vertices[:, 0] + mesh.origin[0], mesh.vertices[:, 1] + mesh.origin[1])
@@ -217,10 +217,10 @@ def test_vertices_have_the_colour_of_the_error_under_them(tile):
     assert tuple(colours[worst]) == colour(renders.ERROR_NORM(error[worst]), bytes=True)[:3]
     exact = error < renders.ERROR_NORM.vmin
     assert exact.any()
-    assert (colours[exact] == colour(-1.0, bytes=True)[:3]).all(), "no error at all is the scale's good end"
+    assert (colours[exact] == colour(-1.0, bytes=True)[:3]).all(), "zero error is the lower end"
 
 
-def test_the_square_that_is_drawn_holds_most_of_what_was_dropped():
+def test_busiest_is_square_with_most_dropped_cells():
     grid = Grid("EPSG:25832", 1000.0, 2250.0, 1.0, 250, 250)
     dropped = np.zeros(grid.shape, bool)
     dropped[10, 10] = dropped[200, 150:160] = True
@@ -235,27 +235,27 @@ def test_the_square_that_is_drawn_holds_most_of_what_was_dropped():
 # --- trade-off --------------------------------------------------------------------------------------------
 
 
-def test_the_trade_off_draws_the_means_of_the_table(run, rows):
-    drawn = trade_off.make_figure(run.config, "flexroad", rows).figure
+def test_trade_off_shows_means_of_metrics_table(run, rows):
+    figure = trade_off.make_figure(run.config, "flexroad", rows).figure
     expected = {
         "Control grid": ["coarse", "flexroad", "fine"],
         "Degree p = q": ["quadratic", "flexroad"],
         "Sampling, road / terrain (m)": ["flexroad", "sparse"],
     }
-    assert [axes.get_title() for axes in drawn.axes] == list(expected)
+    assert [axes.get_title() for axes in figure.axes] == list(expected)
     means = rows.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
-    for axes, variants in zip(drawn.axes, expected.values(), strict=True):
+    for axes, variants in zip(figure.axes, expected.values(), strict=True):
         np.testing.assert_array_equal(axes.lines[0].get_xydata(), means.loc[variants].to_numpy())
         red = [line.get_xydata()[0] for line in axes.lines[1:] if line.get_color() == trade_off.PATH]
         np.testing.assert_array_equal(red, [means.loc["flexroad"].to_numpy()])
-    assert [text.get_text() for text in drawn.axes[0].texts] == ["8×8", "10×10", "14×14"]
-    assert [text.get_text() for text in drawn.axes[2].texts] == ["1 / 10", "2 / 20"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["8×8", "10×10", "14×14"]
+    assert [text.get_text() for text in figure.axes[2].texts] == ["1 / 10", "2 / 20"]
 
 
-# --- data set ---------------------------------------------------------------------------------------------
+# --- dataset ---------------------------------------------------------------------------------------------
 
 
-def test_statistics_are_those_of_the_rasters_and_the_table(run, rows, made_survey):
+def test_statistics_match_rasters_and_metrics_table(run, rows, made_survey):
     table = dataset.statistics(run, "flexroad", rows).set_index("tile_id")
     assert list(table.index) == [tile.id for tile in run.catalog.tiles]
     for tile in run.catalog.tiles:
@@ -268,7 +268,7 @@ def test_statistics_are_those_of_the_rasters_and_the_table(run, rows, made_surve
         assert table.road_percent[tile.id] == pytest.approx(share, abs=0.5)
 
 
-def test_the_data_set_is_drawn_whole():
+def test_dataset_figure_counts_every_tile():
     table = pd.DataFrame(
         {
             "tile_id": list("abcdef"),
@@ -286,12 +286,12 @@ def test_the_data_set_is_drawn_whole():
     assert heights.lines[0].get_xdata()[0] == pytest.approx(45)
 
 
-# --- all of them ------------------------------------------------------------------------------------------
+# --- write_figures ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def quick_renders(monkeypatch):
-    """Draw no meshes: that is `test_render`'s, and takes seconds."""
+    """Replace the slow drawing of meshes by noise; `test_render` tests the drawing."""
     buffer = io.BytesIO()
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(buffer, format="png")
@@ -299,7 +299,7 @@ def quick_renders(monkeypatch):
 
 
 @pytest.mark.usefixtures("quick_renders")
-def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
+def test_write_figures_twice_gives_equal_files(run, rows, tmp_path):
     for name in ("one", "two"):
         assert figures.write_figures(run, tmp_path / name) == []
     page = (tmp_path / "one" / "figures.md").read_text()
@@ -315,7 +315,7 @@ def test_every_figure_is_written_the_same_each_time(run, rows, tmp_path):
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes(), file.name
 
 
-def test_without_opengl_the_others_are_drawn(run, tmp_path, monkeypatch):
+def test_write_figures_without_opengl_leaves_out_renders(run, tmp_path, monkeypatch):
     monkeypatch.setattr(renders, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes))
     (note,) = figures.write_figures(run, tmp_path)
     assert "ablation_renders" in note
@@ -325,19 +325,19 @@ def test_without_opengl_the_others_are_drawn(run, tmp_path, monkeypatch):
     assert "OpenGL" in (tmp_path / "figures.md").read_text()
 
 
-def test_a_run_without_variants_says_what_it_lacks(made_survey, tmp_path):
-    only = finished(tmp_path / "run", BASE, made_survey)
+def test_write_figures_without_variants_lists_missing_figures(made_survey, tmp_path):
+    only = finished_run(tmp_path / "run", BASE, made_survey)
     notes = figures.write_figures(only, tmp_path / "out", only.catalog.tiles[0].id)
     assert [note.split(":")[0].removeprefix("no figure ") for note in notes] == list(FIGURE_NAMES[:4])
     assert all("--config ablation" in note for note in notes)
     assert (tmp_path / "out" / "dataset.pdf").exists()
 
 
-def test_tiles_without_every_variant_are_left_out(made_survey, tmp_path):
-    part = finished(tmp_path / "run", BASE, made_survey)
+def test_write_figures_leaves_out_tiles_with_failed_variant(made_survey, tmp_path):
+    part = finished_run(tmp_path / "run", BASE, made_survey)
     table = read_metrics(part.path)
-    lost = table.tile_id.iloc[0]
-    table.loc[table.tile_id == lost, "status"] = "failed"
+    failed = table.tile_id.iloc[0]
+    table.loc[table.tile_id == failed, "status"] = "failed"
     table.to_parquet(part.path / "metrics.parquet", index=False)
     figures.write_figures(part, tmp_path / "out")
     assert "The 3 tiles" in (tmp_path / "out" / "figures.md").read_text()
@@ -346,14 +346,14 @@ def test_tiles_without_every_variant_are_left_out(made_survey, tmp_path):
         figures.write_figures(part, tmp_path / "out")
 
 
-def test_unknown_tiles_and_variants_are_named(run, tmp_path):
+def test_write_figures_unknown_tile_or_variant_raises(run, tmp_path):
     with pytest.raises(CatalogError, match="0_0"):
         figures.write_figures(run, tmp_path, "0_0")
     with pytest.raises(ConfigError, match="no variant 'nobody'"):
         figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad", plane="nobody"))
 
 
-def test_the_run_is_left_as_it_is(run, tmp_path):
+def test_write_figures_leaves_run_unchanged(run, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
     figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad"))
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before

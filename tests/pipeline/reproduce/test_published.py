@@ -1,4 +1,4 @@
-"""The paper's numbers agree with one another, and so do the claims with the tables they quote."""
+"""The paper's tables agree with each other, and the claims with the tables they quote."""
 
 from itertools import pairwise
 
@@ -12,13 +12,13 @@ from flexroad.pipeline.reproduce.published import GEROD, TABLE_I, TABLE_II, publ
 TEXT_AND_TABLE_DIFFER = {"Sampling at 0.5 m / 5 m doubles the triangles (four times in Table II)"}
 
 
-def test_table_ii_has_the_papers_rows_and_the_configuration_has_them_all():
+def test_ablation_config_has_all_rows_of_the_tables():
     assert len(TABLE_II) == 19
     names = [row.variant for row in (*TABLE_I[:2], *TABLE_II)]
     assert names == list(load_config("ablation").chains)
 
 
-def test_the_full_pipeline_is_the_flexroad_of_table_i():
+def test_full_pipeline_row_matches_table_i():
     main, full = TABLE_I[-1], TABLE_II[0]
     for figure in FIGURES:
         # Table I rounds triangles to thousands.
@@ -27,7 +27,7 @@ def test_the_full_pipeline_is_the_flexroad_of_table_i():
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.text)
-def test_the_papers_tables_bear_out_its_claims(claim):
+def test_claim_matches_the_papers_tables(claim):
     if isinstance(claim, Order):
         values = [published(name, claim.dataset).value(claim.figure) for name in claim.ascending]
         assert all(a <= b for a, b in pairwise(values))
@@ -44,7 +44,7 @@ def test_the_papers_tables_bear_out_its_claims(claim):
         assert percent == pytest.approx(claim.quoted, abs=1.0)
 
 
-def test_claims_name_what_there_is():
+def test_claims_refer_to_existing_figures_and_variants():
     assert len({claim.text for claim in CLAIMS}) == len(CLAIMS)
     for claim in CLAIMS:
         assert claim.figure in FIGURES

@@ -1,4 +1,4 @@
-"""The comparison with the paper: means, intervals, verdicts, and pages that say whose data they are."""
+"""The comparison with the paper: means, intervals, verdicts, and pages that name their data."""
 
 import io
 import re
@@ -31,7 +31,7 @@ from flexroad.pipeline.reproduce.claims import (
 )
 from flexroad.pipeline.reproduce.comparison import compare
 from flexroad.pipeline.reproduce.metrics_data import (
-    KEPT,
+    FIGURE_DTYPE,
     MetricsData,
     collect,
     read_metrics_data,
@@ -46,7 +46,7 @@ VARIANTS = list(load_config("ablation").chains)
 
 
 def figures(values: dict[str, list[float]]) -> pd.DataFrame:
-    """Every figure of each variant's tiles is the value given."""
+    """Return a table in which every figure of a variant's tile has the given value."""
     rows = [
         (f"t{i}", variant, *[value] * len(FIGURES))
         for variant, tiles in values.items()
@@ -56,7 +56,7 @@ def figures(values: dict[str, list[float]]) -> pd.DataFrame:
 
 
 def as_published(tiles: int = 3, classes: str = "segmented") -> MetricsData:
-    """Tiles whose every figure is the paper's."""
+    """Return tiles whose figures equal the paper's."""
     rows = [
         ("made", classes, f"t{i}", ("urban", "rural")[i % 2], name, *map(published(name).value, FIGURES))
         for i in range(tiles)
@@ -67,14 +67,14 @@ def as_published(tiles: int = 3, classes: str = "segmented") -> MetricsData:
     )
 
 
-def test_means_are_over_tiles_that_have_the_figure():
+def test_bootstrap_means_ignore_nan():
     means = bootstrap(figures({"a": [1.0, 3.0, np.nan], "b": [2.0, 2.0, 5.0]}))
     assert means.mean["a", "l2_road_m"] == 2
     assert means.mean["b", "triangles"] == 3
     assert means.ratio("b", "a", "l2_road_m")[0] == 1.5
 
 
-def test_intervals_are_those_of_scipy():
+def test_bootstrap_interval_matches_scipy():
     values = np.random.default_rng(3).gamma(2, 1, 60)
     low, high = bootstrap(figures({"a": values.tolist()})).interval("a", "l2_road_m")
     peer = scipy.stats.bootstrap((values,), np.mean, method="percentile", n_resamples=20_000, rng=1)
@@ -82,13 +82,13 @@ def test_intervals_are_those_of_scipy():
     assert (low, high) == pytest.approx(tuple(peer.confidence_interval), abs=0.05 * width)
 
 
-def test_ratios_are_over_the_same_tiles():
+def test_bootstrap_ratio_uses_paired_tiles():
     tiles = np.random.default_rng(1).gamma(1, 5, 40)
-    ratio, drawn = bootstrap(figures({"a": tiles.tolist(), "b": (2 * tiles).tolist()})).ratio(
+    ratio, resampled = bootstrap(figures({"a": tiles.tolist(), "b": (2 * tiles).tolist()})).ratio(
         "b", "a", "l2_road_m"
     )
     assert ratio == pytest.approx(2)
-    assert drawn == pytest.approx(2)
+    assert resampled == pytest.approx(2)
 
 
 RISE = Change("rises", "x", "l2_road_m", "wo_ecsrc", 111)
@@ -106,14 +106,14 @@ RISE = Change("rises", "x", "l2_road_m", "wo_ecsrc", 111)
         (0.9, NOT_HELD),
     ],
 )
-def test_a_change_holds_between_half_and_twice_the_papers(ours, verdict):
+def test_check_change_holds_between_half_and_twice_the_papers(ours, verdict):
     # The paper's ratio is 2.114: the square root is 1.454, the square 4.469.
-    found = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": [ours] * 4})))
-    assert (found.verdict, found.paper, found.ours) == (verdict, "+111%", percent(ours))
+    result = check(RISE, bootstrap(figures({"flexroad": [1.0] * 4, "wo_ecsrc": [ours] * 4})))
+    assert (result.verdict, result.paper, result.ours) == (verdict, "+111%", percent(ours))
 
 
 @pytest.mark.parametrize(
-    ("values", "slack", "verdict", "shown"),
+    ("values", "slack", "verdict", "text"),
     [
         ((1, 2), 0, HELD, "1.000 < 2.000"),
         ((2, 1), 0, NOT_HELD, "2.000 > 1.000"),
@@ -121,90 +121,90 @@ def test_a_change_holds_between_half_and_twice_the_papers(ours, verdict):
         ((1.04, 1), 0.05, HELD, "1.040 > 1.000"),
     ],
 )
-def test_an_order_holds_as_the_means_are(values, slack, verdict, shown):
+def test_check_order_holds_if_means_are_ordered(values, slack, verdict, text):
     claim = Order("x", "x", "l2_road_m", ("flexroad", "wo_ecsrc"), slack)
     means = bootstrap(figures({"flexroad": [values[0]] * 4, "wo_ecsrc": [values[1]] * 4}))
-    found = check(claim, means)
-    assert (found.verdict, found.paper, found.ours) == (verdict, "0.483 < 1.021", shown)
-    assert found.certainty == ("100% of resamples" if verdict == HELD else "0% of resamples")
+    result = check(claim, means)
+    assert (result.verdict, result.paper, result.ours) == (verdict, "0.483 < 1.021", text)
+    assert result.certainty == ("100% of resamples" if verdict == HELD else "0% of resamples")
 
 
-def test_claims_about_other_data_or_missing_variants_are_not_tested():
+def test_check_other_dataset_or_missing_variant_is_not_tested():
     means = bootstrap(figures({"flexroad": [1.0]}))
     assert check(RISE, means).verdict == NOT_TESTED
     both = bootstrap(figures({"flexroad": [1.0], "wo_ecsrc": [2.0]}))
     assert check(replace(RISE, dataset="GeRoD"), both, "DSC3D").verdict == NOT_TESTED
 
 
-def test_the_papers_own_figures_hold_every_claim_about_its_data():
-    found = compare(as_published())
-    verdicts = found.claims.verdict.value_counts()
-    assert verdicts.to_dict() == {HELD: len(found.claims) - 3, NOT_TESTED: 3}
-    # But for triangles, which Table I rounds.
-    exact = found.numbers[found.numbers.figure != "triangles"]
+def test_compare_published_figures_hold_every_claim():
+    comparison = compare(as_published())
+    verdicts = comparison.claims.verdict.value_counts()
+    assert verdicts.to_dict() == {HELD: len(comparison.claims) - 3, NOT_TESTED: 3}
+    # Except triangles, which Table I rounds.
+    exact = comparison.numbers[comparison.numbers.figure != "triangles"]
     assert exact.difference.abs().max() < 1e-12
-    assert len(found.numbers) == (3 + 19) * len(FIGURES)
+    assert len(comparison.numbers) == (3 + 19) * len(FIGURES)
 
 
-def test_flexroad_alone_is_nothing_to_compare():
+def test_compare_flexroad_alone_raises():
     data = as_published()
     with pytest.raises(ConfigError, match="none of the variants FlexRoad is compared with"):
         compare(MetricsData(data.rows[data.rows.variant == "flexroad"]))
 
 
-def test_the_main_comparison_alone_has_no_table_ii():
+def test_compare_main_variants_alone_has_no_table_ii():
     rows = as_published().rows
     titles = [s.title for s in compare(MetricsData(rows[rows.variant.isin(VARIANTS[:3])])).sections]
     assert "Table I: L2" in titles
     assert not any("Table II" in title for title in titles)
 
 
-def test_changes_are_those_the_paper_quotes():
+def test_compare_table_of_changes_matches_the_papers_text():
     table = next(s.table for s in compare(as_published()).sections if "changes" in s.title)
     without = table[table.variant == "w/o ECSRC"].iloc[0]
     assert (without["L2 road, paper"], without["MAD road, ours"]) == ("+111%", "+135%")
     assert len(table) == len(TABLE_II) - 1
 
 
-def test_strata_have_tables_of_their_own():
+def test_compare_adds_one_table_per_stratum():
     data = as_published(3)
     rural = (data.rows.stratum == "rural") & (data.rows.variant == "rgt")
     data.rows.loc[rural, "l2_road_m"] = 9.0
     tables = {s.title: s.table for s in compare(data).sections}
-    assert tables["Ours, rural: 1 tile"]["L2 road (m)"][1] == "9.000"
-    assert tables["Ours, urban: 2 tiles"]["L2 road (m)"][1] == "0.415"
+    assert tables["Our figures, rural: 1 tile"]["L2 road (m)"][1] == "9.000"
+    assert tables["Our figures, urban: 2 tiles"]["L2 road (m)"][1] == "0.415"
 
 
-def test_every_page_says_first_what_the_data_is():
+def test_pages_name_the_data_in_first_line():
     line = "Data: made, 3 tiles (2 urban, 1 rural)."
     for name, text in pages(as_published()).items():
         assert line in text.splitlines()[0], name
-    assert "The paper's figures are on GeRoD, ours are not" in pages(as_published())["tables.md"]
+    assert "The paper's figures are for GeRoD, ours are for other data" in pages(as_published())["tables.md"]
     real = as_published()
     real = MetricsData(real.rows.assign(dataset="GeRoD"))
-    assert "ours are not" not in pages(real)["tables.md"]
+    assert "ours are for other data" not in pages(real)["tables.md"]
 
 
-def test_tiles_that_failed_count_for_nothing_and_are_told_of():
+def test_compare_leaves_out_and_counts_failed_tiles():
     data = as_published(3)
     failed = (data.rows.tile_id == "t1") & (data.rows.variant == "rgt")
     data.rows.loc[failed, list(FIGURES)] = np.nan
     data.rows.loc[data.rows.tile_id == "t1", "l2_road_m"] += 100
-    assert data.line == "Data: made, 2 tiles (2 urban); 1 more failed and are left out."
+    assert data.line == "Data: made, 2 tiles (2 urban); 1 failed tile left out."
     assert compare(data).numbers.ours.max() < 200_000
     assert abs(compare(data).numbers.query("figure == 'l2_road_m'").difference).max() < 1e-12
 
 
-def test_the_kept_figures_alone_give_the_same_pages(tmp_path):
+def test_pages_from_stored_figures_are_the_same(tmp_path):
     rng = np.random.default_rng(0)
     data = as_published(5)
     data.rows[list(FIGURES)] *= rng.random((5 * 21, 1))
-    data = MetricsData(data.rows.astype(dict.fromkeys(FIGURES, KEPT)))
+    data = MetricsData(data.rows.astype(dict.fromkeys(FIGURES, FIGURE_DTYPE)))
     write_metrics_data(data, tmp_path)
     assert pages(read_metrics_data(tmp_path)) == pages(data)
 
 
-def test_csv_is_read_back(tmp_path):
+def test_csv_page_parses_to_same_values(tmp_path):
     page = pages(as_published())["tables.csv"]
     table = pd.read_csv(io.StringIO(page), comment="#")
     row = table[(table.variant == "wo_dtm") & (table.figure == "l2_terrain_m")].iloc[0]
@@ -213,12 +213,12 @@ def test_csv_is_read_back(tmp_path):
 
 
 def columns(row: str) -> int:
-    """Count the columns that a line of a tabular fills."""
+    """Return the number of columns that a line of a tabular fills."""
     spans = [re.search(r"\\multicolumn{(\d+)}", cell) for cell in re.split(r"(?<!\\)&", row)]
     return sum(int(span[1]) if span else 1 for span in spans)
 
 
-def test_latex_is_well_formed():
+def test_latex_page_is_well_formed():
     text = pages(as_published())["tables.tex"]
     assert text.isascii()
     assert text.count("\\begin{") == text.count("\\end{")
@@ -231,7 +231,7 @@ def test_latex_is_well_formed():
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
-def test_latex_compiles(tmp_path):
+def test_latex_page_compiles(tmp_path):
     (tmp_path / "tables.tex").write_text(pages(as_published())["tables.tex"])
     head = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}\\input{tables}\\end{document}"
     (tmp_path / "page.tex").write_text(head)
@@ -247,7 +247,7 @@ def test_latex_compiles(tmp_path):
 
 
 def made_run(path, config="ablation", dataset=("made",), factor=1.0, layers=LAYERS) -> Run:
-    """A run folder over four tiles with the paper's figures for rows."""
+    """Return a run over four tiles whose rows are the paper's figures."""
     tiles = tuple(
         Tile(
             f"{east}_5629250",
@@ -272,7 +272,7 @@ def made_run(path, config="ablation", dataset=("made",), factor=1.0, layers=LAYE
     return run
 
 
-def test_a_run_and_its_true_classes_stand_side_by_side(tmp_path):
+def test_write_comparison_with_true_run_shows_both(tmp_path):
     ours = made_run(tmp_path / "ours")
     true = made_run(tmp_path / "true", "ablation_true", factor=2)
     written = write_comparison(ours, true, tmp_path / "out")
@@ -280,25 +280,25 @@ def test_a_run_and_its_true_classes_stand_side_by_side(tmp_path):
     page = (tmp_path / "out" / "tables.md").read_text()
     assert page.startswith("Data: made, 4 tiles")
     assert "| Full Pipeline | 0.483 | 0.966 |" in page
-    kept = read_metrics_data(tmp_path / "out")
-    assert kept.classes == ("segmented", "reference")
+    stored = read_metrics_data(tmp_path / "out")
+    assert stored.classes == ("segmented", "reference")
     for path in written:
-        assert path.read_text() == pages(kept)[path.name]
+        assert path.read_text() == pages(stored)[path.name]
 
 
-def test_data_is_never_mixed(tmp_path):
+def test_collect_mixed_datasets_raises(tmp_path):
     mixed = made_run(tmp_path / "mixed", dataset=("GeRoD", ""))
-    with pytest.raises(ConfigError, match="mixes data: unnamed, GeRoD; run each by itself"):
+    with pytest.raises(ConfigError, match="mixes datasets: unnamed, GeRoD; run each of them separately"):
         collect(mixed)
     ours = made_run(tmp_path / "ours")
     other = made_run(tmp_path / "other", "ablation_true", dataset=("GeRoD",))
-    with pytest.raises(ConfigError, match="is not about the data, tiles and variants of"):
+    with pytest.raises(ConfigError, match="has other data, tiles or variants than"):
         collect(ours, other)
     with pytest.raises(ConfigError, match="both class by the segmented mask"):
         collect(ours, ours)
 
 
-def test_no_true_mask_no_true_run(tmp_path):
+def test_collect_true_run_without_true_mask_raises(tmp_path):
     ours = made_run(tmp_path / "ours", layers=("dsm", "dtm"))
     true = made_run(tmp_path / "true", "ablation_true", layers=("dsm", "dtm"))
     with pytest.raises(ConfigError, match="has no true road mask in its catalog; leave out --true"):
@@ -310,7 +310,7 @@ CIRCULAR, TRUTH = STAND_IN + "circular", STAND_IN + "true"
 
 
 def stand_in(dataset: str, factor: float = 1.0) -> MetricsData:
-    """Scenes whose every figure is the paper's on DSC3D, but for FlexRoad's roads."""
+    """Return scenes with the paper's figures for DSC3D, FlexRoad's road L2 multiplied by a factor."""
     rows = [
         (dataset, "segmented", f"s{i}", "urban", row.variant, *map(row.value, FIGURES))
         for i in range(3)
@@ -318,59 +318,59 @@ def stand_in(dataset: str, factor: float = 1.0) -> MetricsData:
     ]
     made = pd.DataFrame(rows, columns=["dataset", "classes", "tile_id", "stratum", "variant", *FIGURES])
     made.loc[made.variant == "flexroad", "l2_road_m"] *= factor
-    return MetricsData(made.astype(dict.fromkeys(FIGURES, KEPT)))
+    return MetricsData(made.astype(dict.fromkeys(FIGURES, FIGURE_DTYPE)))
 
 
-def test_what_stands_in_for_dsc3d_has_tables_and_claims_of_its_own():
+def test_compare_with_stand_in_adds_dsc3d_tables_and_claims():
     data = replace(as_published(), dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH, factor=3.0)))
-    found = compare(data)
-    sections = {section.title: section for section in found.sections}
+    comparison = compare(data)
+    sections = {section.title: section for section in comparison.sections}
     table = sections["Table I, DSC3D rows (synthetic stand-in): L2"].table.set_index("variant")
     assert table.at["FlexRoad", "L2 road (m), ours (circular)"].startswith("0.106 [")
     assert table.at["FlexRoad", "L2 road (m), ours (true)"].startswith("0.318 [")
-    claims = sections["What the paper claims of DSC3D (synthetic stand-in)"]
+    claims = sections["The paper's claims about DSC3D (synthetic stand-in)"]
     assert list(claims.table.verdict) == [HELD] * 3
     assert list(claims.table["verdict, true"]) == [NOT_HELD, HELD, HELD]
     assert CIRCULAR in claims.line
     assert TRUTH in claims.line
-    # The main claims are GeRoD's, and none of them waits for other data.
-    assert "35 claims about GeRoD: 35 held" in " ".join(found.notes)
-    assert not (found.claims.verdict == NOT_TESTED).any()
-    assert found.claims.groupby("data").size().to_dict() == {"made": 35, CIRCULAR: 3, TRUTH: 3}
-    assert found.numbers.groupby("data").size()[TRUTH] == 3 * len(FIGURES)
+    # The main claims are about GeRoD, and all of them are tested.
+    assert "35 claims about GeRoD: 35 held" in " ".join(comparison.notes)
+    assert not (comparison.claims.verdict == NOT_TESTED).any()
+    assert comparison.claims.groupby("data").size().to_dict() == {"made": 35, CIRCULAR: 3, TRUTH: 3}
+    assert comparison.numbers.groupby("data").size()[TRUTH] == 3 * len(FIGURES)
 
 
-def test_every_page_says_that_the_rows_of_dsc3d_are_a_stand_in(tmp_path):
-    main = MetricsData(as_published().rows.astype(dict.fromkeys(FIGURES, KEPT)))
+def test_pages_with_stand_in_name_its_data(tmp_path):
+    main = MetricsData(as_published().rows.astype(dict.fromkeys(FIGURES, FIGURE_DTYPE)))
     data = replace(main, dsc3d=(stand_in(CIRCULAR), stand_in(TRUTH)))
-    made = pages(data)
-    for name, text in made.items():
+    texts = pages(data)
+    for name, text in texts.items():
         assert CIRCULAR in text, name
         assert TRUTH in text, name
         assert data.line in text.splitlines()[0], name
-    # A table's caption names its own data.
-    captions = re.findall(r"\\caption{(.*)}", made["tables.tex"])
+    # Each caption names the data of its table.
+    captions = re.findall(r"\\caption{(.*)}", texts["tables.tex"])
     assert [CIRCULAR in caption for caption in captions] == ["DSC3D" in caption for caption in captions]
     write_metrics_data(data, tmp_path)
-    assert pages(read_metrics_data(tmp_path)) == made
+    assert pages(read_metrics_data(tmp_path)) == texts
     write_metrics_data(main, tmp_path)
     assert pages(read_metrics_data(tmp_path)) == pages(main)
 
 
-def test_dsc3d_itself_is_no_stand_in():
-    found = compare(replace(as_published(), dsc3d=(stand_in("DSC3D"),)))
-    titles = [section.title for section in found.sections]
+def test_compare_with_dsc3d_itself_has_no_stand_in():
+    comparison = compare(replace(as_published(), dsc3d=(stand_in("DSC3D"),)))
+    titles = [section.title for section in comparison.sections]
     assert "Table I, DSC3D rows: L2" in titles
-    assert not any("stand-in" in text for text in (*titles, *found.notes))
+    assert not any("stand-in" in text for text in (*titles, *comparison.notes))
 
 
-def test_runs_for_dsc3d_are_twins(tmp_path):
+def test_collect_dsc3d_runs_must_match(tmp_path):
     ours = made_run(tmp_path / "ours")
     circular = made_run(tmp_path / "circular", "dsc3d", dataset=(CIRCULAR,))
     true = made_run(tmp_path / "true", "dsc3d", dataset=(TRUTH,), factor=2)
     data = collect(ours, None, circular, true)
-    assert [beside.dataset for beside in data.dsc3d] == [CIRCULAR, TRUTH]
-    with pytest.raises(ConfigError, match="is nothing without --dsc3d"):
+    assert [scenes.dataset for scenes in data.dsc3d] == [CIRCULAR, TRUTH]
+    with pytest.raises(ConfigError, match="needs --dsc3d"):
         collect(ours, None, None, true)
-    with pytest.raises(ConfigError, match="is about the same data as"):
+    with pytest.raises(ConfigError, match="has the same data as"):
         collect(ours, None, circular, circular)
