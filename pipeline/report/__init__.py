@@ -1,4 +1,4 @@
-"""Turn a run's rows into pages: Markdown, CSV, and one HTML file with pictures."""
+"""Reports on a run as Markdown, CSV, or one HTML file with pictures."""
 
 from __future__ import annotations
 

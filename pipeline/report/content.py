@@ -1,4 +1,4 @@
-"""What a report says, before it is a page: tables over the run's rows."""
+"""The content of a report: tables computed from a run's rows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pandas as pd
 import yaml
 
-from flexroad.pipeline.report.quality import most_doubtful, over_tiles
+from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import summary
@@ -21,7 +21,7 @@ FIGURES = {
     "triangles": "T",
 }
 """The columns of the paper's Table I."""
-BESIDE = {
+FURTHER = {
     "rmse_road_m": "RMSE road (m)",
     "rmse_terrain_m": "RMSE terrain (m)",
     "nmad_road_m": "NMAD road (m)",
@@ -29,7 +29,9 @@ BESIDE = {
     "completeness": "completeness",
     "seconds": "seconds",
 }
+"""Further columns."""
 WORST = 10
+"""Rows in the tables of the worst tiles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,29 +42,31 @@ class Content:
     state: str
     """Tiles done, failed, pending, in one line."""
     reference: str
-    """What the figures were measured against."""
+    """What the figures were measured against, in one paragraph."""
     main: pd.DataFrame
-    """Mean over tiles per variant: the paper's table."""
+    """The paper's figures per variant, mean over tiles."""
     median: pd.DataFrame
-    beside: pd.DataFrame
-    """Further figures, mean over tiles."""
+    """The same figures, median over tiles."""
+    further: pd.DataFrame
+    """Further figures per variant, mean over tiles."""
     strata: pd.DataFrame
-    """The main table per stratum; empty where the catalog names none."""
+    """The main table per stratum; empty if the catalog has no strata."""
     worst: pd.DataFrame
     """Tiles with the highest road L2 of the exported variant."""
-    trust: pd.DataFrame
-    """What the surfaces tell of themselves, mean over tiles; empty for runs that did not ask them."""
-    doubtful: pd.DataFrame
-    """Tiles of the exported variant to look at first; needs no ground truth."""
+    quality: pd.DataFrame
+    """Error estimates and support per variant, mean over tiles; empty if the run has none."""
+    worst_estimates: pd.DataFrame
+    """Tiles with the highest error estimate of the exported variant; needs no ground truth."""
     steps: pd.DataFrame
     """Height steps between neighbouring tiles."""
-    steps_of: str
-    """Which tiles that is about, if not all."""
+    steps_note: str
+    """Which tiles `steps` covers; empty if all."""
     failures: pd.DataFrame
+    """One row per failed tile: stage, error, message and file."""
     versions: dict[str, str]
     config: str
     tiles: tuple[str, ...]
-    """Ids of the finished tiles, in the catalog's order."""
+    """Ids of the finished tiles, in the order of the catalog."""
 
 
 def gather(run: Run) -> Content:
@@ -75,27 +79,27 @@ def gather(run: Run) -> Content:
     """
     rows = read_metrics(run.path)
     done = rows[rows.status == "done"]
-    how = summary(run)
-    steps, steps_of = edge_steps(run)
+    counts = summary(run)
+    steps, steps_note = edge_steps(run)
     variants = [name for name in run.config.chains if name in set(done.variant)]
-    shown = run.config.export.variants[0]
+    exported = run.config.export.variants[0]
     failures = pd.DataFrame(
-        [(f.tile_id, f.stage, f.kind, f.message, f.file) for f in how.failures],
+        [(f.tile_id, f.stage, f.kind, f.message, f.file) for f in counts.failures],
         columns=["tile", "stage", "error", "message", "file"],
     )
     return Content(
-        title=f"FlexRoad: {run.config.name} over {how.tiles} tile{'s' * (how.tiles != 1)}",
-        state=f"Tiles: {how.done} done, {how.failed} failed, {how.pending} pending",
+        title=f"FlexRoad: {run.config.name} over {counts.tiles} tile{'s' * (counts.tiles != 1)}",
+        state=f"Tiles: {counts.done} done, {counts.failed} failed, {counts.pending} pending",
         reference=_reference(run, set(done.tile_id)),
         main=_over_tiles(done, variants, FIGURES, "mean"),
         median=_over_tiles(done, variants, FIGURES, "median"),
-        beside=_over_tiles(done, variants, BESIDE, "mean"),
+        further=_over_tiles(done, variants, FURTHER, "mean"),
         strata=_per_stratum(done, variants),
-        worst=_worst(done, shown),
-        trust=over_tiles(done, variants),
-        doubtful=most_doubtful(done, shown, WORST),
+        worst=_worst(done, exported),
+        quality=over_tiles(done, variants),
+        worst_estimates=highest_error_estimates(done, exported, WORST),
         steps=steps,
-        steps_of=steps_of,
+        steps_note=steps_note,
         failures=failures,
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),
@@ -103,8 +107,10 @@ def gather(run: Run) -> Content:
     )
 
 
-def _over_tiles(done: pd.DataFrame, variants: list[str], columns: dict[str, str], how: str) -> pd.DataFrame:
-    table = done.groupby("variant")[list(columns)].agg(how).reindex(variants).rename(columns=columns)
+def _over_tiles(
+    done: pd.DataFrame, variants: list[str], columns: dict[str, str], statistic: str
+) -> pd.DataFrame:
+    table = done.groupby("variant")[list(columns)].agg(statistic).reindex(variants).rename(columns=columns)
     table.insert(0, "tiles", done.groupby("variant").size().reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
 
@@ -123,30 +129,31 @@ def _per_stratum(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
 
 def _worst(done: pd.DataFrame, variant: str) -> pd.DataFrame:
     table = done[done.variant == variant].nlargest(WORST, "l2_road_m")
-    columns = {"tile_id": "tile"} | FIGURES | {"p95_road_m": BESIDE["p95_road_m"]}
+    columns = {"tile_id": "tile"} | FIGURES | {"p95_road_m": FURTHER["p95_road_m"]}
     return table[list(columns)].rename(columns=columns)
 
 
 def _reference(run: Run, done: set[str]) -> str:
     tiles = [tile for tile in run.catalog.tiles if tile.id in done]
     if not tiles:
-        return "No tile is done: there is nothing to measure."
-    truth = sum(tile.layer("reference") is not None for tile in tiles)
+        return "No tile is done."
+    references = sum(tile.layer("reference") is not None for tile in tiles)
     roads = sum(tile.layer("reference_road") is not None for tile in tiles)
     heights = (
         "Heights are measured against the catalog's reference surface"
-        if truth == len(tiles)
-        else f"Heights: {len(tiles) - truth} of {len(tiles)} tiles have no reference surface; "
-        "their DTM stands in (with the bridge decks the catalog has), which also supports the fit, "
-        "so their terrain figures are optimistic"
+        if references == len(tiles)
+        else f"{len(tiles) - references} of {len(tiles)} tiles have no reference surface: there heights are "
+        "measured against the DTM (with the catalog's bridge decks), which also supports the fit, so that "
+        "their terrain figures are optimistic"
     )
     segmented = any(chain["evaluate"].classes == "segmented" for chain in run.config.chains.values())
     classes = (
-        "cells are classed by the raw segmented mask (evaluate.classes)"
+        "cells are classed as road or terrain by the raw segmented mask (evaluate.classes)"
         if segmented
-        else "cells are classed by the catalog's reference road mask"
+        else "cells are classed as road or terrain by the catalog's reference road mask"
         if roads == len(tiles)
-        else f"cells of {len(tiles) - roads} of {len(tiles)} tiles are classed by the raw segmented mask"
+        else f"cells of {len(tiles) - roads} of {len(tiles)} tiles are classed as road or terrain by the raw "
+        "segmented mask"
     )
     data = "; ".join(sorted({tile.dataset for tile in tiles if tile.dataset}))
     return f"{f'Data: {data}. ' if data else ''}{heights}; {classes}."

@@ -1,6 +1,6 @@
-"""Draw meshes from a folder: ``python mesh_view.py FOLDER`` makes a ``.png`` beside each ``.npz`` there.
+"""Draw the meshes of a folder: ``python mesh_view.py FOLDER`` writes a ``.png`` next to each ``.npz``.
 
-A program of its own, imported by nothing: VTK ends the process it runs in where OpenGL is missing.
+A separate program, never imported, because VTK ends its process if OpenGL is missing.
 """
 
 from __future__ import annotations
@@ -16,31 +16,32 @@ from numpy.typing import NDArray
 from PIL import Image
 
 SIZE_PX = (480, 340)
+"""Default width and height of a picture."""
 OVERSAMPLING = 3
-"""Lines of a third of a pixel stay thin and even."""
+"""Factor of the size at which pictures are drawn, for thin, even lines."""
 EXAGGERATION = 1.5
-"""Of heights: roads are flat, and a true view shows that alone."""
+"""Factor of the heights; without it roads look flat."""
 
 ROAD, TERRAIN, EDGE, SKY = "#3b3f46", "#ddd6c4", "#6f6753", "#ffffff"
 DENSE_PX = 5.0
-"""Triangles smaller than this are drawn with fainter edges, or the terrain would turn black."""
+"""Edges of triangles smaller than this are drawn fainter, or the terrain would look black."""
 
 
 def main(folder: Path) -> str:
-    """Draw every mesh of the folder and return what went wrong, or nothing."""
-    wrong = []
+    """Draw every mesh of the folder; return the errors, or an empty string."""
+    errors = []
     for file in sorted(folder.glob("*.npz")):
         try:
             with np.load(file) as arrays:
                 picture = draw(**arrays)
         except Exception as error:
-            # One odd mesh must not cost the others their pictures.
-            wrong.append(f"{file.name}: {error!r}")
+            # A broken mesh must not prevent the other pictures.
+            errors.append(f"{file.name}: {error!r}")
             continue
         temporary = file.with_suffix(".part")
         picture.save(temporary, format="png")
         temporary.rename(file.with_suffix(".png"))
-    return "; ".join(wrong)
+    return "; ".join(errors)
 
 
 def draw(
@@ -51,25 +52,25 @@ def draw(
     within: Sequence[float] | None = None,
     size_px: Sequence[int] = SIZE_PX,
 ) -> Image.Image:
-    """Return one mesh, seen obliquely from the south-south-west.
+    """Draw one mesh as seen obliquely from the south-south-west.
 
     Parameters
     ----------
     vertices : ndarray
-        ``(V, 3)``: east, north, up (m).
+        East, north and up, ``(V, 3)``, m.
     faces : ndarray
-        ``(F, 3)``, counter-clockwise from above.
+        Vertex indices, ``(F, 3)``, counter-clockwise seen from above.
     road : ndarray
-        ``(F,)``, True on faces of road.
+        True for road faces, ``(F,)``.
     colours : ndarray, optional
-        ``(V, 3)``, red, green and blue at the vertices, in place of the colours of road and terrain.
+        Red, green and blue at the vertices, ``(V, 3)``; by default road and terrain have one colour each.
     within : sequence of float, optional
-        West, south, east and north of the part that is drawn, in the vertices' coordinates (m).
+        West, south, east and north of the part to draw, in the vertices' coordinates (m).
     size_px : sequence of int
         Width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
-    # Normals of the whole mesh, so that the classes meet without a seam.
+    # Normals are computed on the whole mesh, so that there is no seam between road and terrain.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
     whole.cell_data["road"] = road
     if colours is not None:
@@ -85,16 +86,16 @@ def draw(
     if colours is None:
         _add_classes(plotter, whole, _edge_opacity(vertices, faces[~road]))
     else:
-        # More ambient light than on plain colours: these are read against a colour bar.
+        # More ambient light than for plain colours, so that the colours match the colour bar.
         plotter.add_mesh(whole, scalars="colours", rgb=True, smooth_shading=True, ambient=0.6, diffuse=0.45)
-    _look(plotter, whole.bounds, size[0])
+    _set_scene(plotter, whole.bounds, size[0])
     picture = Image.fromarray(plotter.screenshot(return_img=True))
     plotter.close()
     return picture.resize(size, Image.Resampling.LANCZOS)
 
 
 def _add_classes(plotter: Any, whole: Any, edge_opacity: float) -> None:
-    """Add the terrain with its edges and the road without."""
+    """Add the terrain with edges and the road without edges."""
     road = np.asarray(whole.cell_data["road"], dtype=bool)
     if not road.all():
         plotter.add_mesh(
@@ -113,15 +114,15 @@ def _add_classes(plotter: Any, whole: Any, edge_opacity: float) -> None:
 
 
 def _edge_opacity(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
-    """Return how strongly edges are drawn: fully where triangles are large on the screen."""
+    """Return the opacity of the edges, the higher the larger the triangles are in the picture."""
     sides = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
     width = np.ptp(vertices[:, 0]) or 1.0
     side_px = float(np.median(np.linalg.norm(sides, axis=2))) / width * SIZE_PX[0] * 0.8
     return float(np.clip(side_px / DENSE_PX, 0.1, 1.0)) * 0.7
 
 
-def _look(plotter: Any, bounds: tuple[float, ...], width_px: int) -> None:
-    """Place sun and camera: sun in the north-west as on the maps, eye in the south-south-west."""
+def _set_scene(plotter: Any, bounds: tuple[float, ...], width_px: int) -> None:
+    """Add lights and camera: sun in the north-west as on the maps, camera in the south-south-west."""
     west, east, south, north, low, high = bounds
     middle = np.array([(west + east) / 2, (south + north) / 2, (low + high) / 2])
     size = float(np.hypot(east - west, north - south))

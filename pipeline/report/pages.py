@@ -1,4 +1,4 @@
-"""A report's tables as Markdown, CSV and HTML."""
+"""Pages of a report: its tables as Markdown, CSV and HTML."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from flexroad.pipeline.report import quality
 from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
-"""A number as it is printed, perhaps with its interval."""
+"""A number as text, with its interval if it has one."""
 
 
 @dataclass(frozen=True, eq=False)
 class TilePictures:
-    """What the page shows of one tile."""
+    """The pictures and notes of one tile."""
 
     tile_id: str
     pictures: tuple[tuple[str, bytes], ...]
@@ -41,12 +41,12 @@ def markdown_page(content: Content) -> str:
 
 
 def csv_page(content: Content) -> str:
-    """Return the main table, every digit of it."""
+    """Return the main table as CSV, unrounded."""
     return content.main.to_csv(index=False)
 
 
 def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
-    """Return one self-contained page."""
+    """Return the report as one self-contained HTML page."""
     sections = list(_sections(content))
     return template("page.html.j2").render(
         title=content.title, content=content, sections=sections, tiles=tiles
@@ -54,7 +54,7 @@ def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
 
 
 def template(name: str, *folders: Path) -> jinja2.Template:
-    """Return a page's template, of these folders or of this one, with filters for tables and pictures."""
+    """Return a template from the given folders or this one, with filters for tables and pictures."""
     loader = jinja2.FileSystemLoader([*folders, Path(__file__).parent])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["table"] = _html
@@ -63,23 +63,23 @@ def template(name: str, *folders: Path) -> jinja2.Template:
 
 
 def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
-    """Yield title and table, and how to read it, of the tables that have something to say."""
+    """Return title, table and explanation of every table that is not empty."""
     named = (
         ("Mean over tiles", content.main, ""),
         ("Median over tiles", content.median, ""),
-        ("Further figures, mean over tiles", content.beside, ""),
+        ("Further figures, mean over tiles", content.further, ""),
         ("Per stratum, mean over tiles", content.strata, ""),
         ("Worst tiles by road L2", content.worst, ""),
-        ("Worst tiles by doubt, without ground truth", content.doubtful, quality.MEANING),
-        ("What the surfaces tell of themselves, mean over tiles", content.trust, ""),
-        ("Height steps between neighbouring tiles", content.steps.head(10), content.steps_of),
+        ("Worst tiles by error estimate, without ground truth", content.worst_estimates, quality.MEANING),
+        ("Error estimates and support, mean over tiles", content.quality, ""),
+        ("Height steps between neighbouring tiles", content.steps.head(10), content.steps_note),
         ("Failures", content.failures, ""),
     )
     return (section for section in named if len(section[1]))
 
 
 def are_numbers(table: pd.DataFrame) -> list[bool]:
-    """Return which columns hold numbers, printed already or not."""
+    """Return for each column whether it holds numbers, as numbers or as text."""
     return [
         pd.api.types.is_numeric_dtype(column) or all(PRINTED.fullmatch(str(cell)) for cell in column)
         for _, column in table.items()
@@ -103,7 +103,7 @@ def _cells(table: pd.DataFrame) -> list[list[str]]:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Return a table as Markdown."""
+    """Return a table as Markdown text."""
     numeric = are_numbers(table)
     lines = [list(table.columns), ["---:" if number else "---" for number in numeric], *_cells(table)]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -1,4 +1,4 @@
-"""Which pictures a report shows of which tiles."""
+"""The pictures of a report: maps and mesh views of its tiles."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 MOST = 24
-"""Tiles shown; of larger runs the worst."""
-NO_MESH = "No 3D view: no OpenGL library could be used here (on Debian: apt-get install libegl1)."
+"""Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
+NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 
 
 def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
-    """Draw the exported variant of every tile, or of the worst where there are many."""
+    """Draw the exported variant of every tile, or of the worst tiles of a large run."""
     variant = run.config.export.variants[0]
-    shown = _shown(content)
+    tile_ids = _shown(content)
     maps: dict[str, TilePictures] = {}
     meshes: dict[str, Mesh] = {}
-    known = {tile.id: tile for tile in run.catalog.tiles}
-    for found in peek_statuses(run, [known[tile_id] for tile_id in shown]):
-        graph = found.graph
-        pull = Evaluator(graph, ArtefactStore(run.store))
+    tiles = {tile.id: tile for tile in run.catalog.tiles}
+    for status in peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids]):
+        graph = status.graph
+        evaluate = Evaluator(graph, ArtefactStore(run.store))
         try:
-            meshes[graph.tile.id] = pull(graph.variants[variant]["sample"])
-            maps[graph.tile.id] = _maps(graph, variant, pull)
+            meshes[graph.tile.id] = evaluate(graph.variants[variant]["sample"])
+            maps[graph.tile.id] = _maps(graph, variant, evaluate)
         except StageError as error:
-            # The sources may be gone since; the tables stand all the same.
+            # For example if source files were deleted after the run; the tables do not need them.
             maps[graph.tile.id] = TilePictures(graph.tile.id, (), (f"No pictures: {error}",))
     views = render_meshes(meshes)
-    return [_with_view(found, views.get(tile_id)) for tile_id, found in maps.items()]
+    return [_with_view(pictures, views.get(tile_id)) for tile_id, pictures in maps.items()]
 
 
 def _shown(content: Content) -> list[str]:
     if len(content.tiles) <= MOST:
         return list(content.tiles)
-    return list(dict.fromkeys([*content.worst["tile"], *content.doubtful["tile"]]))
+    return list(dict.fromkeys([*content.worst["tile"], *content.worst_estimates["tile"]]))
 
 
-def _maps(graph: TileGraph, variant: str, pull: Evaluator) -> TilePictures:
-    made = graph.variants[variant]
-    data: TileData = pull(made["load"])
-    road: RoadMask = pull(made["segment"])
-    clusters: RoadClusters = pull(made["ecsrc"])
-    mesh: Mesh = pull(made["sample"])
-    quality: Quality = pull(made["assess"])
+def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
+    nodes = graph.variants[variant]
+    data: TileData = evaluate(nodes["load"])
+    road: RoadMask = evaluate(nodes["segment"])
+    clusters: RoadClusters = evaluate(nodes["ecsrc"])
+    mesh: Mesh = evaluate(nodes["sample"])
+    quality: Quality = evaluate(nodes["assess"])
     core, window = data.core, data.grid.window(data.core)
     dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
     truth = (data.dtm if data.reference is None else data.reference)[window]
@@ -61,23 +61,23 @@ def _maps(graph: TileGraph, variant: str, pull: Evaluator) -> TilePictures:
         (
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
-            ("What the surface rests on", support_picture(dsm, quality.support, raw, core)),
+            ("Support of the surface along the road", support_picture(dsm, quality.support, raw, core)),
             (
                 f"{variant} minus {against}",
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
             ),
         ),
-        (*_flagged(quality), *data.notes),
+        (*_flags(quality), *data.notes),
     )
 
 
-def _flagged(quality: Quality) -> tuple[str, ...]:
+def _flags(quality: Quality) -> tuple[str, ...]:
     return (f"Flags: {', '.join(quality.flags)}.",) if quality.flags else ()
 
 
-def _with_view(found: TilePictures, view: bytes | None) -> TilePictures:
-    if not found.pictures:
-        return found
+def _with_view(tile: TilePictures, view: bytes | None) -> TilePictures:
+    if not tile.pictures:
+        return tile
     if view is None:
-        return TilePictures(found.tile_id, found.pictures, (*found.notes, NO_MESH))
-    return TilePictures(found.tile_id, (*found.pictures, ("Mesh, from the south", view)), found.notes)
+        return TilePictures(tile.tile_id, tile.pictures, (*tile.notes, NO_MESH))
+    return TilePictures(tile.tile_id, (*tile.pictures, ("Mesh, from the south", view)), tile.notes)

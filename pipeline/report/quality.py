@@ -1,13 +1,13 @@
-"""Which tiles to look at first, where there is no ground truth: by what surfaces tell of themselves."""
+"""Report tables of the stage `assess`: which tiles to inspect first if there is no ground truth."""
 
 from __future__ import annotations
 
 import pandas as pd
 
 FIGURES = {
-    "error_estimate_m": "doubt (m)",
-    "suspect_m2": "largest doubted patch (m²)",
-    "residual_p95_m": "p95 to own points (m)",
+    "error_estimate_m": "error estimate (m)",
+    "suspect_m2": "largest suspect patch (m²)",
+    "residual_p95_m": "p95 to its road points (m)",
     "curvature_per_m": "curvature (1/m)",
     "edge_step_m": "edge step (m)",
     "off_dtm_road": "off the DTM (%)",
@@ -15,37 +15,38 @@ FIGURES = {
     "bounded_weights": "weights at bounds (%)",
 }
 SUPPORT = {"measured_road": "measured (%)", "dtm_road": "DTM (%)", "inferred_road": "inferred (%)"}
-"""What the surface rests on, in shares of the road."""
+"""Shares of the road by the support of the surface."""
 MEANING = (
-    "The doubt is the mean distance of the surface, over the cells of the raw road mask, to the nearer of "
-    "two witnesses: the scan, where the filter kept it and no better than it scatters there, and the DTM. "
-    "In metres, it guesses at the road L2; what both witnesses are wrong about it does not know. Flags are "
-    "raised by the thresholds of `assess`; docs/quality.md explains each."
+    "The error estimate is the mean vertical distance of the surface to the nearer of two sources, over the "
+    "cells of the raw road mask: the DSM where the filter kept it, but at least its local scatter, and the "
+    "DTM where it supports the surface. It estimates the road L2; errors common to DSM and DTM are not "
+    "detected. Flags are set by the thresholds of `assess`; docs/quality.md explains each flag."
 )
 
 
 def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
-    """Return the figures of each variant, mean over tiles, and how many tiles have a flag."""
+    """Return the means over tiles and the number of flagged tiles per variant; empty without estimates."""
     if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
     table = done.groupby("variant")[[*FIGURES, *SUPPORT]].mean().reindex(variants)
     flagged = (done["flags"].fillna("") != "").groupby(done.variant).sum()
-    table = _printed(table)
+    table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
 
 
-def most_doubtful(done: pd.DataFrame, variant: str, most: int) -> pd.DataFrame:
-    """Return the tiles of a variant with the greatest doubt, the worst first, and their flags."""
+def highest_error_estimates(done: pd.DataFrame, variant: str, most: int) -> pd.DataFrame:
+    """Return the tiles of a variant with the highest error estimate, highest first, with their flags."""
     table = done[(done.variant == variant) & done["error_estimate_m"].notna()].nlargest(
         most, "error_estimate_m"
     )
-    shown = _printed(table[[*FIGURES, *SUPPORT]])
-    shown.insert(0, "tile", table.tile_id)
-    return shown.assign(flags=table["flags"].replace("", "–"))
+    result = _labelled(table[[*FIGURES, *SUPPORT]])
+    result.insert(0, "tile", table.tile_id)
+    return result.assign(flags=table["flags"].replace("", "–"))
 
 
-def _printed(table: pd.DataFrame) -> pd.DataFrame:
+def _labelled(table: pd.DataFrame) -> pd.DataFrame:
+    """Rename columns to their labels, and convert shares to percent."""
     names = FIGURES | SUPPORT
     shares = [name for name in names if "%" in names[name]]
     return table.assign(**{name: 100 * table[name] for name in shares}).rename(columns=names)

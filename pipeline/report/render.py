@@ -1,7 +1,6 @@
-"""Pictures of one tile for the report: maps with north up and metres on the axes, and meshes in space.
+"""Pictures for reports, as PNG bytes: maps of one tile with north up and metres on the axes, and line charts.
 
-Everything here turns arrays into PNG bytes. Meshes are drawn by a child process: VTK takes the whole process
-with it where there is no OpenGL library, and a report must survive that.
+Pictures of meshes are in `mesh_pictures`.
 """
 
 from __future__ import annotations
@@ -27,43 +26,25 @@ from flexroad.tasks.types import Bools, Floats
 
 log = logging.getLogger(__name__)
 
-
 DPI = 100
-
-
 WIDTH_PX, MAP_PX = 480, 340
 """Widths of a picture and of the map in it."""
-
-
 TRUE_COLOUR_BYTES = 100_000
-
-
+"""Largest size of a PNG in true colours; larger ones are reduced to 256 colours."""
 LEFT_PX, BELOW_PX, GAP_PX = 46, 42, 10
-
+"""Space left of and below the map, and between map and legend."""
 
 RELIEF = LinearSegmentedColormap.from_list(
     "relief", ["#8fae9a", "#b9c7a0", "#e6dcb4", "#d9bd90", "#c4a183", "#e9e2da"]
 )
-
-
 ROAD, KEPT, DROPPED = "#33373d", "#1f6fb2", "#f0681a"
-
-
 BY_DTM = "#8a5fbf"
-
-
 TRUE = "#00d5ff"
-"""Outline of what should have been found: stands out on grass, asphalt and roofs."""
-
-
+"""Outline of the labels: contrasts with grass, asphalt and roofs."""
 OVERLAY = 0.72
 """Opacity of a mask over the relief."""
-
-
 UNKNOWN = "#f2f2f2"
-"""Cells without a value."""
-
-
+"""Colour of cells without a value."""
 SUN_AZIMUTH_DEG, SUN_ALTITUDE_DEG = 315.0, 45.0
 
 
@@ -79,7 +60,7 @@ def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = 
     title : str
         What is drawn, above the map.
     road : Bools, optional
-        Cells laid over the relief as road.
+        Road cells, drawn over the relief.
 
     Returns
     -------
@@ -97,12 +78,12 @@ def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = 
 
 
 def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: str = "") -> bytes:
-    """Draw what the filter kept of a road mask and what it dropped, over the relief.
+    """Draw the kept and the dropped part of a road mask over the relief.
 
     Parameters
     ----------
     height : Floats
-        The surface the filter saw, the DSM (m), ``(H, W)``.
+        The DSM (m), ``(H, W)``.
     raw, kept : Bools
         Road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
     grid : Grid
@@ -121,16 +102,16 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: s
 def support_picture(
     height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid, title: str = ""
 ) -> bytes:
-    """Draw what the surface rests on along the road, over the relief.
+    """Draw the support of the surface on road cells over the relief.
 
     Parameters
     ----------
     height : Floats
         The DSM (m), ``(H, W)``.
     support : ndarray
-        The cells by `tasks.quality.support.Support`, ``(H, W)``.
+        Class of each cell, a `flexroad.tasks.quality.support.Support`, ``(H, W)``.
     road : Bools
-        Road before the filter, ``(H, W)``.
+        Road cells before the filter, ``(H, W)``.
     grid : Grid
         Where the cells lie.
     title : str
@@ -148,9 +129,9 @@ def support_picture(
 
 
 def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid: Grid, title: str) -> bytes:
-    """Draw named areas in their colours over a grey relief, with a legend."""
-    paper = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
-    rgb = _shaded(paper, height, grid.cell)
+    """Draw areas (name, cells, colour) over a grey relief, with a legend."""
+    grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
+    rgb = _shaded(grey, height, grid.cell)
     for _, mask, colour in parts:
         rgb = _laid_over(rgb, mask, colour, OVERLAY)
     figure, axes = _map(rgb, grid, title)
@@ -175,7 +156,7 @@ def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid
 def error_map(
     error: Floats, grid: Grid, title: str = "", road: Bools | None = None, limit_m: float | None = None
 ) -> bytes:
-    """Draw signed vertical errors: red lies too high, blue too low.
+    """Draw signed vertical errors: red is too high, blue too low.
 
     Parameters
     ----------
@@ -189,12 +170,12 @@ def error_map(
         Cells whose outline is drawn.
     limit_m : float, optional
         End of the colour bar on both sides (m). By default the 98th percentile of the absolute error,
-        rounded up to 1, 2 or 5 times a power of ten; give one where pictures are compared.
+        rounded up to 1, 2 or 5 times a power of ten; set it to compare pictures.
 
     Returns
     -------
     bytes
-        A PNG, 480 pixels wide; the colour bar has arrows where errors go beyond it.
+        A PNG, 480 pixels wide; the colour bar has arrows if errors exceed the limit.
     """
     limit = limit_m if limit_m is not None else _round_limit(error)
     figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
@@ -206,16 +187,16 @@ def error_map(
     return _png(figure)
 
 
-def found_map(
-    ground: Floats | NDArray[np.uint8], truth: Bools, found: Bools, grid: Grid, title: str = ""
+def segmentation_map(
+    ground: Floats | NDArray[np.uint8], truth: Bools, segmented: Bools, grid: Grid, title: str = ""
 ) -> bytes:
-    """Draw the outlines of true and found road over a photo, or over a shaded relief.
+    """Draw the outlines of labelled and segmented road over an orthophoto or a shaded relief.
 
     Parameters
     ----------
     ground : ndarray
-        A photo of the grid's ground, red, green and blue, ``(3, h, w)``; or heights (m), ``(H, W)``.
-    truth, found : Bools
+        An orthophoto of the grid (red, green, blue), ``(3, h, w)``; or heights (m), ``(H, W)``.
+    truth, segmented : Bools
         Road by the labels and by the segmenter, ``(H, W)``.
     grid : Grid
         Where the cells lie.
@@ -230,11 +211,11 @@ def found_map(
     if ground.ndim == 3:
         rgb = np.moveaxis(ground, 0, -1) / 255
     else:
-        paper = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*grid.shape, 3))
-        rgb = _shaded(paper, np.asarray(ground, np.float64), grid.cell)
+        grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*grid.shape, 3))
+        rgb = _shaded(grey, np.asarray(ground, np.float64), grid.cell)
     figure, axes = _map(rgb, grid, title)
-    # The wider line below shows on both sides of the other where they agree.
-    parts = (("labels", truth, TRUE, 2.4), ("found", found, DROPPED, 0.9))
+    # The first line is wider, so that it is visible below the second where both agree.
+    parts = (("labels", truth, TRUE, 2.4), ("segmented", segmented, DROPPED, 0.9))
     for _, mask, colour, width in parts:
         _outline(axes, mask, grid, colour, width)
     legend = _beside(figure, axes, WIDTH_PX - LEFT_PX - MAP_PX - GAP_PX)
@@ -250,18 +231,18 @@ def curves(
     limits: tuple[tuple[float, float] | None, tuple[float, float] | None] = (None, None),
     mark: tuple[float, float, str] | None = None,
 ) -> bytes:
-    """Draw named lines over one another, ``(n,)`` and ``(n,)`` each.
+    """Draw lines in one chart.
 
     Parameters
     ----------
     lines : Mapping of str to pair of Floats
-        Where each goes, by name.
+        The x and y values of each line by name, ``(n,)`` each.
     labels : tuple of str
-        Of both axes.
+        Labels of the x and the y axis.
     limits : tuple, optional
-        Of both axes.
+        Limits of the x and the y axis.
     mark : tuple, optional
-        A point on them, and what it is.
+        x, y and name of a point to mark.
 
     Returns
     -------
@@ -283,25 +264,25 @@ def curves(
 
 
 def _limits(height: Floats) -> tuple[float, float]:
-    """Return the 1st and 99th percentile, so that one crane does not bleach the map."""
-    known = height[np.isfinite(height)]
-    if known.size == 0:
+    """Return the 1st and 99th percentile, so that single high objects do not dominate the colours."""
+    valid = height[np.isfinite(height)]
+    if valid.size == 0:
         return 0.0, 1.0
-    low, high = np.percentile(known, [1, 99])
+    low, high = np.percentile(valid, [1, 99])
     return float(low), float(max(high, low + 0.5))
 
 
 def _round_limit(error: Floats) -> float:
-    known = np.abs(error[np.isfinite(error)])
-    robust = max(float(np.percentile(known, 98)) if known.size else 0.0, 0.01)
+    valid = np.abs(error[np.isfinite(error)])
+    robust = max(float(np.percentile(valid, 98)) if valid.size else 0.0, 0.01)
     power = 10.0 ** math.floor(math.log10(robust))
     return next(step * power for step in (1, 2, 5, 10) if step * power >= robust * (1 - 1e-9))
 
 
 def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
-    """Light colours by Lambert's law with the sun in the north-west; level ground keeps its colour."""
+    """Shade colours by Lambert's law with the sun in the north-west; level ground keeps its colour."""
     south, east = np.gradient(height, cell)
-    # Beside a gap there is no slope: shown as level.
+    # Next to NaN cells the gradient is NaN: shaded as level.
     south, east = np.nan_to_num(south), np.nan_to_num(east)
     azimuth, altitude = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ALTITUDE_DEG)
     sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
@@ -312,14 +293,14 @@ def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
 
 
 def _laid_over(rgb: Floats, mask: Bools, colour: str, opacity: float) -> Floats:
-    """Lay a colour over the cells of a mask."""
+    """Blend a colour into the cells of a mask."""
     return np.where(mask[..., None], (1 - opacity) * rgb + opacity * np.array(to_rgb(colour)), rgb)
 
 
 def _map(
     values: Floats, grid: Grid, title: str, colours: str | None = None, norm: Normalize | None = None
 ) -> tuple[Figure, Axes]:
-    """Return a figure with values, colours or numbers, in place: metres from the tile's south-west corner."""
+    """Return a figure with a map of colours or numbers; axes in metres from the tile's south-west corner."""
     scale = min(MAP_PX / grid.width, 2 * MAP_PX / grid.height)
     width, height = max(scale * grid.width, 60), max(scale * grid.height, 60)
     size = WIDTH_PX, BELOW_PX + height + (24 if title else 8)
@@ -336,14 +317,14 @@ def _map(
 
 
 def _outline(axes: Axes, mask: Bools, grid: Grid, colour: str, width: float) -> None:
-    """Draw the border of a mask onto a map."""
+    """Draw the outline of a mask on a map."""
     if mask.any() and not mask.all():
         east, north = grid.eastings - grid.west, grid.northings - grid.south
         axes.contour(east, north, mask, levels=[0.5], colors=colour, linewidths=width)
 
 
 def _beside(figure: Figure, axes: Axes, width_px: float) -> Axes:
-    """Return axes to the right of the map and as high."""
+    """Return new axes to the right of the map, of the same height."""
     place = axes.get_position()
     return figure.add_axes((place.x1 + GAP_PX / WIDTH_PX, place.y0, width_px / WIDTH_PX, place.height))
 
@@ -365,15 +346,15 @@ def _png(figure: Figure) -> bytes:
 
 
 def _small(picture: Image.Image) -> bytes:
-    """Return the picture as a PNG: in true colours if that is small, else in 256, a third of the bytes.
+    """Return the picture as a PNG: in true colours if that is small, else in 256 colours.
 
-    Smooth pictures are the small ones, and the only ones where few colours would show.
+    256 colours take a third of the bytes. They would show on smooth pictures only, and these are small.
     """
     true = picture.convert("RGB")
     full = _encoded(true)
     if len(full) <= TRUE_COLOUR_BYTES:
         return full
-    # MAXCOVERAGE also serves rare colours: the ends of a colour bar are as exact as the map.
+    # MAXCOVERAGE keeps rare colours, such as the ends of a colour bar.
     return _encoded(true.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
 
 

@@ -1,6 +1,6 @@
-"""How well neighbouring tiles meet: the height step along their shared edge.
+"""Height steps between neighbouring tiles along their shared edges.
 
-Tiles are fitted independently, so nothing makes their surfaces meet; this says how far they do.
+Tiles are fitted independently, so their surfaces do not meet exactly.
 """
 
 from __future__ import annotations
@@ -21,27 +21,39 @@ from flexroad.tasks.types import Floats, RoadMask, Surface
 
 COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
 MOST = 2000
-"""Tiles compared with their neighbours; of larger runs a part, evenly over the catalog."""
+"""Largest number of tiles compared with their neighbours; of larger runs, every n-th tile is compared."""
 KEPT = 1024
-"""Tiles whose surfaces are held until their other neighbours have come."""
+"""Tiles whose surfaces are kept in memory until their other neighbours are compared."""
 
 Nodes = tuple[Node, Node]
-"""Of the surface and of the road mask."""
+"""Nodes of the surface and of the road mask."""
 
 
 def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
-    """Return one row per exported variant and pair of neighbours, largest steps first, and of which tiles.
+    """Return the steps per exported variant and pair of neighbours, and a note on the tiles compared.
 
-    Only pairs whose surfaces are in the store are told of.
+    Parameters
+    ----------
+    run : Run
+        The run; pairs whose surfaces are not in its store are left out.
+    most : int
+        Largest number of tiles compared with their neighbours.
+
+    Returns
+    -------
+    table : DataFrame
+        Columns `COLUMNS`, largest steps first.
+    note : str
+        Which tiles were compared; empty if all.
     """
     tiles = run.catalog.tiles
     every = math.ceil(len(tiles) / most)
     pairs = list(_pairs(tiles, every))
     wanted = {tile.id: tile for pair in pairs for tile in pair}
     done = {
-        found.graph.tile.id: _nodes(found.graph)
-        for found in peek_statuses(run, wanted.values())
-        if found.done
+        status.graph.tile.id: _nodes(status.graph)
+        for status in peek_statuses(run, wanted.values())
+        if status.done
     }
     rows = [row for variant in run.config.export.variants for row in _rows(run, pairs, done, variant)]
     table = pd.DataFrame(rows, columns=COLUMNS)
@@ -59,8 +71,8 @@ def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
 
 
 def _nodes(graph: TileGraph) -> dict[str, Nodes]:
-    made = {variant: graph.variants[variant] for variant in graph.export.variants}
-    return {v: (graph.nodes[names["fit"]], graph.nodes[names["segment"]]) for v, names in made.items()}
+    exported = {variant: graph.variants[variant] for variant in graph.export.variants}
+    return {v: (graph.nodes[names["fit"]], graph.nodes[names["segment"]]) for v, names in exported.items()}
 
 
 def _rows(
@@ -82,7 +94,7 @@ def _rows(
 
 
 def _corner(grid: Grid, east: float, north: float) -> tuple[str, float, float]:
-    # To the millimetre: edges that are sums of cell sizes differ in the last digits.
+    # Rounded to the millimetre, because edges computed from cell sizes differ in the last digits.
     return grid.crs, round(east, 3), round(north, 3)
 
 
@@ -92,16 +104,16 @@ def _step(grid: Grid, other: Grid, a: Surface, road: RoadMask, b: Surface) -> tu
     step = np.abs(a.height(east, north) - b.height(east, north))
     step = np.where(inside, step, np.nan)
     on_road = step[road.mask[road.grid.cells(east, north)] & np.isfinite(step)]
-    known = step[np.isfinite(step)]
+    valid = step[np.isfinite(step)]
     return (
-        float(known.mean()) if known.size else float("nan"),
-        float(known.max()) if known.size else float("nan"),
+        float(valid.mean()) if valid.size else float("nan"),
+        float(valid.max()) if valid.size else float("nan"),
         float(on_road.mean()) if on_road.size else float("nan"),
     )
 
 
 def _shared_edge(grid: Grid, other: Grid) -> tuple[Floats, Floats]:
-    """Return points along the edge, one per cell."""
+    """Return eastings and northings of points along the shared edge, one per cell."""
     if other.west > grid.west + grid.cell:
         return np.full(grid.height, grid.east), grid.northings
     return grid.eastings, np.full(grid.width, grid.north)

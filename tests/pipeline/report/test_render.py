@@ -22,7 +22,7 @@ def pixels(png: bytes) -> np.ndarray:
 
 
 def on_map(png: bytes, row: int, col: int) -> np.ndarray:
-    """Mean colour around a cell of a 250 x 250 map without title."""
+    """Return the mean colour around a cell of a 250 x 250 map without title."""
     scale, top = render.MAP_PX / 250, 8
     y, x = top + (row + 0.5) * scale, render.LEFT_PX + (col + 0.5) * scale
     return pixels(png)[int(y) - 3 : int(y) + 4, int(x) - 3 : int(x) + 4].mean(axis=(0, 1))
@@ -37,34 +37,34 @@ def ramp_end(i: int) -> np.ndarray:
     return np.array(render.RELIEF(float(i))[:3]) * 255
 
 
-def test_hillshade_has_north_up_and_high_ground_light():
+def test_hillshade_has_north_up_and_high_ground_in_light_colours():
     high_north = np.where(ROW < 125, 20.0, 10.0)
     png = render.hillshade(high_north, GRID)
     np.testing.assert_allclose(on_map(png, 30, 125), ramp_end(1), atol=3)
     np.testing.assert_allclose(on_map(png, 220, 125), ramp_end(0), atol=3)
 
 
-def test_the_sun_is_in_the_north_west():
+def test_hillshade_is_lit_from_north_west():
     cone = -0.5 * np.hypot(ROW - 125, COL - 125)
     png = render.hillshade(cone, GRID)
     light = {side: on_map(png, *at).mean() for side, at in {"nw": (65, 65), "se": (185, 185)}.items()}
     assert light["nw"] > light["se"] + 25
 
 
-def test_nodata_stays_empty():
+def test_hillshade_nan_cells_have_nodata_colour():
     holes = np.where((ROW > 100) & (COL > 100), np.nan, RELIEF)
     png = render.hillshade(holes, GRID)
     assert near(on_map(png, 200, 200), render.UNKNOWN, 2)
     assert not near(on_map(png, 50, 50), render.UNKNOWN, 10)
 
 
-def test_road_is_laid_over():
+def test_hillshade_with_road_is_darker_on_road_only():
     plain, with_road = (render.hillshade(RELIEF, GRID, road=road) for road in (None, np.abs(COL - 60) < 8))
     assert on_map(with_road, 125, 60).mean() < on_map(plain, 125, 60).mean() - 50
     np.testing.assert_allclose(on_map(with_road, 125, 180), on_map(plain, 125, 180), atol=6)
 
 
-def test_filter_picture_tells_kept_from_dropped():
+def test_filter_picture_colours_kept_and_dropped_cells():
     raw = np.abs(COL - 60) < 12
     kept = raw & (ROW > 80)
     png = render.filter_picture(RELIEF, raw, kept, GRID)
@@ -76,7 +76,7 @@ def test_filter_picture_tells_kept_from_dropped():
     assert np.ptp(neutral) < 20
 
 
-def test_support_picture_tells_three_kinds_on_the_road_alone():
+def test_support_picture_colours_three_classes_on_road_only():
     road = np.abs(COL - 60) < 12
     png = render.support_picture(RELIEF, (1 + ROW // 84).astype(np.uint8), road, GRID)
     for row, colour in ((40, render.KEPT), (125, render.BY_DTM), (210, render.DROPPED)):
@@ -95,14 +95,14 @@ def test_error_map_is_red_where_too_high_and_blue_where_too_low():
     assert near(on_map(png, 125, 225), render.UNKNOWN, 2)
 
 
-def test_error_limits_are_round_and_robust():
+def test_error_map_default_limit_is_round_and_robust():
     error = 0.03 * np.sin(ROW / 9) * np.cos(COL / 7)
     error[0, :100] = 40.0
     assert render.error_map(error, GRID) == render.error_map(error, GRID, limit_m=0.05)
     assert render.error_map(error, GRID) != render.error_map(error, GRID, limit_m=0.1)
 
 
-def test_road_outline_is_drawn():
+def test_error_map_with_road_draws_its_outline():
     error, road = np.zeros(GRID.shape), np.abs(COL - 125) < 50
     png = render.error_map(error, GRID, road=road, limit_m=0.1)
     strip = pixels(png)[150:160, render.LEFT_PX + 5 : render.LEFT_PX + render.MAP_PX - 5].mean(axis=(0, 2))
@@ -112,18 +112,18 @@ def test_road_outline_is_drawn():
 
 
 @pytest.mark.filterwarnings("error")
-def test_nothing_known_is_still_a_picture():
-    unknown = np.full(GRID.shape, np.nan)
+def test_pictures_of_empty_data_are_drawn():
+    empty = np.full(GRID.shape, np.nan)
     none = np.zeros(GRID.shape, bool)
     for png in (
-        render.hillshade(unknown, GRID, road=none),
-        render.filter_picture(unknown, none, none, GRID),
-        render.error_map(unknown, GRID, road=none),
+        render.hillshade(empty, GRID, road=none),
+        render.filter_picture(empty, none, none, GRID),
+        render.error_map(empty, GRID, road=none),
     ):
         assert pixels(png).shape[1] == render.WIDTH_PX
 
 
-def test_pictures_are_small_also_of_noise():
+def test_pictures_of_noise_are_small():
     noise = np.random.default_rng(0).normal(0, 0.1, GRID.shape)
     rough = RELIEF + np.where(noise > 0.1, 10, 0)
     for png in (
@@ -136,7 +136,7 @@ def test_pictures_are_small_also_of_noise():
 
 
 @pytest.mark.parametrize(("width", "height"), [(40, 250), (250, 40), (3, 3), (900, 1200)])
-def test_any_shape_fits(width, height):
+def test_hillshade_of_any_shape_has_fixed_width(width, height):
     grid = Grid("EPSG:25832", 0.0, 100.0, 0.4, width, height)
     heights = np.add.outer(np.arange(height), np.arange(width)) * 0.1
     rows, columns, _ = pixels(render.hillshade(heights, grid)).shape
@@ -144,12 +144,12 @@ def test_any_shape_fits(width, height):
     assert rows < 2 * render.MAP_PX + 80
 
 
-def test_equal_input_gives_equal_bytes():
+def test_hillshade_twice_gives_equal_bytes():
     assert render.hillshade(RELIEF, GRID, "a") == render.hillshade(RELIEF, GRID, "a")
 
 
 def sheet(n: int = 26) -> Mesh:
-    """A gently rolling square of 250 m; its western third is road."""
+    """Return a square of 250 m with gentle hills; its western third is road."""
     x, y = np.meshgrid(np.linspace(0, 250, n), np.linspace(0, 250, n))
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
@@ -162,7 +162,7 @@ def sheet(n: int = 26) -> Mesh:
 
 @pytest.fixture(scope="module")
 def opengl():
-    """Skip where VTK alone, without our code, cannot draw."""
+    """Skip the test if VTK alone, without our code, cannot draw."""
     probe = "import pyvista as pv; p = pv.Plotter(off_screen=True); p.add_mesh(pv.Cube()); p.screenshot()"
     if subprocess.run([sys.executable, "-c", probe], capture_output=True, check=False).returncode:
         pytest.skip("no OpenGL library on this machine")
@@ -170,7 +170,7 @@ def opengl():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
-def test_meshes_are_drawn_the_right_way_round():
+def test_render_meshes_road_is_on_the_left_and_broken_mesh_is_none():
     whole = sheet()
     broken = Mesh(whole.crs, whole.origin, whole.vertices[:, :2], whole.faces, whole.road)
     pictures = mesh_pictures.render_meshes({"b": whole, "broken": broken, "a": whole})
@@ -190,7 +190,7 @@ def test_meshes_are_drawn_the_right_way_round():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
-def test_a_part_of_a_mesh_is_drawn_in_given_colours():
+def test_render_meshes_draws_part_in_given_colours():
     whole = sheet()
     red_in_the_west = np.where(whole.vertices[:, :1] < 125, [[200, 30, 30]], [[30, 30, 200]]).astype(np.uint8)
     west, south = whole.origin[:2]
@@ -203,10 +203,10 @@ def test_a_part_of_a_mesh_is_drawn_in_given_colours():
         shares.append((red.mean(), blue.mean()))
     assert min(shares[0]) > 0.05
     assert shares[1][0] == 0
-    assert shares[1][1] > shares[0][1], "a part fills the picture"
+    assert shares[1][1] > shares[0][1], "the part does not fill the picture"
 
 
-def test_no_meshes_need_no_child(monkeypatch):
+def test_render_meshes_without_meshes_starts_no_child(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nonexistent")
     assert mesh_pictures.render_meshes({}) == {}
 
@@ -216,7 +216,7 @@ def test_no_meshes_need_no_child(monkeypatch):
     ("script", "reason"),
     [("kill -SEGV $$", "signal 11.*libegl1"), ("echo no module vtk >&2; exit 1", "no module vtk")],
 )
-def test_a_child_that_dies_costs_the_pictures_only(tmp_path, monkeypatch, caplog, script, reason):
+def test_render_meshes_failing_child_gives_none_and_warns(tmp_path, monkeypatch, caplog, script, reason):
     stand_in = tmp_path / "python"
     stand_in.write_text(f"#!/bin/sh\n{script}\n")
     stand_in.chmod(0o755)
