@@ -1,4 +1,4 @@
-"""The whole chain of a tile: where its time goes, what a worker holds, whether 2,000 tiles make it grow."""
+"""All stages of a tile: time per stage, and memory of one process over 2,000 tiles."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from flexroad.pipeline.worker.tile import process_tile
 
 TILES = 8
 MANY = 2000
+"""Tiles of the memory test."""
 
 
 def main(many: int = MANY) -> None:
@@ -34,7 +35,7 @@ def main(many: int = MANY) -> None:
 
 def table(config: Config, catalog: Catalog, folder: Path) -> None:
     run = Run.create(folder, config, catalog)
-    # The first tile compiles, or reads what was compiled.
+    # The first tile compiles code, or loads compiled code; it is not timed.
     process_tile(run.job(run.graph(run.catalog.tiles[0]), frozenset(STAGE_NAMES)))
     totals, stages = [], []
     for graph in map(run.graph, run.catalog.tiles):
@@ -42,24 +43,24 @@ def table(config: Config, catalog: Catalog, folder: Path) -> None:
         stages.append(process_tile(run.job(graph, frozenset(STAGE_NAMES))).seconds)
         totals.append(time.perf_counter() - start)
     names = [*STAGE_NAMES, "export"]
-    each = {name: statistics.median(seconds[name] for seconds in stages) for name in names}
+    medians = {name: statistics.median(seconds[name] for seconds in stages) for name in names}
     total = statistics.median(totals)
     print(f"\n{config.name}: {', '.join(config.chains)}; median over {TILES} urban to rural tiles, one core")
     for name in names:
-        print(f"  {name:10}{1000 * each[name]:8.1f} ms{each[name] / total:7.0%}")
-    rest = total - sum(each.values())
+        print(f"  {name:10}{1000 * medians[name]:8.1f} ms{medians[name] / total:7.0%}")
+    rest = total - sum(medians.values())
     print(f"  {'store':10}{1000 * rest:8.1f} ms{rest / total:7.0%}")
     print(f"  {'tile':10}{1000 * total:8.1f} ms; the limit is 400 ms: {total / 0.4:.2f} of it")
 
 
 def growth(config: Config, catalog: Catalog, folder: Path, many: int) -> None:
-    """Do the same tiles over and over, each time all anew, and watch this process grow."""
+    """Process the same tiles repeatedly, all stages each time, and print the memory of this process."""
     run = Run.create(folder, config, catalog)
     graphs = [run.graph(tile) for tile in run.catalog.tiles]
     print(f"\nmemory of one process over {many} tiles (resident, MB)")
-    every = max(1, many // 10)
+    interval = max(1, many // 10)
     for done in range(many):
-        if done % every == 0:
+        if done % interval == 0:
             print(f"  {done:6} {resident_mb():8.0f}")
         process_tile(run.job(graphs[done % len(graphs)], frozenset(STAGE_NAMES)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

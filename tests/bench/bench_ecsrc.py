@@ -1,4 +1,4 @@
-"""ECSRC against Algorithm 1 written with Python's sets, on a 250 x 250 tile with 20% road."""
+"""ECSRC compared with Algorithm 1 written with Python sets, on a 250 x 250 tile with 20% road."""
 
 import time
 from collections.abc import Callable
@@ -15,7 +15,7 @@ SIZE, SHARE = 250, 0.2
 
 
 def case(relief_m: float) -> tuple[TileData, RoadMask]:
-    """Blobs of road over rolling ground with noise in proportion."""
+    """Return a tile with patches of road on hilly ground, with noise in proportion to the relief."""
     rng = np.random.default_rng(1)
     field = gaussian_filter(rng.standard_normal((SIZE, SIZE)), 8)
     mask = field > np.quantile(field, 1 - SHARE)
@@ -26,7 +26,7 @@ def case(relief_m: float) -> tuple[TileData, RoadMask]:
 
 
 def best(function: Callable[[], object], repeats: int) -> float:
-    """Return the shortest of some runs (s)."""
+    """Return the shortest time of several calls (s)."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -40,11 +40,11 @@ def main() -> None:
     print(f"{'relief':>8} {'sets':>10} {'FlexRoad':>10} {'ratio':>7}  labels")
     for relief_m in (0.2, 1.0, 4.0):
         data, road = case(relief_m)
-        found = ecsrc(data, road, options).labels
-        literal = oracle.labels(road.mask, data.dsm, 1.0, options)
+        labels = ecsrc(data, road, options).labels
+        expected = oracle.labels(road.mask, data.dsm, 1.0, options)
         slow = best(lambda data=data, road=road: oracle.labels(road.mask, data.dsm, 1.0, options), 2)
         fast = best(lambda data=data, road=road: ecsrc(data, road, options), 20)
-        same = "equal" if np.array_equal(found, literal) else "DIFFERENT"
+        same = "equal" if np.array_equal(labels, expected) else "DIFFERENT"
         print(f"{relief_m:6.1f} m {1e3 * slow:7.0f} ms {1e3 * fast:7.1f} ms {slow / fast:7.0f}  {same}")
 
 

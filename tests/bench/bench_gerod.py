@@ -1,8 +1,8 @@
-"""The benchmark's input-only rows beside the paper's, and how fast its tiles are made.
+"""Plane and RGT rows of the synthetic benchmark beside the paper's, and the time to make its tiles.
 
-Plane and RGT depend on the data and the mask alone: the preset was held against them and nothing else.
-``PYTHONPATH=. python tests/bench/bench_gerod.py 240 1`` for the whole survey of seed 1;
-48 tiles of seed 0 without.
+Plane and RGT depend only on the data and the mask. The preset was tuned to these rows and to nothing else.
+Usage: ``PYTHONPATH=. python tests/bench/bench_gerod.py [TILES SEED]``; the default is 48 tiles of seed 0,
+the whole survey of seed 1 is ``240 1``.
 """
 
 import sys
@@ -37,15 +37,15 @@ Place = tuple[str, Grid, str, SceneOptions, int]
 
 
 def measure(place: Place) -> Mapping[str, float]:
-    """Return one tile's figures, and the time it took to make (s)."""
+    """Return the figures of one tile and the time to make it (s)."""
     tile_id, grid, stratum, options, seed = place
     start = time.perf_counter()
     scene = make_scene(grid, seed, stratum, options)
-    took = time.perf_counter() - start
+    seconds = time.perf_counter() - start
     data = TileData(tile_id, grid, grid, scene.dsm, scene.dtm, scene.road_mask, scene.reference)
     road = RoadMask(grid, grid, scene.road_mask, np.zeros(grid.shape, np.bool_))
     clusters = ecsrc.ecsrc(data, road, ecsrc.Options())
-    found = {"road share": float(scene.road_mask.mean()), "height range (m)": float(np.ptp(scene.dsm))}
+    figures = {"road share": float(scene.road_mask.mean()), "height range (m)": float(np.ptp(scene.dsm))}
     surfaces = {
         "Plane": (plane.fit(data, clusters, plane.Options()), sample.Options(method="corners")),
         "RGT": (raster.fit(data, clusters, raster.Options()), sample.Options(method="uniform")),
@@ -53,18 +53,18 @@ def measure(place: Place) -> Mapping[str, float]:
     for name, (surface, sampling) in surfaces.items():
         mesh = sample.sample(surface, road, clusters, sampling)
         metrics = evaluate.evaluate(mesh, data, road, CLASSES)
-        found |= {
+        figures |= {
             f"{name} road L2 (m)": metrics.l2_road_m,
             f"{name} terrain L2 (m)": metrics.l2_terrain_m,
             f"{name} road MAD (deg)": metrics.mad_road_deg,
             f"{name} terrain MAD (deg)": metrics.mad_terrain_deg,
         }
-    return found | {"making (s)": took}
+    return figures | {"making (s)": seconds}
 
 
 def main() -> None:
-    asked = [int(word) for word in sys.argv[1:]]
-    tiles, seed = asked if len(asked) == 2 else (48, 0)
+    numbers = [int(word) for word in sys.argv[1:]]
+    tiles, seed = numbers if len(numbers) == 2 else (48, 0)
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(measure, [(*place, seed) for place in survey(tiles, seed)], chunksize=4))
     print(f"{tiles} tiles, seed {seed}: {np.mean([row['making (s)'] for row in rows]):.2f} s a tile to make")

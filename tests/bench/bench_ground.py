@@ -1,9 +1,9 @@
-"""The ground filter beside CSF and PDAL's PMF and SMRF, all at their defaults, on real and made clouds.
+"""The ground filter compared with CSF and PDAL's PMF and SMRF, with default options, on real and made clouds.
 
-Real clouds come from the folder named by FLEXROAD_REAL_DATA; PDAL is used if it is on the path; what is not
-there is left out. Ground is class 2. Noise (class 7) is taken out first; class 1 takes part but is not
-scored, as nobody said what it is; all other classes are objects. Made clouds are the cells of the benchmark's
-surface models: bridges are objects, plants and mixed echoes within 0.3 m of the ground are not scored.
+Real clouds are read from the folder FLEXROAD_REAL_DATA, PDAL is used if it is on the path; both are optional.
+Ground is class 2. Noise (class 7) is removed first. Class 1 (unclassified) is filtered but not scored; all
+other classes are objects. Made clouds are the cells of the benchmark's surface models: bridges are objects,
+plants and mixed echoes within 0.3 m of the ground are not scored.
 """
 
 from __future__ import annotations
@@ -29,22 +29,25 @@ from flexroad.tasks.types import Bools, Floats
 SEED, TILES = 2, 24
 SIDE_M = 500
 CHOSEN_ON, PER_STRATUM = 1, 3
-"""Another seed, from which the default slope was chosen."""
+"""Seed and tiles per stratum from which the default slope was chosen."""
 VAGUE_M = 0.3
+"""Plants and mixed echoes nearer to the ground than this are not scored."""
 UNCLASSIFIED, GROUND, NOISE = 1, 2, 7
 LOW_SHARE, LOW_M = 0.0005, (1.0, 8.0)
-"""Low points added to a cloud: how many, how far below."""
+"""Low points added to a cloud: share of the points, and least and largest depth (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A cloud whose ground is known."""
+    """A point cloud with known ground."""
 
     name: str
     points: Floats
-    """``(n, 3)``."""
+    """Easting, northing and height, ``(n, 3)``, m."""
     truth: Bools
+    """Ground points, ``(n,)``."""
     scored: Bools
+    """Points that are scored, ``(n,)``."""
 
 
 Filter = Callable[[Floats], Bools]
@@ -67,38 +70,38 @@ def main() -> None:
 
 def show(case: Case, name: str, classify: Filter) -> None:
     start = time.perf_counter()
-    found = classify(case.points)
-    took = (time.perf_counter() - start) / len(case.points) * 1e6
-    first, second, total, kappa = errors(found, case)
+    result = classify(case.points)
+    seconds = (time.perf_counter() - start) / len(case.points) * 1e6
+    first, second, total, kappa = errors(result, case)
     print(
-        f"{case.name:22} {name:9} {first:7.2%} {second:7.2%} {total:7.2%} {kappa:6.3f} {took:8.2f}",
+        f"{case.name:22} {name:9} {first:7.2%} {second:7.2%} {total:7.2%} {kappa:6.3f} {seconds:8.2f}",
         flush=True,
     )
 
 
-def errors(found: Bools, case: Case) -> tuple[float, float, float, float]:
-    """Return ground rejected, objects accepted, all errors (shares), and Cohen's kappa."""
-    found, truth = found[case.scored], case.truth[case.scored]
-    total = np.mean(found != truth)
-    by_chance = np.mean(found) * np.mean(truth) + np.mean(~found) * np.mean(~truth)
+def errors(result: Bools, case: Case) -> tuple[float, float, float, float]:
+    """Return the shares of rejected ground, of accepted objects and of all errors, and Cohen's kappa."""
+    result, truth = result[case.scored], case.truth[case.scored]
+    total = np.mean(result != truth)
+    by_chance = np.mean(result) * np.mean(truth) + np.mean(~result) * np.mean(~truth)
     kappa = (1 - total - by_chance) / (1 - by_chance)
-    return float(np.mean(~found[truth])), float(np.mean(found[~truth])), float(total), float(kappa)
+    return float(np.mean(~result[truth])), float(np.mean(result[~truth])), float(total), float(kappa)
 
 
 def sensitivity(cases: list[Case]) -> None:
-    """Print our errors over slope and radius: type I / type II."""
+    """Print our type I and type II errors by slope and radius."""
     for case in cases:
         print(f"\n{case.name}: type I / type II by slope (down) and radius")
         radii = (10.0, 20.0, 30.0, 50.0)
         print(f"{'':6}" + "".join(f"{radius:14.0f} m" for radius in radii))
         for slope in (0.15, 0.2, 0.3, 0.35, 0.4, 0.5):
-            found = [ours(Options(slope=slope, radius_m=radius))(case.points) for radius in radii]
-            pairs = [errors(one, case)[:2] for one in found]
+            results = [ours(Options(slope=slope, radius_m=radius))(case.points) for radius in radii]
+            pairs = [errors(result, case)[:2] for result in results]
             print(f"{slope:<6}" + "".join(f"{first:8.2%} {second:7.2%}" for first, second in pairs))
 
 
 def choice() -> None:
-    """Print what a terrain model of the ground is off by, over the slope: what the default was chosen by."""
+    """Print the error of a terrain model of the ground by slope; the default slope was chosen from this."""
     places = gerod.survey(TILES, CHOSEN_ON)
     tiles = [place for name in gerod.STRATA for place in [p for p in places if p[2] == name][:PER_STRATUM]]
     scenes = [make_scene(grid, CHOSEN_ON, name, options) for _, grid, name, options in tiles]
@@ -106,21 +109,21 @@ def choice() -> None:
     print(f"{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}")
     for slope, confidence in ((0.2, 1.65), (0.3, 1.65), (0.35, 1.65), (0.4, 1.65), (0.5, 1.65), (0.35, 3.0)):
         options = Options(slope=slope, confidence=confidence)
-        off = np.mean([terrain_error(scene, options) for scene in scenes], axis=0)
-        print(f"{slope:6} {confidence:10} {off[0]:7.3f} {off[1]:7.3f}", flush=True)
+        error = np.mean([terrain_error(scene, options) for scene in scenes], axis=0)
+        print(f"{slope:6} {confidence:10} {error[0]:7.3f} {error[1]:7.3f}", flush=True)
 
 
 def terrain_error(scene: Scene, options: Options) -> tuple[float, float]:
-    """Return the mean vertical distance over all cells and over roads, bridges left out (m)."""
-    found = ground_cells(scene.dsm, scene.grid.cell, options)
-    tin = LinearNDInterpolator(np.argwhere(found), scene.dsm[found])
-    off = np.abs(tin(*np.indices(found.shape)) - scene.reference)
-    known = np.isfinite(off) & (scene.kind != Kind.DECK)
-    return float(off[known].mean()), float(off[known & scene.reference_road].mean())
+    """Return the mean vertical distance to the truth over all cells and over roads, without bridges (m)."""
+    is_ground = ground_cells(scene.dsm, scene.grid.cell, options)
+    tin = LinearNDInterpolator(np.argwhere(is_ground), scene.dsm[is_ground])
+    error = np.abs(tin(*np.indices(is_ground.shape)) - scene.reference)
+    valid = np.isfinite(error) & (scene.kind != Kind.DECK)
+    return float(error[valid].mean()), float(error[valid & scene.reference_road].mean())
 
 
 def noise() -> None:
-    """Print what the least of many noisy neighbours costs on a plane: the tolerance is for one pair."""
+    """Print the errors that noise causes on a level plane, by confidence and point density."""
     print("\na level plane with noise: ground kept and its offset in noise_m, by confidence (across)")
     rng = np.random.default_rng(SEED)
     confidences = (1.65, 2.3, 3.0)
@@ -129,8 +132,8 @@ def noise() -> None:
         n = 50_000
         x, y = rng.uniform(0, np.sqrt(n / density), (2, n))
         z = rng.normal(0, Options().noise_m, n)
-        found = [ground(x, y, z, Options(confidence=confidence)) for confidence in confidences]
-        row = "".join(f"{is_.mean():8.1%} {z[is_].mean() / Options().noise_m:+6.2f}" for is_ in found)
+        results = [ground(x, y, z, Options(confidence=confidence)) for confidence in confidences]
+        row = "".join(f"{is_.mean():8.1%} {z[is_].mean() / Options().noise_m:+6.2f}" for is_ in results)
         print(f"{density:4} per m2 {row}")
 
 
@@ -158,16 +161,16 @@ def csf() -> dict[str, Filter]:
 
 
 class Quiet:
-    """Nothing is printed, by compiled code neither."""
+    """Suppress all output, also that of compiled code."""
 
     def __enter__(self) -> None:
-        self.kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+        self.stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.close(nowhere)
 
     def __exit__(self, *error: object) -> None:
-        os.dup2(self.kept, 1)
-        os.close(self.kept)
+        os.dup2(self.stdout, 1)
+        os.close(self.stdout)
 
 
 def pdal(name: str) -> dict[str, Filter]:
@@ -180,7 +183,7 @@ def pdal(name: str) -> dict[str, Filter]:
             las = laspy.create(point_format=6, file_version="1.4")
             las.header.scales, las.header.offsets = [1e-4] * 3, np.floor(points.min(axis=0))
             las.xyz = points
-            # Filters ask for returns; these clouds count as first and only ones.
+            # The filters need return numbers: every point is a single return.
             las.return_number[:] = las.number_of_returns[:] = 1
             las.write(source)
             subprocess.run(["pdal", "translate", source, target, name], check=True)
@@ -192,7 +195,7 @@ def pdal(name: str) -> dict[str, Filter]:
 def real() -> Iterator[Case]:
     folder = os.environ.get("FLEXROAD_REAL_DATA")
     if not folder:
-        print("FLEXROAD_REAL_DATA is not set: no real clouds")
+        print("FLEXROAD_REAL_DATA is not set: real clouds are left out")
         return
     for name, pattern in (("IGN", "l93_770500_6277500/*.laz"), ("St-Barth", "stbarth/*.laz")):
         clouds = [laspy.read(path) for path in sorted((Path(folder) / "ign_crops").glob(pattern))]
@@ -205,7 +208,7 @@ def real() -> Iterator[Case]:
 
 
 def with_low_points(case: Case) -> Case:
-    """Add some points below others, as echoes with a detour give them; they are not scored."""
+    """Add points below others, as multipath echoes cause them; they are not scored."""
     rng = np.random.default_rng(SEED)
     low = case.points[rng.choice(len(case.points), round(LOW_SHARE * len(case.points)), replace=False)]
     low = low - np.column_stack([np.zeros((len(low), 2)), rng.uniform(*LOW_M, len(low))])
@@ -220,7 +223,7 @@ def with_low_points(case: Case) -> Case:
 
 
 def made() -> Iterator[Case]:
-    """Yield a square of the benchmark's world per stratum."""
+    """Yield one square of the synthetic benchmark per stratum."""
     places = gerod.survey(TILES, SEED)
     for stratum in gerod.STRATA:
         grid, options = next((grid, options) for _, grid, name, options in places if name == stratum)

@@ -1,7 +1,7 @@
-"""``prepare points`` on a real survey: points per second and peak memory, next to the cost of decoding alone.
+"""``prepare points`` on a real survey: points per second and peak memory, compared with decoding alone.
 
-Every row is a process of its own. Four files are the same survey four times, side by side: memory is not
-to grow with them.
+Every row is measured in a separate process. Four files are four copies of the same survey, side by side:
+memory should not grow with their number.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from pathlib import Path
 SURVEY = Path("autzen") / "autzen_north.laz"
 THIN = Path("autzen") / "autzen-thin.las"
 OFFSET_EAST, MAX_EAST, MIN_EAST = 155, 179, 187
-"""Where the header of a LAS file has them: moving these moves the cloud."""
+"""Byte offsets in the header of a LAS file; changing these values moves the cloud."""
 STEP_FEET = 3400.0
 TASKS = ("decode", "serial", "dask")
 EVERY_S = 0.1
-"""How often the memory of workers is looked at."""
+"""Interval of memory measurements."""
 
 
 def main() -> None:
     folder = os.environ.get("FLEXROAD_REAL_DATA")
     if not folder:
-        print("FLEXROAD_REAL_DATA is not set: nothing to measure")
+        print("FLEXROAD_REAL_DATA is not set: nothing is measured")
         return
     with tempfile.TemporaryDirectory() as scratch:
         files = side_by_side(Path(folder) / SURVEY, Path(scratch), 4)
         print(f"\n{SURVEY}: {files[0].stat().st_size / 1e6:.0f} MB, {os.cpu_count()} cores")
         print("  task     files     points  seconds  points/s   peak MB  largest worker MB")
         for task in TASKS:
-            for some in (files[:1], files):
-                run = measure(task, some, Path(folder) / THIN, Path(scratch))
+            for subset in (files[:1], files):
+                run = measure(task, subset, Path(folder) / THIN, Path(scratch))
                 print(
-                    f"  {task:8}{len(some):6}{run['points']:12,}{run['seconds']:9.1f}"
+                    f"  {task:8}{len(subset):6}{run['points']:12,}{run['seconds']:9.1f}"
                     f"{run['points'] / run['seconds']:10,.0f}{run['peak']:10.0f}{run['worker']:19.0f}"
                 )
 
 
 def side_by_side(survey: Path, folder: Path, number: int) -> list[Path]:
-    """Copies of a cloud, each east of the one before."""
+    """Write copies of a cloud, each east of the one before, and return their paths."""
     paths = []
     for index in range(number):
         raw = bytearray(survey.read_bytes())
-        for at in (OFFSET_EAST, MAX_EAST, MIN_EAST):
-            struct.pack_into("<d", raw, at, struct.unpack_from("<d", raw, at)[0] + index * STEP_FEET)
+        for offset in (OFFSET_EAST, MAX_EAST, MIN_EAST):
+            struct.pack_into("<d", raw, offset, struct.unpack_from("<d", raw, offset)[0] + index * STEP_FEET)
         paths.append(folder / f"{index}.laz")
         paths[-1].write_bytes(raw)
     return paths
@@ -69,13 +69,13 @@ def measure(task: str, files: list[Path], thin: Path, folder: Path) -> dict[str,
     return result
 
 
-def one(task: str, out: Path, thin: Path, files: list[Path]) -> None:
-    """What a process of its own does."""
+def measure_here(task: str, out: Path, thin: Path, files: list[Path]) -> None:
+    """Run one task in this process and print its measurements as JSON."""
     if task == "decode":
         work = decode
     else:
         work = prepare
-        # Compiled code is loaded before the clock starts.
+        # Compiled code is loaded before timing starts.
         prepare("serial", [thin], out / "warm", cell=20)
     worker = [0.0]
     threading.Thread(target=watch, args=(worker,), daemon=True).start()
@@ -88,7 +88,7 @@ def one(task: str, out: Path, thin: Path, files: list[Path]) -> None:
 
 
 def watch(worker: list[float]) -> None:
-    """Keep the largest memory of a child process (MB): the system's own figure starts with its parent's."""
+    """Store the largest memory of a child process (MB); ``ru_maxrss`` would include the parent's."""
     import psutil
 
     while True:
@@ -106,7 +106,7 @@ def header_points(path: Path) -> int:
 
 
 def decode(task: str, files: list[Path], out: Path) -> None:
-    """Nothing but the coordinates, by laspy, in parallel."""
+    """Only decode the coordinates, with laspy, in parallel."""
     import laspy
     import numpy as np
 
@@ -130,6 +130,6 @@ def prepare(task: str, files: list[Path], out: Path, cell: float = 1) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        one(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), [Path(name) for name in sys.argv[4:]])
+        measure_here(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), [Path(name) for name in sys.argv[4:]])
     else:
         main()

@@ -1,6 +1,6 @@
-"""Rasters of a block of points, one thread: the time, and where it goes.
+"""Rasters of a block of points, one thread: total time and time per step.
 
-A block of 250 m with its rim, 4 million coloured points, a quarter of them on houses and trees.
+The block is 250 m wide plus a rim, with 4 million coloured points, a quarter of them on houses and trees.
 """
 
 import os
@@ -28,14 +28,14 @@ STEPS = {
     "terrain": ("terrain.py", "triangulated"),
     "photo": ("topcolour.py", "photo"),
 }
-WAYS = {
+METHODS = {
     "classes": Options(despike_m=5),
     "slope filter": Options(despike_m=5, ground="filter"),
 }
 
 
 def land(rim_m: float) -> Points:
-    """Points on rolling ground, houses and trees."""
+    """Return points on hilly ground, houses and trees."""
     rng = np.random.default_rng(1)
     west, south, east, north = GRID.buffered(rim_m).bounds
     easting, northing = rng.uniform(west, east, POINTS), rng.uniform(south, north, POINTS)
@@ -48,7 +48,7 @@ def land(rim_m: float) -> Points:
 
 
 def main() -> None:
-    for name, options in WAYS.items():
+    for name, options in METHODS.items():
         points = land(reach_m(options, GRID.cell))
         rasterise(points[:100_000], GRID, options, DOP_CELL)
         profile = cProfile.Profile()
@@ -64,10 +64,10 @@ def main() -> None:
 
 
 def steps(profile: cProfile.Profile) -> dict[str, float]:
-    """Return the time within each step's function (s)."""
+    """Return the time spent in each step's function (s)."""
     spent = {
-        (file.rpartition("/")[2], function): each[3]
-        for (file, _, function), each in pstats.Stats(profile).stats.items()
+        (file.rpartition("/")[2], function): stats[3]
+        for (file, _, function), stats in pstats.Stats(profile).stats.items()
     }
     return {step: spent[place] for step, place in STEPS.items() if place in spent}
 

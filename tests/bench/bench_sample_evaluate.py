@@ -1,4 +1,4 @@
-"""Sampling and evaluation of one 250 x 250 tile, beside what general libraries need for their parts."""
+"""Sampling and evaluation of one 250 x 250 tile, compared with general libraries for parts of them."""
 
 import time
 from collections.abc import Callable
@@ -22,7 +22,7 @@ GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 
 
 def best(function: Callable[[], object], repeats: int = 7) -> float:
-    """Return the shortest of some runs (ms), the first left out."""
+    """Return the shortest time of several calls (ms); the first call is not timed."""
     function()
     times = []
     for _ in range(repeats):
@@ -32,19 +32,19 @@ def best(function: Callable[[], object], repeats: int = 7) -> float:
     return 1e3 * min(times)
 
 
-def line(what: str, faces: int, ours: float, peer: str = "", theirs: float = 0.0) -> None:
+def line(label: str, faces: int, ours: float, peer: str = "", theirs: float = 0.0) -> None:
     ratio = f"{peer} {theirs:7.1f} ms, {theirs / ours:5.1f} times ours" if peer else ""
-    print(f"{what:21}{faces:8} faces {ours:7.1f} ms   {ratio}")
+    print(f"{label:21}{faces:8} faces {ours:7.1f} ms   {ratio}")
 
 
 def peers_of_evaluate(name: str, mesh: Mesh) -> None:
-    """Compare the two point loops with peers that are given the same faces."""
+    """Compare `drape` and `mean_angles` with other libraries on the same faces."""
     x, y, z = mesh.vertices.T
     inside = np.meshgrid(GRID.eastings[1:-1] - mesh.origin[0], GRID.northings[1:-1] - mesh.origin[1])
     faces = Triangulation(x, y, mesh.faces)
-    found = drape(mesh, GRID)[1:-1, 1:-1]
+    heights = drape(mesh, GRID)[1:-1, 1:-1]
     peer = LinearTriInterpolator(faces, z)(*inside)
-    assert np.abs(found - peer).max() < 1e-6
+    assert np.abs(heights - peer).max() < 1e-6
     theirs = best(lambda: LinearTriInterpolator(Triangulation(x, y, mesh.faces), z)(*inside), 2)
     line(f"drape {name}", len(mesh.faces), best(lambda: drape(mesh, GRID)), "matplotlib", theirs)
 
@@ -68,16 +68,16 @@ def main() -> None:
     for method, surface in surfaces.items():
         options = sample.Options(method=method)
         mesh = meshes[method] = sample.sample(surface, road, clusters, options)
-        took = best(lambda s=surface, o=options: sample.sample(s, road, clusters, o))
-        line(f"sample {method}", len(mesh.faces), took)
+        time_ms = best(lambda s=surface, o=options: sample.sample(s, road, clusters, o))
+        line(f"sample {method}", len(mesh.faces), time_ms)
     plan = meshes["dynamic"].vertices
     ours = best(lambda: sample._delaunay(plan))
     line("Delaunay", len(meshes["dynamic"].faces), ours, "scipy     ", best(lambda: Delaunay(plan[:, :2])))
     for name, mesh in meshes.items():
         for nearest in (False, True):
             options = evaluate.Options(nearest=nearest)
-            took = best(lambda m=mesh, o=options: evaluate.evaluate(m, data, road, o))
-            line(f"evaluate {name}{' +3D' * nearest}", len(mesh.faces), took)
+            time_ms = best(lambda m=mesh, o=options: evaluate.evaluate(m, data, road, o))
+            line(f"evaluate {name}{' +3D' * nearest}", len(mesh.faces), time_ms)
         peers_of_evaluate(name, mesh)
 
 

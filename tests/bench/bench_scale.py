@@ -1,12 +1,12 @@
-"""Thousands of tiles: what a run costs beside its tiles, what it holds in memory, and how soon it is resumed.
+"""Thousands of tiles: overhead of a run, its memory, and the time to resume it.
 
-The tiles are tiny, so that the machinery shows; two large rasters and a mask hold them all. Two runs:
+The tiles are tiny, so that the overhead dominates; all are parts of two large rasters and a mask. Two runs:
 
-- one whose tiles only sleep as long as real ones take, on many workers, for the overhead of client and
-  scheduler: wall time x workers against the sum of the sleeps;
-- one whose tiles are really done, for the memory of client and workers over time.
+- one whose tiles only sleep as long as a real tile takes, for the overhead of client and scheduler: wall time
+  x workers compared with the sum of the sleeps;
+- one that computes its tiles, for the memory of client and workers over time.
 
-``python tests/bench/bench_scale.py [TILES] [PLOT.png]``
+Usage: ``python tests/bench/bench_scale.py [TILES] [PLOT.png]``
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 
 TILES = 1000
-"""10,000 for docs/operations.md."""
+"""Default number of tiles; docs/operations.md uses 10,000."""
 TILE_M = 20
 PATCH_M = 400
-"""Size of the one made scene that is laid out over and over."""
+"""Size of the made scene of which the rasters are repeated copies."""
 SLEEP_S = 0.3
-"""What a tile of configs/nightly.yaml takes."""
+"""Time of a tile with configs/nightly.yaml."""
 SLEEPERS = 4
 ASLEEP = 2000
-"""Tiles slept through: enough for a mean."""
+"""Tiles of the sleeping run: enough for a mean."""
 WORKERS = 2
 STATE = 550_000
 """Tiles of 250 m of one German state (34,100 km2)."""
@@ -63,23 +63,23 @@ def main(tiles: int = TILES, plot: Path | None = None) -> None:
         folder = Path(scratch)
         side = math.isqrt(tiles)
         survey(folder, side)
-        found, took = timed(lambda: rasters.index(folder, LAYERS, tile_size_m=TILE_M))
-        Catalog(found.tiles).write(folder / "catalog.parquet")
-        say("cut the catalog", took, side**2)
-        catalog, took = timed(lambda: Catalog.read(folder / "catalog.parquet"))
-        say("read the catalog", took, side**2)
-        held = kept(lambda: Catalog.read(folder / "catalog.parquet")) / side**2
-        print(f"  in memory {held / 2**10:.1f} KB a tile, {held * STATE / 2**30:.1f} GB for {STATE:,}")
+        index, seconds = timed(lambda: rasters.index(folder, LAYERS, tile_size_m=TILE_M))
+        Catalog(index.tiles).write(folder / "catalog.parquet")
+        report("make the catalog", seconds, side**2)
+        catalog, seconds = timed(lambda: Catalog.read(folder / "catalog.parquet"))
+        report("read the catalog", seconds, side**2)
+        size = result_bytes(lambda: Catalog.read(folder / "catalog.parquet")) / side**2
+        print(f"  in memory {size / 2**10:.1f} KB a tile, {size * STATE / 2**30:.1f} GB for {STATE:,}")
         config = compose(CONFIG, "scale")
-        run, took = timed(lambda: Run.create(folder / "RUN", config, catalog))
-        say("make the run", took, side**2)
-        _, took = timed(lambda: [run.graph(tile) for tile in catalog.tiles])
-        say("build the graphs", took, side**2)
+        run, seconds = timed(lambda: Run.create(folder / "RUN", config, catalog))
+        report("create the run", seconds, side**2)
+        _, seconds = timed(lambda: [run.graph(tile) for tile in catalog.tiles])
+        report("build the graphs", seconds, side**2)
         overhead(Run.create(folder / "ASLEEP", config, catalog))
-        memory = watched(run)
-        resumed(folder, side**2)
+        memory = run_and_measure(run)
+        resume(folder, side**2)
         size = (run.path / DATABASE).stat().st_size
-        print(f"database {size / 2**20:.1f} MB; of a state {size / side**2 * STATE / 2**30:.1f} GB")
+        print(f"database {size / 2**20:.1f} MB; for a state {size / side**2 * STATE / 2**30:.1f} GB")
         if plot:
             draw(memory, plot)
 
@@ -88,9 +88,9 @@ LAYERS = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
 
 
 def survey(folder: Path, side: int) -> None:
-    """Write three rasters of ``side`` x ``side`` tiles: one made scene, laid out over and over."""
+    """Write three rasters of ``side`` x ``side`` tiles: repeated copies of one made scene."""
     grid = Grid("EPSG:25832", 300_000, 5_700_000, 1.0, PATCH_M, PATCH_M)
-    # So many streets that every tile has one.
+    # Dense streets, so that every tile has one.
     scene = make_scene(grid, 7, options=SceneOptions(block_m=20))
     cells = side * TILE_M
     write(folder / "dsm.tif", scene.dsm, cells)
@@ -102,10 +102,10 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
     repeat = math.ceil(cells / PATCH_M)
     data = np.tile(patch, (repeat, repeat))[:cells, :cells]
     data = data.astype(np.float32) if data.dtype == np.float64 else data
-    kind = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
-    where = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
+    layout = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
     with rasterio.open(
-        path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **kind, **where
+        path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **layout, **place
     ) as raster:
         raster.write(data, 1)
 
@@ -114,7 +114,7 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
 
 
 def sleep_tile(job: TileJob) -> TileResult:
-    """Take as long as a real tile, and send back as much."""
+    """Take as long as a real tile, and return as much data."""
     from flexroad.pipeline.store.records import TileRecord
 
     time.sleep(SLEEP_S)
@@ -126,14 +126,14 @@ def sleep_tile(job: TileJob) -> TileResult:
 
 @dataclass
 class Asleep:
-    """Dask with workers that sleep; notes when the first and the last result came."""
+    """A Dask executor whose workers sleep; records the time of every result."""
 
     workers: int
     times: list[float] = field(default_factory=list)
-    here: list[float] = field(default_factory=list)
-    """CPU time of client and scheduler (s) at the same moments."""
-    there: dict[int, float] = field(default_factory=dict)
-    """And of all workers, by number of results."""
+    client_cpu: list[float] = field(default_factory=list)
+    """CPU time of client and scheduler (s) at these times."""
+    worker_cpu: dict[int, float] = field(default_factory=dict)
+    """CPU time of all workers (s), by number of results."""
 
     def map(
         self,
@@ -144,10 +144,10 @@ class Asleep:
     ) -> Iterator[Any]:
         for result in DaskExecutor(self.workers).map(sleep_tile, jobs, lost, probe):
             self.times.append(time.perf_counter())
-            self.here.append(time.process_time())
+            self.client_cpu.append(time.process_time())
             if len(self.times) % 50 == self.workers:
-                # Now and then: asking costs time, too.
-                self.there[len(self.times)] = busy(psutil.Process().children(recursive=True))
+                # Not for every result, because the measurement takes time.
+                self.worker_cpu[len(self.times)] = busy(psutil.Process().children(recursive=True))
             yield result
 
 
@@ -158,18 +158,19 @@ def busy(processes: list[psutil.Process]) -> float:
 
 def overhead(run: Run) -> None:
     asleep = Asleep(SLEEPERS)
-    some = {tile.id for tile in run.catalog.tiles[:ASLEEP]}
-    run_tiles(run, asleep, only=lambda tile: tile.id in some)
-    # Of each worker's first tile one sees the end only.
+    selected = {tile.id for tile in run.catalog.tiles[:ASLEEP]}
+    run_tiles(run, asleep, only=lambda tile: tile.id in selected)
+    # Each worker's first tile is left out: only its end is recorded.
     first, tiles = SLEEPERS - 1, len(asleep.times) - SLEEPERS
     wall, slept = asleep.times[-1] - asleep.times[first], SLEEP_S * tiles
-    here = (asleep.here[-1] - asleep.here[first]) / tiles
-    there = (max(asleep.there.values()) - asleep.there[SLEEPERS]) / (max(asleep.there) - SLEEPERS)
+    client = (asleep.client_cpu[-1] - asleep.client_cpu[first]) / tiles
+    results = max(asleep.worker_cpu) - SLEEPERS
+    worker = (max(asleep.worker_cpu.values()) - asleep.worker_cpu[SLEEPERS]) / results
     print(
         f"asleep: {tiles} tiles of {SLEEP_S} s on {SLEEPERS} workers: {wall:.1f} s x {SLEEPERS} against "
         f"{slept:.1f} s: overhead {wall * SLEEPERS / slept - 1:.1%}\n"
-        f"  CPU: a worker {1000 * there:.1f} ms a tile, {there / SLEEP_S:.1%}; client and scheduler "
-        f"{1000 * here:.1f} ms a tile, enough for {SLEEP_S / here:.0f} workers",
+        f"  CPU: a worker {1000 * worker:.1f} ms a tile, {worker / SLEEP_S:.1%}; client and scheduler "
+        f"{1000 * client:.1f} ms a tile, enough for {SLEEP_S / client:.0f} workers",
         flush=True,
     )
 
@@ -179,25 +180,25 @@ def overhead(run: Run) -> None:
 
 @dataclass
 class Memory:
-    """What client and workers hold (MB), every few seconds."""
+    """Memory of client and workers (MB), measured at intervals."""
 
     seconds: list[float] = field(default_factory=list)
     tiles: list[int] = field(default_factory=list)
     client: list[float] = field(default_factory=list)
     worker: list[float] = field(default_factory=list)
-    """The largest of them."""
+    """Memory of the largest worker."""
     done: int = 0
 
-    def keep_looking(self, over: threading.Event, every_s: float) -> None:
-        me, start = psutil.Process(), time.perf_counter()
-        while not over.wait(every_s):
-            held = [resident_mb(child) for child in me.children(recursive=True)]
+    def measure(self, stop: threading.Event, interval_s: float) -> None:
+        process, start = psutil.Process(), time.perf_counter()
+        while not stop.wait(interval_s):
+            workers = [resident_mb(child) for child in process.children(recursive=True)]
             self.seconds.append(time.perf_counter() - start)
             self.tiles.append(self.done)
-            self.client.append(resident_mb(me))
-            self.worker.append(max(held, default=0.0))
+            self.client.append(resident_mb(process))
+            self.worker.append(max(workers, default=0.0))
 
-    def note(self, result: TileResult) -> None:
+    def count(self, result: TileResult) -> None:
         self.done += 1
 
 
@@ -208,20 +209,20 @@ def resident_mb(process: psutil.Process) -> float:
         return 0.0
 
 
-def watched(run: Run) -> Memory:
-    memory, over = Memory(), threading.Event()
-    looking = threading.Thread(target=memory.keep_looking, args=(over, 1.0))
-    looking.start()
+def run_and_measure(run: Run) -> Memory:
+    memory, stop = Memory(), threading.Event()
+    thread = threading.Thread(target=memory.measure, args=(stop, 1.0))
+    thread.start()
     try:
-        how, took = timed(lambda: run_tiles(run, DaskExecutor(WORKERS), watch=memory.note))
+        summary, seconds = timed(lambda: run_tiles(run, DaskExecutor(WORKERS), watch=memory.count))
     finally:
-        over.set()
-        looking.join()
-    say(f"do {how.done} tiles ({how.failed} failed) on {WORKERS} workers", took, how.tiles)
-    # From a tenth on everything is loaded and compiled.
-    for name, held in (("client", memory.client), ("largest worker", memory.worker)):
-        tenth = next(i for i, n in enumerate(memory.tiles) if n >= how.tiles // 10)
-        print(f"  {name:15}{held[tenth]:6.0f} MB after a tenth, {held[-2]:6.0f} MB at the end")
+        stop.set()
+        thread.join()
+    report(f"do {summary.done} tiles ({summary.failed} failed) on {WORKERS} workers", seconds, summary.tiles)
+    # After a tenth of the tiles all code is loaded and compiled.
+    for name, values in (("client", memory.client), ("largest worker", memory.worker)):
+        tenth = next(i for i, n in enumerate(memory.tiles) if n >= summary.tiles // 10)
+        print(f"  {name:15}{values[tenth]:6.0f} MB after a tenth, {values[-2]:6.0f} MB at the end")
     return memory
 
 
@@ -241,20 +242,20 @@ def draw(memory: Memory, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-# --- afterwards ---------------------------------------------------------------------------------------
+# --- resume ---------------------------------------------------------------------------------------
 
 
-def resumed(folder: Path, tiles: int) -> None:
-    """Time whole commands, Python's start included, over tiles that are all done."""
+def resume(folder: Path, tiles: int) -> None:
+    """Time whole commands, with the start of Python, on a finished run."""
     (folder / "scale.yaml").write_text(str(CONFIG).replace("'", '"'))
     again = ["run", "--config", "scale.yaml", "--catalog", "catalog.parquet", "--out", "RUN"]
     commands = (again, ["status", "RUN"], ["report", "RUN"])
     for words in commands:
-        _, took = timed(lambda words=words: flexroad(folder, words))
-        say(f"flexroad {words[0]}", took, tiles)
+        _, seconds = timed(lambda words=words: flexroad(folder, words))
+        report(f"flexroad {words[0]}", seconds, tiles)
     (folder / "RUN" / DATABASE).unlink()
-    _, took = timed(lambda: flexroad(folder, again))
-    say("flexroad run, database lost", took, tiles)
+    _, seconds = timed(lambda: flexroad(folder, again))
+    report("flexroad run, database deleted", seconds, tiles)
 
 
 def flexroad(folder: Path, words: list[str]) -> None:
@@ -268,26 +269,28 @@ def flexroad(folder: Path, words: list[str]) -> None:
     )
 
 
-def kept(act: Callable[[], Any]) -> int:
-    """Return how many bytes a result holds."""
+def result_bytes(function: Callable[[], Any]) -> int:
+    """Return the memory of a function's result (bytes)."""
     tracemalloc.start()
-    found = act()
+    result = function()
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    del found
+    del result
     return size
 
 
-def timed(act: Callable[[], Any]) -> tuple[Any, float]:
+def timed(function: Callable[[], Any]) -> tuple[Any, float]:
+    """Return a function's result and its time (s)."""
     start = time.perf_counter()
-    found = act()
-    return found, time.perf_counter() - start
+    result = function()
+    return result, time.perf_counter() - start
 
 
-def say(what: str, seconds: float, tiles: int) -> None:
-    each = seconds / tiles
+def report(label: str, seconds: float, tiles: int) -> None:
+    per_tile = seconds / tiles
+    state_min = per_tile * STATE / 60
     print(
-        f"{what:45}{seconds:8.2f} s{1000 * each:9.3f} ms a tile{each * STATE / 60:9.1f} min for {STATE:,}",
+        f"{label:45}{seconds:8.2f} s{1000 * per_tile:9.3f} ms a tile{state_min:9.1f} min for {STATE:,}",
         flush=True,
     )
 

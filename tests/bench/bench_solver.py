@@ -1,8 +1,8 @@
-"""The convex solver against 200 Adam iterations, from the same start on the same losses, unit weights.
+"""The convex solver compared with 200 Adam iterations: same start, same losses, unit weights.
 
-Two losses: the differences alone, and with the bending energy. "to win" is the time
-until the solver's loss is below the lowest of all Adam steps, "whole" until it stops by itself. Adam
-evaluates the loss that bench_fit.py measures; for the bending energy, a gradient by dense products is added.
+Two losses: the height differences alone, and with the bending energy. "to win" is the time until the solver's
+loss is below the lowest loss of all Adam steps, "whole" the time until it stops by itself. Adam uses the
+objective that bench_fit.py measures; the gradient of the bending energy is added with dense products.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STIFFNESS_M3, TERRAIN = 100.0, 0.02
 
 
 def case() -> tuple[TileData, RoadClusters]:
-    """Rolling ground with noise, a winding road and cars on it."""
+    """Return a tile with hilly ground, noise, and a winding road with cars."""
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, SIZE, SIZE)
     e, n = np.meshgrid(grid.eastings - grid.west, grid.northings - grid.south)
     rng = np.random.default_rng(0)
@@ -40,18 +40,18 @@ def case() -> tuple[TileData, RoadClusters]:
     return TileData("bench", grid, grid, dsm, dtm), RoadClusters(grid, road.astype(np.int32))
 
 
-def with_bending(objective: Objective, bent: BendingEnergy) -> Callable[[Floats], tuple[float, Floats]]:
+def with_bending(objective: Objective, bending: BendingEnergy) -> Callable[[Floats], tuple[float, Floats]]:
     def loss(variables: Floats) -> tuple[float, Floats]:
         value, gradient = objective(variables)
-        energy, slope = bent(variables[0])
-        gradient[0] += slope
+        energy, energy_gradient = bending(variables[0])
+        gradient[0] += energy_gradient
         return value + energy, gradient
 
     return loss
 
 
 def best(function: Callable[[], object]) -> float:
-    """Return the shortest of some runs (ms of CPU time, for the machine may be busy)."""
+    """Return the shortest CPU time of several calls (ms); CPU time, because the machine may be busy."""
     times = []
     for _ in range(ROUNDS):
         start = time.process_time()
@@ -61,7 +61,7 @@ def best(function: Callable[[], object]) -> float:
 
 
 def compare(points: int, smoothness: str) -> float:
-    """Print one row; return how many times as long as the solver Adam takes to the same loss."""
+    """Print one row; return the ratio of Adam's time to the solver's time for the same loss."""
     data, clusters = case()
     options = nurbs.Options(weights="unit", control_points=(points, points), lambda_reg=0)
     space = nurbs.space_of(data, options)
@@ -70,43 +70,47 @@ def compare(points: int, smoothness: str) -> float:
     start, shape = heights - datum, (points, points)
     west, south, east, north = data.grid.hull
     stiffness = STIFFNESS_M3 * np.where(clusters.mask, 1.0, TERRAIN) / clusters.mask.size
-    bent = bending_energy(stiffness, space, (east - west, north - south)) if smoothness == "bending" else None
-    way = with_bending(objective, bent) if bent else objective
+    bending = (
+        bending_energy(stiffness, space, (east - west, north - south)) if smoothness == "bending" else None
+    )
+    loss = with_bending(objective, bending) if bending else objective
     variables, limit = np.stack([start, np.zeros_like(start)]), np.full((2, 1, 1), np.inf)
     schedule = adam.Schedule(options.learning_rate, ITERATIONS, 0, 20)
 
     def solve(steps: int) -> irls.Solution:
         return irls.minimise(
-            irls.HuberObjective(objective, shape, bending=bent), start, steps, options.stop_tolerance
+            irls.HuberObjective(objective, shape, bending=bending), start, steps, options.stop_tolerance
         )
 
-    _, losses = adam.minimise(way, variables, limit, schedule)
-    lowest, found = min(losses), solve(ITERATIONS)
-    steps = int(np.argmax(np.array(found.losses) < lowest))
+    _, losses = adam.minimise(loss, variables, limit, schedule)
+    lowest, solution = min(losses), solve(ITERATIONS)
+    steps = int(np.argmax(np.array(solution.losses) < lowest))
     if not steps:
-        raise SystemExit(f"{smoothness}, {points}: the solver stopped at {found.losses[-1]:.6f}, above Adam")
+        raise SystemExit(
+            f"{smoothness}, {points}: the solver stopped at {solution.losses[-1]:.6f}, above Adam"
+        )
     slow, fast, whole = (
         best(f)
         for f in (
-            lambda: adam.minimise(way, variables, limit, schedule),
+            lambda: adam.minimise(loss, variables, limit, schedule),
             lambda: solve(steps),
             lambda: solve(ITERATIONS),
         )
     )
     print(
-        f"{points:>6} {smoothness:<9}{lowest:>10.6f}{slow:>8.0f}{found.losses[-1]:>10.6f}{whole:>8.0f}"
+        f"{points:>6} {smoothness:<9}{lowest:>10.6f}{slow:>8.0f}{solution.losses[-1]:>10.6f}{whole:>8.0f}"
         f"{steps:>7}{fast:>8.0f}{slow / fast:>8.1f}{slow / whole:>8.1f}"
     )
     return slow / fast
 
 
 def main() -> None:
-    """Print the table; an error if the solver never wins, or not in a third of the time where it is to."""
+    """Print the table; exit with an error if the solver is not at least three times as fast."""
     print(f"{SIZE} x {SIZE} cells, one thread; losses in m, times in ms")
     print("points smoothness   Adam      ms   solver   whole  steps  to win   ratio   whole")
     ratios = {(n, kind): compare(n, kind) for n in (35, 70) for kind in ("none", "bending")}
     if min(ratios[35, kind] for kind in ("none", "bending")) < 3:
-        raise SystemExit("the solver is slower than wanted")
+        raise SystemExit("the solver is slower than required")
 
 
 if __name__ == "__main__":

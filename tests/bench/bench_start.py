@@ -1,4 +1,4 @@
-"""How soon commands start: CPU time of whole processes, as ratios to ``python -c "import numpy"`` in one run.
+"""Start of commands: CPU time of whole processes, relative to ``python -c "import numpy"``.
 
 Targets: ``flexroad --help`` at most 5, ``flexroad config show`` at most 8, a run with nothing to do over ten
 tiles at most 15.
@@ -29,8 +29,8 @@ def cpu_s(command: list[str]) -> float:
 def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         survey, run = Path(scratch, "survey"), Path(scratch, "run")
-        made = ["catalog", "synthetic", "-o", str(survey), "--tiles", "10", "--tile-size", "60"]
-        subprocess.run([*FLEXROAD, *made], check=True, capture_output=True)
+        synthetic = ["catalog", "synthetic", "-o", str(survey), "--tiles", "10", "--tile-size", "60"]
+        subprocess.run([*FLEXROAD, *synthetic], check=True, capture_output=True)
         catalog = ["--catalog", str(survey / "catalog.parquet"), "--out", str(run)]
         commands = {
             "python -c 'import numpy'": ([sys.executable, "-c", "import numpy"], 1),
@@ -39,9 +39,9 @@ def main() -> None:
             "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "nightly", *catalog], 15),
         }
         for command, _ in commands.values():
-            # Once not counted: files come into memory, and the run is done.
+            # First call not timed: it reads files into the cache and finishes the run.
             subprocess.run(command, check=True, capture_output=True)
-        # In turn, so that a machine that slows down slows all of them.
+        # Commands alternate, so that a slower machine affects all of them alike.
         rounds = [{name: cpu_s(command) for name, (command, _) in commands.items()} for _ in range(ROUNDS)]
     best = {name: min(times[name] for times in rounds) for name in commands}
     base = best["python -c 'import numpy'"]
