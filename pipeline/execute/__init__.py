@@ -1,7 +1,7 @@
-"""Run jobs one after the other or on Dask; the only package that knows Dask.
+"""Executors: run jobs one after the other or on Dask. The only package that imports Dask.
 
-One Dask task is one tile: its graph is pulled inside a single process, so that no raster ever travels
-(``docs/decisions.md`` has the measurement against one task per stage).
+One Dask task is one tile. Its graph is computed inside a single process, so that no raster is sent between
+processes (``docs/decisions.md`` has the measurement against one task per stage).
 """
 
 from flexroad.pipeline.execute.dask import DaskExecutor

@@ -1,4 +1,4 @@
-"""Where the scheduler is: on this machine, running already, or asked for from SLURM or Kubernetes."""
+"""Dask clusters: on this machine, already running, or requested from SLURM or Kubernetes."""
 
 from __future__ import annotations
 
@@ -25,42 +25,44 @@ SETTINGS = {
     "distributed.worker.memory.terminate": 0.95,
     "distributed.worker.profile.enabled": False,
 }
-"""Dask's settings are for data frames that lie in workers. A tile leaves nothing to write to disk, and a
-worker that paused would wait forever for its only tile to give memory back; so it is stopped at the limit.
-Looking a hundred times a second at what a worker does would cost 2% of a tile; the journal tells more."""
-ELSEWHERE_BYTES = 4 * 1024**3
-"""Memory of a worker of a cluster that is asked for, where nothing is said."""
+"""Dask settings of all workers. Dask's defaults suit data frames that are kept in workers. A tile leaves
+nothing that could be spilled to disk, and a paused worker would wait forever for its only tile to free
+memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time."""
+DEFAULT_MEMORY_BYTES = 4 * 1024**3
+"""Memory of one SLURM or Kubernetes worker if the configuration gives none."""
 GRACE_S = 10.0
-"""How long a running scheduler may be without workers: a nanny may be at replacing one."""
-ASKED_FOR = {
+"""How long a running scheduler may have no workers (s): a nanny may be replacing one."""
+CLUSTER_PACKAGES = {
     "slurm": ("dask_jobqueue", "dask-jobqueue"),
     "kubernetes": ("dask_kubernetes.operator", "dask-kubernetes"),
 }
+"""Module and package by kind of cluster."""
 
 
 @dataclass(frozen=True)
 class ClusterTarget:
-    """Where a client connects to."""
+    """The cluster that a client connects to."""
 
     target: Any
-    """An address, or a cluster object of Dask's."""
+    """An address, or a Dask cluster object."""
     name: str
+    """The cluster's name in messages."""
     start_s: float = 0
-    """How long to wait for the first worker."""
+    """How long to wait for the first worker (s)."""
     own: bool = False
-    """Whether the workers are of this terminal."""
+    """Whether the workers were started from this terminal."""
 
 
 @contextlib.contextmanager
 def open_cluster(
     cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
 ) -> Iterator[ClusterTarget]:
-    """Start, ask for or find a cluster, and end what was started.
+    """Connect to, start or request a cluster; on exit, stop it if it was started here.
 
     Raises
     ------
     ConfigError
-        If something is not installed, or the cluster cannot be had.
+        If a package or program is not installed, or the cluster cannot be started.
     """
     if scheduler:
         yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
@@ -71,27 +73,27 @@ def open_cluster(
 
     make = {"local": local, "slurm": slurm, "kubernetes": kubernetes}[cluster.kind]
     with contextlib.ExitStack() as stack:
-        # For as long as it lasts: workers that follow those that died are to know it, too.
+        # Set until the cluster ends, so that workers that replace dead ones get the settings too.
         stack.enter_context(dask.config.set(SETTINGS))
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
-        made = stack.enter_context(make(cluster, scratch, dashboard))
+        opened = stack.enter_context(make(cluster, scratch, dashboard))
         start_s = 0 if cluster.kind == "local" else cluster.start_s
-        yield ClusterTarget(made, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
+        yield ClusterTarget(opened, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
 
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return processes of one thread on this machine.
+    """Return a cluster of single-threaded processes on this machine.
 
     Raises
     ------
     ConfigError
-        If they cannot be started.
+        If the processes cannot be started.
     """
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
     from distributed.system import MEMORY_LIMIT
 
-    # As far as a container may use them.
+    # Dask's count respects the limits of a container.
     workers = cluster.workers or CPU_COUNT
     try:
         return LocalCluster(
@@ -107,35 +109,35 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
         )
     except (OSError, RuntimeError) as error:
         raise ConfigError(
-            f"cannot start {workers} worker processes here: {_line(error).rstrip('.')}; take fewer "
+            f"cannot start {workers} worker processes here: {_one_line(error).rstrip('.')}; use fewer "
             "--workers, or allow more processes and open files (ulimit -u, ulimit -n)"
         ) from error
 
 
 def slurm(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return workers that SLURM gives; when jobs end at their walltime others are asked for.
+    """Return a cluster of SLURM jobs; a job that ends at its walltime is replaced.
 
     Raises
     ------
     ConfigError
-        If dask-jobqueue or sbatch is not there.
+        If dask-jobqueue or sbatch is not installed.
     """
     jobqueue = _extra("slurm")
     if shutil.which("sbatch") is None:
         raise ConfigError(
             "cluster.kind slurm: there is no sbatch here; run this on a login node of the cluster, with the "
-            "SLURM client installed, or say `cluster: local`"
+            "SLURM client installed, or set `cluster: local`"
         )
-    made = jobqueue.SLURMCluster(**slurm_options(cluster, dashboard))
+    slurm_cluster = jobqueue.SLURMCluster(**slurm_options(cluster, dashboard))
     jobs = -(-(cluster.workers or 1) // cluster.per_job)
-    made.adapt(minimum_jobs=jobs, maximum_jobs=jobs)
-    return made
+    slurm_cluster.adapt(minimum_jobs=jobs, maximum_jobs=jobs)
+    return slurm_cluster
 
 
 def slurm_options(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
-    """Return what ``SLURMCluster`` is asked for: jobs of ``per_job`` workers, one thread and core each."""
+    """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each."""
     walltime = timedelta(hours=cluster.walltime_h)
-    # A worker that leaves by itself before SLURM ends it gives its tiles back.
+    # A worker that closes before SLURM kills it returns its tiles to the scheduler.
     lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
     exports = [f"export {name}={value}" for name, value in _environment().items()]
     return {
@@ -143,7 +145,7 @@ def slurm_options(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
         "account": cluster.account,
         "cores": cluster.per_job,
         "processes": cluster.per_job,
-        "memory": f"{(cluster.memory or ELSEWHERE_BYTES) * cluster.per_job} B",
+        "memory": f"{(cluster.memory or DEFAULT_MEMORY_BYTES) * cluster.per_job} B",
         "walltime": _clock(walltime),
         "job_extra_directives": list(cluster.job_extra),
         "job_script_prologue": [*exports, *cluster.prologue],
@@ -157,25 +159,25 @@ def slurm_options(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
 
 
 def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return workers in pods, by the Dask operator.
+    """Return a cluster of Kubernetes pods, created by the Dask operator.
 
     Raises
     ------
     ConfigError
-        If dask-kubernetes or the cluster is not there.
+        If dask-kubernetes is not installed, no image is set, or the cluster cannot be reached.
     """
     operator = _extra("kubernetes")
     if not cluster.image:
         raise ConfigError(
-            "cluster.kind kubernetes: which image? set cluster.image to one with flexroad in it"
+            "cluster.kind kubernetes: no image is set; set cluster.image to one that contains flexroad"
         )
     spec = operator.make_cluster_spec(**kubernetes_options(cluster))
-    # Whatever the client libraries raise: no credentials, nobody there, no operator, no rights.
+    # The client libraries raise many types: no credentials, no connection, no operator, no permission.
     try:
         importlib.import_module("kr8s").api(namespace=cluster.namespace).version()
     except Exception as error:
         raise ConfigError(
-            f"cluster.kind kubernetes: {_line(error)}; does `kubectl get pods` work?"
+            f"cluster.kind kubernetes: {_one_line(error)}; does `kubectl get pods` work?"
         ) from error
     try:
         return operator.KubeCluster(
@@ -183,14 +185,14 @@ def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
         )
     except Exception as error:
         raise ConfigError(
-            f"cluster.kind kubernetes: {_line(error)}; is the Dask operator installed, and may this account "
-            "make DaskCluster resources?"
+            f"cluster.kind kubernetes: {_one_line(error)}; is the Dask operator installed, and may this "
+            "account create DaskCluster resources?"
         ) from error
 
 
 def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
-    """Return what ``make_cluster_spec`` is asked for: pods of one worker, one thread and core each."""
-    size = {"cpu": "1", "memory": str(int(cluster.memory or ELSEWHERE_BYTES))}
+    """Return the options of ``make_cluster_spec``: pods of one worker, one thread and core each."""
+    size = {"cpu": "1", "memory": str(int(cluster.memory or DEFAULT_MEMORY_BYTES))}
     return {
         "name": f"flexroad-{uuid.uuid4().hex[:8]}",
         "image": cluster.image,
@@ -198,12 +200,12 @@ def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
         "resources": {"requests": size, "limits": size},
         "env": _environment(),
         "worker_command": "dask worker --nthreads 1",
-        # Whoever is killed leaves no cluster behind.
+        # If the client is killed, the cluster ends by itself after this many seconds.
         "idle_timeout": 900,
     }
 
 
-def _line(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or repr(error)
 
 
@@ -213,7 +215,7 @@ def _environment() -> dict[str, str]:
 
 
 def _extra(kind: str) -> Any:
-    module, package = ASKED_FOR[kind]
+    module, package = CLUSTER_PACKAGES[kind]
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Many jobs at once, on Dask: connect, check that the workers are fit, and submit."""
+"""The Dask executor: connect to a cluster, check its workers, and submit jobs."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
 
 LOCAL = Cluster()
 ANSWER_S = 10.0
-"""How long a scheduler may take to answer."""
+"""How long a scheduler may take to answer (s)."""
 
 
 class DaskExecutor:
-    """Local worker processes of one thread each, a running cluster, or one that is asked for.
+    """Runs jobs on local worker processes of one thread each, or on another Dask cluster.
 
     Parameters
     ----------
     workers : int, optional
-        Number of processes; by default what ``cluster`` says.
+        Number of processes; by default that of ``cluster``.
     scheduler : str, optional
-        Address of a running Dask scheduler, used instead.
+        Address of a running Dask scheduler, which is used instead of ``cluster``.
     cluster : Cluster
-        Who works, and how long is waited for them.
+        The kind and size of the cluster, and how long to wait for workers.
     dashboard : bool
-        Serve Dask's dashboard; where it is goes to ``say``.
+        Serve Dask's dashboard; its address is passed to ``say``.
     say : callable
-        Told in one line what whoever watches wants to know: the dashboard, who is waited for.
+        Prints one line for the user: the address of the dashboard, a wait for workers.
     """
 
     def __init__(
@@ -66,20 +66,20 @@ class DaskExecutor:
         queue = iter(jobs)
         first = list(islice(queue, 1))
         if not first:
-            # Nothing to do needs no workers.
+            # Without jobs no cluster is started.
             return
         from flexroad.pipeline.execute.session import Session
 
         with (
             _quiet(),
-            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as place,
-            self._connected(place) as client,
+            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as target,
+            self._connected(target) as client,
         ):
-            guard = _guard(client, place, probe)
+            check = _check_workers(client, target, probe)
             session = Session(
                 client,
-                place.name,
-                guard,
+                target.name,
+                check,
                 function,
                 chain(first, queue),
                 lost,
@@ -89,19 +89,19 @@ class DaskExecutor:
             yield from session.results()
 
     @contextlib.contextmanager
-    def _connected(self, place: ClusterTarget) -> Iterator[Client]:
+    def _connected(self, target: ClusterTarget) -> Iterator[Client]:
         from distributed import Client
 
         try:
-            client = Client(place.target, timeout=ANSWER_S, set_as_default=False)
+            client = Client(target.target, timeout=ANSWER_S, set_as_default=False)
         except OSError as error:
-            raise ConfigError(f"{place.name} does not answer: {error}") from error
+            raise ConfigError(f"{target.name} does not answer: {error}") from error
         with client:
             if self.dashboard:
                 self.say(_dashboard(client))
-            if not _any_worker(client, time.monotonic() + place.start_s):
+            if not _any_worker(client, time.monotonic() + target.start_s):
                 raise ConfigError(
-                    f"{place.name} has no workers; start some (`dask worker ADDRESS --nthreads 1`)"
+                    f"{target.name} has no workers; start some (`dask worker ADDRESS --nthreads 1`)"
                 )
             yield client
 
@@ -116,73 +116,79 @@ def _any_worker(client: Client, end: float) -> bool:
     return False
 
 
-def _guard(client: Client, place: ClusterTarget, probe: Callable[[], None] | None) -> str:
-    """Compare versions, put plugins on scheduler and workers, and probe; return the guard's name.
+def _check_workers(client: Client, target: ClusterTarget, probe: Callable[[], None] | None) -> str:
+    """Compare versions, register the plugins and run the probe; return the name of the `WorkerCheck`.
 
     Raises
     ------
     ConfigError
-        If a worker is not fit for the work.
+        If a worker has other versions, cannot load flexroad or fails the probe.
     ClusterLost
-        If nobody answers any more.
+        If the scheduler no longer answers.
     """
     from flexroad.pipeline.execute import workers
-    from flexroad.pipeline.execute.scheduler import no_second_try
+    from flexroad.pipeline.execute.scheduler import retry_blocker
 
     here = workers.versions()
     name = uuid.uuid4().hex[:8]
     try:
         _compare(client, here)
-        client.register_plugin(no_second_try(client.id, name), name=f"flexroad-{name}")
-        _post(client, workers.WorkerCheck(here, probe, ignore_sigint=place.own), name)
+        client.register_plugin(retry_blocker(client.id, name), name=f"flexroad-{name}")
+        _register(client, workers.WorkerCheck(here, probe, ignore_sigint=target.own), name)
     except ConfigError:
         raise
     except OSError as error:
-        raise ClusterLost(f"{place.name} went away before its first tile: {error}") from error
+        raise ClusterLost(f"{target.name} went away before its first tile: {error}") from error
     except Exception as error:
-        # Of whatever kind unpickling gave; only a line of it helps.
-        told = " ".join(str(error).split()) or repr(error)
+        # Unpickling on the cluster may raise any type of error.
+        reason = " ".join(str(error).split()) or repr(error)
         raise ConfigError(
-            f"{place.name} cannot load flexroad ({told}); install it for the workers, and let the scheduler "
-            "take plugins (distributed.scheduler.pickle)"
+            f"{target.name} cannot load flexroad ({reason}); install it for the workers, and let the "
+            "scheduler accept plugins (distributed.scheduler.pickle)"
         ) from error
-    # A worker that dies meanwhile is no fault; the one after it is asked when its first tile comes.
+    # A worker that dies now is ignored: the one that replaces it is checked before its first tile.
     for fault in client.run(workers.find_fault, name, on_error="ignore").values():
         if fault:
             raise ConfigError(fault)
     return name
 
 
-def _post(client: Client, guard: Any, name: str) -> None:
-    """Put a guard on all workers, again if one of them just died."""
-    for rest in range(4, -1, -1):
+def _register(client: Client, plugin: Any, name: str) -> None:
+    """Register a plugin on all workers; retried if a worker dies meanwhile."""
+    for retries_left in range(4, -1, -1):
         try:
-            client.register_plugin(guard, name=name)
+            client.register_plugin(plugin, name=name)
             return
         except OSError:
-            if not rest:
+            if not retries_left:
                 raise
             time.sleep(1)
 
 
 def _compare(client: Client, here: dict[str, str]) -> None:
-    """Compare versions by Dask's own message: what differs too much could not load anything of ours."""
+    """Compare the versions that Dask reports: with very different ones no plugin could be unpickled.
+
+    Raises
+    ------
+    ConfigError
+        If the versions of the scheduler or of a worker differ from those here.
+    """
     from flexroad.pipeline.execute.workers import PICKLING
 
-    found = client.get_versions(packages=[name for name in here if name != "python"])
-    _refuse("the scheduler", found["scheduler"], {name: here[name] for name in PICKLING})
-    for address, worker in found["workers"].items():
-        _refuse(f"worker {address}", worker, here)
+    reported = client.get_versions(packages=[name for name in here if name != "python"])
+    _compare_process("the scheduler", reported["scheduler"], {name: here[name] for name in PICKLING})
+    for address, worker in reported["workers"].items():
+        _compare_process(f"worker {address}", worker, here)
 
 
-def _refuse(who: str, found: Any, here: dict[str, str]) -> None:
-    from flexroad.pipeline.execute.workers import difference, unlike
+def _compare_process(name: str, reported: Any, here: dict[str, str]) -> None:
+    from flexroad.pipeline.execute.workers import difference, version_error
 
-    there = {name: found["packages"].get(name) or "missing" for name in here}
-    there["python"] = ".".join(found["host"]["python"].split(".")[:3])
-    other = difference(there, here)
-    if other:
-        raise ConfigError(unlike(who, other))
+    there = {package: reported["packages"].get(package) or "missing" for package in here}
+    there["python"] = ".".join(reported["host"]["python"].split(".")[:3])
+    different = difference(there, here)
+    if different:
+        raise ConfigError(version_error(name, different))
 
 
 def _dashboard(client: Client) -> str:
@@ -195,7 +201,7 @@ def _dashboard(client: Client) -> str:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask's own words about what is told in one's own: lost workers, schedulers, versions."""
+    """Silence Dask's messages on lost workers, schedulers and versions: FlexRoad reports these itself."""
     from distributed.utils import silence_logging_cmgr
 
     with silence_logging_cmgr(logging.CRITICAL), warnings.catch_warnings():

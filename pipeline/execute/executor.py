@@ -1,4 +1,4 @@
-"""What every executor does."""
+"""The interface of all executors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ R = TypeVar("R")
 
 
 class Executor(Protocol):
-    """Runs a function over jobs."""
+    """Applies a function to jobs."""
 
     def map(
         self,
@@ -19,19 +19,23 @@ class Executor(Protocol):
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
-        """Yield results as they come, in any order, with a bounded number of jobs in flight.
+        """Yield results in the order of completion, with a bounded number of jobs in flight.
 
         Parameters
         ----------
+        function : callable
+            Takes a job, returns its result; runs in the worker processes.
+        jobs : iterable
+            The jobs; taken one by one as workers become free.
         lost : callable
-            Makes the result of a job whose process died more often than is bearable.
+            Takes a job and the reason, returns the result of a job whose worker process died twice.
         probe : callable, optional
-            Raises OSError where no work can be done; called in every process before it works.
+            Raises OSError if a process cannot do the work; called in every process before its first job.
 
         Raises
         ------
         ConfigError
-            If the workers cannot do the work: none there, other versions, a store they cannot write.
+            If the workers cannot do the work: no workers, other versions, a store they cannot write.
         ClusterLost
-            If the scheduler went away, or all workers for longer than one waits; what is done is done.
+            If the scheduler is gone, or all workers are gone for too long; results yielded before are valid.
         """

@@ -1,4 +1,4 @@
-"""A raster in blocks that are read when they are needed."""
+"""Lazy rasters: Dask arrays whose blocks are read on demand."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def lazy_raster(
     read : callable
         Takes a source, returns its block; runs in the threads or processes of the scheduler in use.
     sources : mapping
-        What ``read`` takes, by (row, column) of the block; blocks without a source are filled.
+        The argument of ``read`` by (row, column) of the block; blocks without a source are filled.
     heights, widths : sequence of int
         Rows of each row of blocks, columns of each column of blocks.
     dtype : dtype
-        Of the array.
+        Data type of the array.
     fill : float
         Value of blocks without a source.
 

@@ -1,4 +1,7 @@
-"""What a scheduler gets to see of a run; it need not have flexroad, for all of it travels by value."""
+"""Objects sent to the scheduler.
+
+They are pickled by value, so that the scheduler needs no flexroad.
+"""
 
 from __future__ import annotations
 
@@ -8,47 +11,49 @@ from typing import Any
 from distributed import SchedulerPlugin
 
 
-def carrier() -> Callable[[bytes, str], tuple[str, Any]]:
-    """Return what a task is: a packed call that only a worker opens, and only if it is fit to.
+def task_function() -> Callable[[bytes, str], tuple[str, Any]]:
+    """Return the function of every task: it unpickles a call and runs it if the worker passed its check.
 
-    It gives why the job must not be done there, or nothing, and what the job came to. A scheduler opens the
-    tasks it is given; packed, a tile costs it no more than its bytes.
+    Its arguments are the pickled call and the name of the `WorkerCheck`; it returns an error message, empty
+    if there is none, and the result. A scheduler unpickles the tasks that it receives; a call that is
+    already pickled stays bytes there.
     """
 
-    def carry(packed: bytes, guard: str) -> tuple[str, Any]:
+    def run_task(packed: bytes, check: str) -> tuple[str, Any]:
         from distributed import get_worker
         from distributed.protocol.pickle import loads
 
         worker = get_worker()
-        if guard not in worker.plugins:
+        if check not in worker.plugins:
             return f"worker {worker.address} cannot load flexroad; install it there", None
-        fault: str = worker.plugins[guard].fault
+        fault: str = worker.plugins[check].fault
         if fault:
             return fault, None
         work, function, job = loads(packed)
         return "", work(function, job)
 
-    return carry
+    return run_task
 
 
-def no_second_try(client_id: str, guard: str) -> SchedulerPlugin:
-    """Return a plugin that hands a client its own tasks back as soon as their worker dies.
+def retry_blocker(client_id: str, check: str) -> SchedulerPlugin:
+    """Return a scheduler plugin that fails a client's tasks at the first death of their worker.
 
-    A scheduler tries such tasks again on other workers, as often as it is set to
-    (``distributed.scheduler.allowed-failures``), and so a tile that kills its worker would take others with
-    it. Nothing changes for other clients, and nothing stays when the client goes, be it killed.
+    By default a scheduler retries such tasks on other workers, as often as its setting
+    ``distributed.scheduler.allowed-failures`` says, so that a tile that kills its worker would kill others,
+    too. Tasks of other clients are not affected. When the client disconnects or is killed, the plugins are
+    removed.
     """
 
-    class NoSecondTry(SchedulerPlugin):  # type: ignore[misc]
+    class RetryBlocker(SchedulerPlugin):  # type: ignore[misc]
         def update_graph(self, scheduler: Any, *, client: str, tasks: list[Any], **_: Any) -> None:
             if client == client_id:
                 for key in tasks:
-                    # One death more is more than allowed.
+                    # With this count one more death of a worker fails the task.
                     scheduler.tasks[key].suspicious = scheduler.allowed_failures
 
         def remove_client(self, scheduler: Any, client: str) -> None:
             if client == client_id:
-                scheduler.worker_plugins.pop(guard, None)
-                scheduler.plugins.pop(f"flexroad-{guard}", None)
+                scheduler.worker_plugins.pop(check, None)
+                scheduler.plugins.pop(f"flexroad-{check}", None)
 
-    return NoSecondTry()
+    return RetryBlocker()

@@ -1,4 +1,4 @@
-"""One job after the other in this process; the executor to debug with."""
+"""The serial executor: one job after the other in this process, for debugging."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from flexroad.pipeline.execute.executor import J, R
 
 
 class SerialExecutor:
-    """One job after the other in this process."""
+    """Runs one job after the other in this process."""
 
     def map(
         self,
@@ -17,6 +17,6 @@ class SerialExecutor:
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
-        """Yield results in the jobs' order; whoever calls has probed this process already."""
+        """Yield results in the order of the jobs; ``probe`` is not called, the caller has done so here."""
         for job in jobs:
             yield function(job)

@@ -1,7 +1,7 @@
-"""A window of jobs in flight on a scheduler.
+"""Jobs in flight on one Dask scheduler.
 
-A worker that dies takes with it every job it had been given. Which of them killed it nobody knows, so all
-of them are suspects and are done last, one at a time on a worker: whoever loses its worker there is lost.
+If a worker dies, all jobs that were assigned to it fail, and the one that caused the death is unknown. All
+of them are quarantined: they run last, one at a time on a worker. A job whose worker dies again is lost.
 """
 
 from __future__ import annotations
@@ -22,42 +22,50 @@ from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerErro
 
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, R
-from flexroad.pipeline.execute.scheduler import carrier
+from flexroad.pipeline.execute.scheduler import task_function
 from flexroad.pipeline.execute.workers import work
 
 TICK_S = 1.0
-"""How long nothing must happen before one looks whether scheduler and workers are there."""
+"""Interval between checks of the scheduler and the workers (s)."""
 
 
 @dataclass(frozen=True)
 class InFlight(Generic[J]):
-    """A job on its way."""
+    """A job that was submitted."""
 
     job: J
-    alone: str = ""
-    """Address of the worker it has for itself, being suspect."""
+    reserved_worker: str = ""
+    """Address of the worker that runs only this job; empty if the job is not quarantined."""
 
 
 class Session(Generic[J, R]):
-    """Does jobs over one connection.
+    """Submits jobs over one connection and collects their results.
 
     Parameters
     ----------
     client : distributed.Client
-        With a `Guard` on every worker and a `no_second_try` on the scheduler.
+        Client with a `WorkerCheck` on every worker and a `retry_blocker` on the scheduler.
     name : str
-        What the scheduler is called in messages.
-    guard : str
-        The guard's name; makes keys this run's own, too.
+        The scheduler's name in messages.
+    check : str
+        Name of the `WorkerCheck`; part of the task keys, so that they are unique to this session.
+    function : callable
+        Takes a job, returns its result.
+    jobs : iterator
+        The jobs; taken as there is room.
+    lost : callable
+        Takes a job and the reason, returns the result of a lost job.
     patience_s : float
-        How long one waits for a worker when there is none.
+        How long to wait for a worker when there is none (s).
+    say : callable
+        Prints one line for the user.
     """
 
     def __init__(
         self,
         client: Client,
         name: str,
-        guard: str,
+        check: str,
         function: Callable[[J], R],
         jobs: Iterator[J],
         lost: Callable[[J, str], R],
@@ -66,23 +74,23 @@ class Session(Generic[J, R]):
     ) -> None:
         self.client = client
         self.name = name
-        self.guard = guard
+        self.check = check
         self.function = function
         self.jobs = jobs
         self.quarantined: deque[J] = deque()
-        """Jobs that were on a worker that died."""
+        """Jobs that were assigned to a worker that died."""
         self.lost = lost
         self.patience_s = patience_s
         self.say = say
-        self.flying: dict[Future, InFlight[J]] = {}
-        self.landed: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self.in_flight: dict[Future, InFlight[J]] = {}
+        self.completed: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self.numbers = count(1)
-        self.carry = carrier()
+        self.run_task = task_function()
         self.workers: dict[str, int] = {}
-        """Threads by worker, as they were at ``looked``."""
-        self.looked = 0.0
-        self.idle_since: float | None = None
-        """Since when there has been no worker."""
+        """Number of threads by worker address, at ``checked_at``."""
+        self.checked_at = 0.0
+        self.no_worker_since: float | None = None
+        """Time of the first check without workers; None if there are workers."""
 
     def results(self) -> Iterator[R]:
         """Yield results as jobs finish, until nothing is left to do.
@@ -90,133 +98,135 @@ class Session(Generic[J, R]):
         Raises
         ------
         ClusterLost
-            If the connection to the scheduler broke, or there was no worker for longer than one waits.
+            If the connection to the scheduler broke, or there was no worker for ``patience_s``.
         ConfigError
-            If a worker is not fit for the work.
+            If a worker fails its check.
         """
         while True:
-            self._look()
-            self._send()
-            if not (self.flying or self.quarantined):
+            self._check_cluster()
+            self._submit_jobs()
+            if not (self.in_flight or self.quarantined):
                 return
-            for future in self._landed():
-                yield from self._outcome(future, self.flying.pop(future))
+            for future in self._take_completed():
+                yield from self._outcome(future, self.in_flight.pop(future))
                 future.release()
 
-    def _send(self) -> None:
-        apart = {flight.alone for flight in self.flying.values() if flight.alone}
-        if not apart:
-            # Twice the threads keeps every worker busy while constant memory holds the rest back.
-            room = max(2, 2 * sum(self.workers.values())) - len(self.flying)
+    def _submit_jobs(self) -> None:
+        reserved = {flight.reserved_worker for flight in self.in_flight.values() if flight.reserved_worker}
+        if not reserved:
+            # Twice the number of threads keeps all workers busy at constant memory.
+            room = max(2, 2 * sum(self.workers.values())) - len(self.in_flight)
             for job in islice(self.jobs, max(0, room)):
-                self._fly(InFlight(job))
-        if len(self.flying) == len(apart):
-            for address in [address for address in self.workers if address not in apart]:
+                self._submit(InFlight(job))
+        if len(self.in_flight) == len(reserved):
+            for address in [address for address in self.workers if address not in reserved]:
                 if self.quarantined:
-                    self._fly(InFlight(self.quarantined.popleft(), address))
+                    self._submit(InFlight(self.quarantined.popleft(), address))
 
-    def _fly(self, flight: InFlight[J]) -> None:
+    def _submit(self, flight: InFlight[J]) -> None:
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
-        # Numbered: a key that failed must not come back. Not pure: the store knows what is done already.
+        # Numbered: Dask would return the old error for a key that failed. Not pure: a job writes files.
         future = self.client.submit(
-            self.carry,
+            self.run_task,
             dumps((work, self.function, flight.job)),
-            self.guard,
-            key=f"{name}-{self.guard}-{next(self.numbers)}",
+            self.check,
+            key=f"{name}-{self.check}-{next(self.numbers)}",
             pure=False,
-            workers=[flight.alone] if flight.alone else None,
+            workers=[flight.reserved_worker] if flight.reserved_worker else None,
         )
-        self.flying[future] = flight
-        future.add_done_callback(self.landed.put)
+        self.in_flight[future] = flight
+        future.add_done_callback(self.completed.put)
 
-    def _landed(self) -> list[Future]:
+    def _take_completed(self) -> list[Future]:
+        """Return the futures that completed; wait for the first one for at most ``TICK_S``."""
         try:
-            found = [self.landed.get(timeout=TICK_S)]
+            futures = [self.completed.get(timeout=TICK_S)]
         except queue.Empty:
             return []
-        while not self.landed.empty():
-            found.append(self.landed.get())
-        return [future for future in found if future in self.flying]
+        while not self.completed.empty():
+            futures.append(self.completed.get())
+        return [future for future in futures if future in self.in_flight]
 
-    def _look(self) -> None:
-        """See, but not more often than every second, who is there."""
-        if self.workers and time.monotonic() < self.looked + TICK_S:
+    def _check_cluster(self) -> None:
+        """Update the list of workers, at most once per ``TICK_S``."""
+        if self.workers and time.monotonic() < self.checked_at + TICK_S:
             return
         if self.client.status != "running":
-            # Asked now, it would not answer for long.
-            raise self._gone()
+            # A request would only time out.
+            raise self._cluster_lost()
         try:
             self.workers = self.client.nthreads()
         except OSError as error:
-            raise self._gone() from error
-        self.looked = time.monotonic()
+            raise self._cluster_lost() from error
+        self.checked_at = time.monotonic()
         self._wait_for_workers()
-        for future, flight in list(self.flying.items()):
-            if flight.alone and flight.alone not in self.workers and not future.done():
-                # Its worker went before it got there.
-                self.quarantined.append(self.flying.pop(future).job)
+        for future, flight in list(self.in_flight.items()):
+            worker = flight.reserved_worker
+            if worker and worker not in self.workers and not future.done():
+                # The reserved worker died before the job started.
+                self.quarantined.append(self.in_flight.pop(future).job)
                 future.release()
 
     def _wait_for_workers(self) -> None:
         if self.workers:
-            self.idle_since = None
-        elif self.idle_since is None:
-            self.idle_since = self.looked
+            self.no_worker_since = None
+        elif self.no_worker_since is None:
+            self.no_worker_since = self.checked_at
             self.say(f"no worker is left; waiting up to {self.patience_s:g} s for one")
-        elif self.looked > self.idle_since + self.patience_s:
+        elif self.checked_at > self.no_worker_since + self.patience_s:
             raise ClusterLost(f"no worker was left for {self.patience_s:g} s")
 
     def _outcome(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         error = future.exception() if future.status == "error" else None
         if isinstance(error, KilledWorker):
-            yield from self._died(flight, error)
+            yield from self._worker_died(flight, error)
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
-            # A scheduler may be set to give up what waits for workers; patience is this side's.
-            if flight.alone:
+            # A scheduler may be configured to fail tasks without workers; here ``patience_s`` decides.
+            if flight.reserved_worker:
                 self.quarantined.append(flight.job)
             else:
-                self._fly(flight)
+                self._submit(flight)
         elif future.status == "error":
             future.result()
         elif future.status == "finished":
-            yield from self._fetched(future, flight)
+            yield from self._fetch(future, flight)
         elif self.client.status == "running":
-            # Cancelled by a scheduler that is there: the worker died with the result before it was fetched.
+            # Cancelled, but the scheduler is connected: the worker died before its result was fetched.
             self.quarantined.append(flight.job)
         else:
-            raise self._gone()
+            raise self._cluster_lost()
 
-    def _fetched(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
+    def _fetch(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
             fault, result = future.result()
         except KilledWorker as error:
-            # The worker died between doing the job and handing over the result.
-            yield from self._died(flight, error)
+            # The worker died after the job, before its result was transferred.
+            yield from self._worker_died(flight, error)
         except (CancelledError, OSError) as error:
             if self.client.status != "running":
-                raise self._gone() from error
+                raise self._cluster_lost() from error
             self.quarantined.append(flight.job)
         else:
             if fault:
                 raise ConfigError(fault)
             yield result
 
-    def _died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
-        if flight.alone:
-            yield self.lost(flight.job, self._why(error))
+    def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
+        if flight.reserved_worker:
+            yield self.lost(flight.job, self._death_reason(error))
         else:
             self.quarantined.append(flight.job)
 
-    def _gone(self) -> ClusterLost:
+    def _cluster_lost(self) -> ClusterLost:
         return ClusterLost(f"{self.name} is gone")
 
-    def _why(self, error: KilledWorker) -> str:
+    def _death_reason(self, error: KilledWorker) -> str:
         worker = error.last_worker
         for _, event in self.client.get_events("worker-restart-memory") or ():
             if event["worker"] == worker.address:
                 used, limit = format_bytes(event["rss"]), format_bytes(worker.memory_limit)
                 return (
                     f"the worker process died 2 times here, at last for memory: it used {used} and may use "
-                    f"{limit}; give each more (cluster: memory, fewer --workers)"
+                    f"{limit}; give each worker more (cluster: memory, fewer --workers)"
                 )
         return "the worker process died 2 times here; too little memory is the usual cause"

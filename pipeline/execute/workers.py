@@ -1,4 +1,4 @@
-"""What is asked of a worker before it gets a tile, and what is done to it: imported by workers themselves."""
+"""Setup and check of a worker before its first tile; runs in the worker processes."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute.executor import J, R
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
-"""What must be alike for messages to be understood; also on the scheduler."""
+"""Packages whose versions must be equal for processes to exchange objects; also on the scheduler."""
 RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torch")
-"""What must be alike for tiles to come out alike."""
+"""Packages whose versions must be equal for tiles to have equal results."""
 
-_here = local()
-"""What is known of the thread that does a job."""
+_thread = local()
+"""Per thread: ``pinned`` is set once its libraries are limited to one thread."""
 
 
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
-    """Pins a worker's threads and, before its first tile, compares versions and tries the store.
+    """Limits a worker to one thread; before its first tile, compares versions and runs a probe.
 
     Parameters
     ----------
     versions : mapping
-        Of the client, as `versions` gives them.
+        Versions of the client, from `versions`.
     probe : callable, optional
-        Raises OSError where no work can be done.
-    deaf : bool
-        Leave Ctrl-C to the client: a terminal sends it to all processes of the command, and workers would
+        Raises OSError if the process cannot do the work.
+    ignore_sigint : bool
+        Ignore Ctrl-C in the worker. A terminal sends it to all processes of the command, and workers would
         only print tracebacks.
     """
 
@@ -51,7 +51,7 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
         self.ignore_sigint = ignore_sigint
 
     def setup(self, worker: Any) -> None:
-        """Prepare a worker of now, or one that joins later."""
+        """Prepare the worker; called for workers that join later, too."""
         self.address: str = worker.address
         self._lock = Lock()
         self._fault: str | None = None
@@ -61,46 +61,46 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
 
     @property
     def fault(self) -> str:
-        """Why the worker must not work, or nothing; found out once."""
+        """Error message if the worker cannot do the work, else empty; computed once."""
         with self._lock:
             if self._fault is None:
                 self._fault = self._find_fault()
             return self._fault
 
     def _find_fault(self) -> str:
-        other = difference(versions(), self.versions)
-        if other:
-            return unlike(f"worker {self.address}", other)
+        different = difference(versions(), self.versions)
+        if different:
+            return version_error(f"worker {self.address}", different)
         try:
             if self.probe:
                 self.probe()
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
+            file = f"{error.filename}: " if error.filename else ""
             return (
-                f"worker {self.address} cannot use the store: {where}{error.strerror or error}; "
-                "mount it there under the same path and let the worker write it"
+                f"worker {self.address} cannot use the store: {file}{error.strerror or error}; "
+                "mount it there under the same path and make it writable for the worker"
             )
         return ""
 
 
 def work(function: Callable[[J], R], job: J) -> R:
-    """Do one job on a worker that is fit to."""
-    if not hasattr(_here, "pinned"):
-        # Some libraries count by calling thread. Once is enough: what is loaded later reads the environment.
+    """Do one job on a worker that passed its check."""
+    if not hasattr(_thread, "pinned"):
+        # Some libraries have a limit per calling thread. Libraries loaded later read the environment.
         pin_threads()
-        _here.pinned = True
+        _thread.pinned = True
     return function(job)
 
 
-async def find_fault(guard: str, dask_worker: Any) -> str:
-    """Return why a worker must not work, or nothing."""
-    watch: WorkerCheck = dask_worker.plugins[guard]
-    return await asyncio.to_thread(lambda: watch.fault)
+async def find_fault(check: str, dask_worker: Any) -> str:
+    """Return an error message if the worker cannot do the work, else an empty string."""
+    plugin: WorkerCheck = dask_worker.plugins[check]
+    return await asyncio.to_thread(lambda: plugin.fault)
 
 
 def pin_threads() -> None:
-    """Let this thread and the libraries it calls compute on one core: the other cores do other tiles."""
-    # In time for what is loaded later; what is loaded already must be told.
+    """Limit the libraries that this thread calls to one core: the other cores compute other tiles."""
+    # The environment sets libraries that are loaded later; loaded ones are set by their own functions.
     os.environ.update(ONE_THREAD)
     from threadpoolctl import threadpool_limits
 
@@ -112,29 +112,29 @@ def pin_threads() -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions here of what decides whether messages are understood and tiles come out alike."""
-    found = {"python": platform.python_version()}
+    """Return the versions of Python and the packages in `PICKLING` and `RESULTS`; "missing" if absent."""
+    installed = {"python": platform.python_version()}
     for package in (*PICKLING[1:], *RESULTS):
         try:
-            found[package] = importlib.metadata.version(package)
+            installed[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "missing"
-    return found
+            installed[package] = "missing"
+    return installed
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """Return in words which versions differ, or nothing.
+    """Return a text with the versions that differ; empty if none do.
 
-    Of Python the minor version counts; a build's local label (``+cpu``) does not.
+    Of Python only major and minor version are compared; a local label (``+cpu``) is ignored.
     """
-    unlike = [name for name in there if _plain(name, there[name]) != _plain(name, here[name])]
-    return ", ".join(f"{name} is {there[name]} there and {here[name]} here" for name in unlike)
+    different = [name for name in there if _comparable(name, there[name]) != _comparable(name, here[name])]
+    return ", ".join(f"{name} is {there[name]} there and {here[name]} here" for name in different)
 
 
-def unlike(who: str, other: str) -> str:
-    """Return the line about a process with other versions."""
-    return f"{who}: {other}; install the same there, best with the same constraints.txt"
+def version_error(process: str, different: str) -> str:
+    """Return the error message about a process with other versions."""
+    return f"{process}: {different}; install the same there, best with the same constraints.txt"
 
 
-def _plain(name: str, version: str) -> str:
+def _comparable(name: str, version: str) -> str:
     return ".".join(version.split(".")[:2]) if name == "python" else version.split("+")[0]

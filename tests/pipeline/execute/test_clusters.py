@@ -1,4 +1,4 @@
-"""Clusters that run already, in real processes on loopback; and what is asked of SLURM and Kubernetes."""
+"""Executor on running clusters (real processes on loopback); options of SLURM and Kubernetes clusters."""
 
 import ctypes
 import os
@@ -19,7 +19,7 @@ from tests.dask_processes import Processes, until, wait_for
 
 pytestmark = pytest.mark.slow
 
-# Workers have no tests to import.
+# Workers cannot import this test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 IMPATIENT = Cluster(patience_s=1)
@@ -27,16 +27,16 @@ IMPATIENT = Cluster(patience_s=1)
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
-    found = Processes(tmp_path_factory.mktemp("running"))
-    found.scheduler()
-    found.worker("--nworkers", "2")
-    yield found
-    found.end()
+    processes = Processes(tmp_path_factory.mktemp("running"))
+    processes.scheduler()
+    processes.worker("--nworkers", "2")
+    yield processes
+    processes.end()
 
 
 @pytest.fixture
 def running(shared):
-    """A cluster of two workers that tests share; whoever kills one gets it back from its nanny."""
+    """A cluster of two workers, shared by the tests; its nannies replace workers that a test kills."""
     wait_for(shared.address, 2)
     return shared
 
@@ -50,7 +50,7 @@ def double(job):
 
 
 def deadly(job):
-    """Die of the jobs that say so."""
+    """Kill the worker process if the job is "segfault..." or "exit..."; else return the job."""
     if str(job).startswith("segfault"):
         ctypes.string_at(0)
     if str(job).startswith("exit"):
@@ -59,7 +59,7 @@ def deadly(job):
     return job
 
 
-def test_jobs_are_made_as_there_is_room(running):
+def test_map_lazy_jobs_are_taken_as_workers_become_free(running):
     taken, done = [], []
 
     def jobs():
@@ -69,13 +69,13 @@ def test_jobs_are_made_as_there_is_room(running):
 
     for result in DaskExecutor(scheduler=running.address).map(double, jobs(), lost):
         done.append(result)
-        # Two for each thread, one in hand.
+        # Two for each of the two threads, and the next one.
         assert len(taken) <= len(done) + 5
     assert sorted(done) == [2 * job for job in range(40)]
 
 
 def threads(job):
-    """Tell what the process computes with, having loaded some more of it."""
+    """Return the process id and the numbers of threads, with numpy and torch loaded."""
     import numpy  # noqa: F401
     import torch
     from threadpoolctl import threadpool_info
@@ -85,7 +85,7 @@ def threads(job):
     return os.getpid(), max(pools), torch.get_num_threads(), os.environ["OMP_NUM_THREADS"]
 
 
-def test_threads_are_pinned_also_of_a_worker_that_joins_later(processes):
+def test_map_worker_that_joins_later_uses_one_thread(processes):
     many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "2")
     processes.scheduler()
     processes.worker("--preload", "numpy", **many)
@@ -95,45 +95,46 @@ def test_threads_are_pinned_also_of_a_worker_that_joins_later(processes):
         yield from range(3)
         processes.worker("--preload", "numpy", **many)
         wait_for(processes.address, 2)
-        while len({pid for pid, *_ in found}) < 2:
+        while len({pid for pid, *_ in results}) < 2:
             yield 0
 
-    found = []
+    results = []
     for result in DaskExecutor(scheduler=processes.address).map(threads, jobs(), lost):
-        found.append(result)
-    assert len({pid for pid, *_ in found}) == 2
-    assert {result[1:] for result in found} == {(1, 1, "1")}
+        results.append(result)
+    assert len({pid for pid, *_ in results}) == 2
+    assert {result[1:] for result in results} == {(1, 1, "1")}
 
 
 @pytest.fixture
 def other_numpy(tmp_path) -> dict[str, str]:
-    """An environment in which numpy is said to be another."""
+    """An environment that reports another version of numpy."""
     (tmp_path / "numpy-1.0.dist-info").mkdir()
     (tmp_path / "numpy-1.0.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 1.0\n")
     return {"PYTHONPATH": str(tmp_path)}
 
 
-def refused(processes, jobs=(1, 2, 3), **options) -> str:
+def map_error(processes, jobs=(1, 2, 3), **options) -> str:
+    """Return the one-line message of the ConfigError that `DaskExecutor.map` raises."""
     with pytest.raises(ConfigError) as caught:
         list(DaskExecutor(scheduler=processes.address).map(double, jobs, lost, **options))
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy, monkeypatch):
+def test_map_without_workers_or_with_other_versions_raises(processes, other_numpy, monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.execute.clusters.GRACE_S", 0)
     processes.scheduler()
-    assert f"{processes.address} has no workers; start some" in refused(processes)
+    assert f"{processes.address} has no workers; start some" in map_error(processes)
     unlike = processes.worker(**other_numpy)
     wait_for(processes.address, 1)
-    told = refused(processes)
-    assert "worker tcp://127.0.0.1" in told
-    assert "numpy is 1.0 there and" in told
-    assert "install the same there" in told
+    message = map_error(processes)
+    assert "worker tcp://127.0.0.1" in message
+    assert "numpy is 1.0 there and" in message
+    assert "install the same there" in message
     unlike.terminate()
     unlike.wait(20)
 
-    # One that joins later gets nothing to do, either.
+    # A worker that joins later is checked, too.
     processes.worker()
     wait_for(processes.address, 1)
 
@@ -144,40 +145,40 @@ def test_a_cluster_that_cannot_do_the_work_is_refused(processes, other_numpy, mo
         while True:
             yield 1
 
-    assert "numpy is 1.0 there and" in refused(processes, jobs())
+    assert "numpy is 1.0 there and" in map_error(processes, jobs())
 
 
-def test_a_store_that_workers_cannot_write_is_refused(running):
+def test_map_store_not_writable_by_workers_raises(running):
     here = os.getpid()
 
     def probe():
         if os.getpid() != here:
             raise OSError(30, "Read-only file system", "/store")
 
-    told = refused(running, probe=probe)
-    assert "worker tcp://127.0.0.1" in told
-    assert "cannot use the store: /store: Read-only file system; mount it" in told
+    message = map_error(running, probe=probe)
+    assert "worker tcp://127.0.0.1" in message
+    assert "cannot use the store: /store: Read-only file system; mount it" in message
 
 
-def test_nobody_answers(monkeypatch):
+def test_map_scheduler_that_does_not_answer_raises(monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
     with pytest.raises(ConfigError, match=r"scheduler at tcp://127.0.0.1:9 does not answer"):
         list(DaskExecutor(scheduler="tcp://127.0.0.1:9").map(double, [1], lost))
 
 
 @pytest.mark.parametrize("poison", [["segfault"], ["exit 1", "segfault 2"]])
-def test_a_job_that_kills_its_worker_is_lost_and_no_other(running, poison):
-    """However patient the scheduler is, whose limit is 7 deaths."""
+def test_map_job_that_kills_its_worker_loses_only_that_job(running, poison):
+    """The scheduler's own limit of 7 deaths has no effect."""
     jobs = [*range(10), *poison, *range(10, 20)]
     results = list(DaskExecutor(scheduler=running.address).map(deadly, jobs, lost))
-    told = [result for result in results if isinstance(result, tuple)]
-    assert sorted(job for job, _ in told) == poison
-    assert all("died 2 times here" in why for _, why in told)
+    lost_jobs = [result for result in results if isinstance(result, tuple)]
+    assert sorted(job for job, _ in lost_jobs) == poison
+    assert all("died 2 times here" in why for _, why in lost_jobs)
     assert sorted(result for result in results if isinstance(result, int)) == list(range(20))
 
 
 def greedy(job):
-    """Die, or take ever more memory, of the jobs that say so."""
+    """Use ever more memory if the job is "greedy"; else do as `deadly`."""
     hoard = []
     while job == "greedy":
         hoard.append(b"x" * 20_000_000)
@@ -185,15 +186,15 @@ def greedy(job):
     return deadly(job)
 
 
-def test_too_much_memory_on_the_only_worker_of_this_machine():
+def test_map_job_above_memory_limit_is_lost_with_reason():
     small = Cluster(workers=1, memory="700 MiB")
     jobs = [1, 2, "greedy", 3, "exit 1", 4]
     results = list(DaskExecutor(cluster=small).map(greedy, jobs, lost))
-    told = dict(result for result in results if isinstance(result, tuple))
-    assert sorted(told) == ["exit 1", "greedy"]
-    assert "at last for memory: it used" in told["greedy"]
-    assert "may use 700.00 MiB" in told["greedy"]
-    assert "at last for memory" not in told["exit 1"]
+    reasons = dict(result for result in results if isinstance(result, tuple))
+    assert sorted(reasons) == ["exit 1", "greedy"]
+    assert "at last for memory: it used" in reasons["greedy"]
+    assert "may use 700.00 MiB" in reasons["greedy"]
+    assert "at last for memory" not in reasons["exit 1"]
     assert sorted(result for result in results if isinstance(result, int)) == [1, 2, 3, 4]
 
 
@@ -202,44 +203,45 @@ def slow(job):
     return job
 
 
-@pytest.mark.parametrize("who", ["scheduler", "workers"])
-def test_whoever_stays_away_ends_the_run(processes, who):
+@pytest.mark.parametrize("killed", ["scheduler", "workers"])
+def test_map_scheduler_or_all_workers_killed_raises(processes, killed):
     scheduler = processes.scheduler()
     worker = processes.worker("--no-nanny")
     wait_for(processes.address, 1)
-    found = []
+    results = []
 
-    def go_on():
+    def map_and_kill():
         for result in DaskExecutor(scheduler=processes.address, cluster=IMPATIENT).map(slow, range(20), lost):
-            found.append(result)
-            if len(found) == 5:
-                (scheduler if who == "scheduler" else worker).kill()
+            results.append(result)
+            if len(results) == 5:
+                (scheduler if killed == "scheduler" else worker).kill()
 
-    with pytest.raises(ClusterLost, match="is gone$" if who == "scheduler" else "for 1 s"):
-        go_on()
-    assert found[:5] == [0, 1, 2, 3, 4]
-    assert len(found) < 20
+    with pytest.raises(ClusterLost, match="is gone$" if killed == "scheduler" else "for 1 s"):
+        map_and_kill()
+    assert results[:5] == [0, 1, 2, 3, 4]
+    assert len(results) < 20
 
 
-def kept(dask_scheduler) -> list[str]:
+def scheduler_state(dask_scheduler) -> list[str]:
+    """Names of all tasks and plugins on the scheduler."""
     return [*dask_scheduler.tasks, *dask_scheduler.worker_plugins, *dask_scheduler.plugins]
 
 
 @pytest.mark.parametrize("wanted", [20, 1], ids=["whole", "interrupted"])
-def test_nothing_of_a_run_stays_on_a_cluster(running, wanted):
+def test_map_ended_leaves_nothing_on_the_cluster(running, wanted):
     from distributed import Client
 
     with Client(running.address, set_as_default=False) as client:
-        before = client.run_on_scheduler(kept)
+        before = client.run_on_scheduler(scheduler_state)
         results = DaskExecutor(scheduler=running.address).map(slow, range(20), lost)
         next(results)
-        assert len(client.run_on_scheduler(kept)) > len(before)
+        assert len(client.run_on_scheduler(scheduler_state)) > len(before)
         assert len(list(islice(results, wanted - 1))) == wanted - 1
         results.close()
-        until(lambda: client.run_on_scheduler(kept) == before)
+        until(lambda: client.run_on_scheduler(scheduler_state) == before)
 
 
-def test_the_section_reaches_slurm():
+def test_slurm_options_write_job_script():
     jobqueue = pytest.importorskip("dask_jobqueue")
     cluster = Cluster(
         kind="slurm", workers=6, per_job=3, memory="2 GiB", walltime_h=2.5, queue="night", account="roads",
@@ -257,12 +259,12 @@ def test_the_section_reaches_slurm():
     assert "--lifetime 8700s" in lines[-1]
 
 
-def test_slurm_is_asked_for_workers_and_released(tmp_path, monkeypatch):
-    """With commands that start and end jobs here, as SLURM would elsewhere."""
+def test_map_on_slurm_starts_and_ends_jobs(tmp_path, monkeypatch):
+    """``sbatch`` and ``scancel`` are replaced by commands that start and kill local processes."""
     pytest.importorskip("dask_jobqueue")
     jobs = tmp_path / "jobs"
     commands = {
-        # Copied first, as SLURM does: who hands it in removes it at once.
+        # The script is copied, as SLURM does: dask-jobqueue removes it at once.
         "sbatch": f'cp "$1" {jobs}.sh; setsid bash {jobs}.sh >/dev/null 2>&1 &\n'
         f"echo $! >>{jobs}; echo Submitted batch job $!",
         "scancel": 'kill -- -"$1"',
@@ -278,7 +280,7 @@ def test_slurm_is_asked_for_workers_and_released(tmp_path, monkeypatch):
     until(lambda: not any(psutil.pid_exists(pid) for pid in started))
 
 
-def test_the_section_reaches_kubernetes():
+def test_kubernetes_options_set_pods():
     operator = pytest.importorskip("dask_kubernetes.operator")
     cluster = Cluster(kind="kubernetes", workers=5, memory="2 GiB", image="roads:1")
     spec = operator.make_cluster_spec(**kubernetes_options(cluster))["spec"]
@@ -294,14 +296,14 @@ def test_the_section_reaches_kubernetes():
     ("kind", "remedy"),
     [("slurm", "there is no sbatch here"), ("kubernetes", r"pip install 'flexroad\[kubernetes\]'")],
 )
-def test_what_is_missing_is_named(kind, remedy, monkeypatch, tmp_path):
+def test_open_cluster_missing_program_raises(kind, remedy, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "dask_kubernetes.operator", None)
     with pytest.raises(ConfigError, match=remedy), open_cluster(Cluster(kind=kind), None, None, False):
         pass
 
 
-def test_who_works_changes_no_fingerprint(made_survey, tmp_path):
+def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     from flexroad.catalog import Catalog
     from flexroad.pipeline.graph.graph import tile_graphs
 
