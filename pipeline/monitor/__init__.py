@@ -1,1 +1,1 @@
-"""Show how a run goes: progress, states, alerts."""
+"""Progress, tile states and alerts of a run."""

@@ -1,4 +1,4 @@
-"""Tell somebody that a run went wrong: by a command of the operator's, or by a POST to a web address."""
+"""Notify the operator of a failed run: by a shell command or a POST to a web address."""
 
 from __future__ import annotations
 
@@ -14,74 +14,85 @@ from typing import Any
 from urllib.parse import urlsplit
 
 BUSY = (429, 500, 502, 503, 504)
-"""Answers of a web server that is worth asking again."""
+"""HTTP status codes after which the request is repeated."""
 
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How long an alarm may take."""
+    """Time limits and retries of a notification."""
 
     command_s: float = 120
+    """Time limit of a command (s)."""
     answer_s: float = 10
+    """Time limit of an answer of a web server (s)."""
     retries: int = 2
     pause_s: float = 1
-    """Before the second try; twice as long before each following one."""
+    """Pause before the first retry (s); doubled before each further one."""
 
 
-def notify(target: str, told: Mapping[str, Any], patience: RetryPolicy | None = None) -> str | None:
-    """Tell the target; return why that did not succeed, or None: an alarm that fails is no fault of the run.
+def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None = None) -> str | None:
+    """Send a summary to the target.
 
     Parameters
     ----------
     target : str
-        ``http://...`` or ``https://...``, which gets what is told as JSON; anything else is a command for
-        the shell, which gets the same on its standard input and in the file FLEXROAD_SUMMARY names. The file
-        lasts as long as the command.
+        A web address (``http://...`` or ``https://...``), which receives the summary as JSON by POST;
+        anything else is a shell command, which gets the JSON on its standard input and in the file named by
+        the variable FLEXROAD_SUMMARY. The file is removed when the command ends.
+    summary : mapping
+        The content, serialisable as JSON.
+    policy : RetryPolicy, optional
+        Time limits and retries.
+
+    Returns
+    -------
+    str or None
+        The reason of a failure; None on success. Nothing is raised: a run does not depend on its alert.
     """
-    text = json.dumps(told, indent=1)
-    patience = patience or RetryPolicy()
+    text = json.dumps(summary, indent=1)
+    policy = policy or RetryPolicy()
     if target.startswith(("http://", "https://")):
-        return _post(target, text, patience)
-    return _call(target, text, patience)
+        return _post(target, text, policy)
+    return _run_command(target, text, policy)
 
 
-def _post(url: str, text: str, patience: RetryPolicy) -> str | None:
+def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
     import requests
     from requests.adapters import HTTPAdapter
     from urllib3 import Retry
 
-    # The rest of such an address is often a secret: it goes into no log.
-    place = urlsplit(url).hostname
-    again = Retry(
-        patience.retries,
-        backoff_factor=patience.pause_s / 2,
+    # The rest of the address is often a secret: messages name only the host.
+    host = urlsplit(url).hostname
+    retry = Retry(
+        policy.retries,
+        backoff_factor=policy.pause_s / 2,
         status_forcelist=BUSY,
         allowed_methods=None,
-        # It may ask for an hour.
+        # The header may request a pause of an hour.
         respect_retry_after_header=False,
         raise_on_status=False,
     )
     with requests.Session() as session:
-        session.mount(f"{urlsplit(url).scheme}://", HTTPAdapter(max_retries=again))
+        session.mount(f"{urlsplit(url).scheme}://", HTTPAdapter(max_retries=retry))
         try:
             answer = session.post(
                 url,
                 text.encode(),
                 headers={"Content-Type": "application/json"},
-                timeout=patience.answer_s,
+                timeout=policy.answer_s,
                 allow_redirects=False,
             )
         except requests.RequestException as error:
-            return f"{place} cannot be told: {type(error).__name__}"
-    return None if answer.status_code // 100 == 2 else f"{place} answered {answer.status_code}"
+            return f"{host} cannot be reached: {type(error).__name__}"
+    return None if answer.status_code // 100 == 2 else f"{host} answered {answer.status_code}"
 
 
-def _call(command: str, text: str, patience: RetryPolicy) -> str | None:
+def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
     try:
         with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
             path = Path(folder) / "summary.json"
             path.write_text(text)
-            # What it says goes with what the run says of itself, not among its results.
+            # Its output goes to standard error, with the messages of the run.
             process = subprocess.Popen(
                 command,
                 shell=True,
@@ -90,17 +101,17 @@ def _call(command: str, text: str, patience: RetryPolicy) -> str | None:
                 env={**os.environ, "FLEXROAD_SUMMARY": str(path)},
                 start_new_session=True,
             )
-            return _wait(process, text, patience)
+            return _wait(process, text, policy)
     except (OSError, ValueError) as error:
         return f"`{command}` cannot be run: {error}"
 
 
-def _wait(process: subprocess.Popen[bytes], text: str, patience: RetryPolicy) -> str | None:
+def _wait(process: subprocess.Popen[bytes], text: str, policy: RetryPolicy) -> str | None:
     try:
-        process.communicate(text.encode(), patience.command_s)
+        process.communicate(text.encode(), policy.command_s)
     except subprocess.TimeoutExpired:
-        # With all that it started.
+        # The whole process group: the command may have started others.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        return f"`{process.args!s}` took more than {patience.command_s:g} s and was ended"
+        return f"`{process.args!s}` took more than {policy.command_s:g} s and was killed"
     return f"`{process.args!s}` ended with exit code {process.returncode}" if process.returncode else None

@@ -1,4 +1,4 @@
-"""A map of the state of every tile of a run: ``RUN/tiles.geojson``, for QGIS and other programs."""
+"""Map of the state of every tile of a run (``RUN/tiles.geojson``), for QGIS and other programs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ COLUMNS = ("id", "state", "error", "seconds", "error_estimate_m", "finished")
 def write_states(run: Run, where: Location) -> None:
     """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
 
-    Each has its id, its ``state`` (done: by the last run; cached: found done by it; failed; pending), why it
-    failed, the seconds it took, the doubt of the surface exported first (m), and when it was finished.
+    Columns: ``id``; ``state`` (``done``: computed by the last run; ``cached``: done before it; ``failed``;
+    ``pending``); ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``,
+    the error estimate of the surface exported first (m); ``finished``, the time of completion.
 
     Raises
     ------
@@ -31,15 +32,15 @@ def write_states(run: Run, where: Location) -> None:
     """
     from geopandas import GeoDataFrame
 
-    left = {tile.id: tile for tile in run.catalog.tiles}
+    missing = {tile.id: tile for tile in run.catalog.tiles}
     with RunDatabase.open_readonly(run.path / DATABASE) as database:
         rows = [
-            _row(left.pop(name), standing, entry, run.config.export.variants[0])
-            for name, standing, entry in database.entries()
-            if name in left
+            _row(missing.pop(tile_id), state, record, run.config.export.variants[0])
+            for tile_id, state, record in database.entries()
+            if tile_id in missing
         ]
-    # Tiles that are new since the last run.
-    rows += [_row(tile, "pending", None, "") for tile in left.values()]
+    # Tiles that were added to the catalog after the last run.
+    rows += [_row(tile, "pending", None, "") for tile in missing.values()]
     table = GeoDataFrame(
         [row for _, row in rows], columns=COLUMNS, dtype=object, geometry=outlines([tile for tile, _ in rows])
     )
@@ -47,31 +48,32 @@ def write_states(run: Run, where: Location) -> None:
 
 
 def outlines(tiles: Sequence[Tile]) -> Any:
-    """Return the outline of each tile in longitude and latitude, an array of shapely polygons.
+    """Return the outlines of tiles in longitude and latitude, an ``(n,)`` array of shapely polygons.
 
-    Anticlockwise, and to 1 cm; one transformation for all tiles of a CRS.
+    Polygons are anticlockwise; coordinates are rounded to 1e-7 degrees (about 1 cm). Tiles of one CRS are
+    transformed together.
     """
     from geopandas import GeoSeries
     from shapely import box, transform
 
     shapes = np.array([box(*tile.grid.bounds) for tile in tiles], object)
-    systems = np.array([tile.grid.crs for tile in tiles], object)
-    for crs in set(systems):
-        here = systems == crs
-        shapes[here] = GeoSeries(shapes[here], crs=crs).to_crs("EPSG:4326")
+    crs_of_tile = np.array([tile.grid.crs for tile in tiles], object)
+    for crs in set(crs_of_tile):
+        selected = crs_of_tile == crs
+        shapes[selected] = GeoSeries(shapes[selected], crs=crs).to_crs("EPSG:4326")
     return transform(shapes, lambda degrees: degrees.round(7))
 
 
 def _row(
-    tile: Tile, standing: TileState, entry: TileRecord | None, variant: str
+    tile: Tile, state: TileState, record: TileRecord | None, variant: str
 ) -> tuple[Tile, dict[str, Any]]:
-    row: dict[str, Any] = {"id": tile.id, "state": standing}
-    # The entry of a pending tile describes files or options that are no longer there.
-    if entry is not None and standing != "pending":
-        row |= {"seconds": round(entry.seconds, 3), "finished": entry.finished or None}
-        if entry.failures:
-            row["error"] = entry.failures[0].line
-        for one in entry.rows:
-            if one["variant"] == variant:
-                row["error_estimate_m"] = one.get("error_estimate_m")
+    row: dict[str, Any] = {"id": tile.id, "state": state}
+    # The record of a pending tile belongs to earlier files or options.
+    if record is not None and state != "pending":
+        row |= {"seconds": round(record.seconds, 3), "finished": record.finished or None}
+        if record.failures:
+            row["error"] = record.failures[0].line
+        for metrics in record.rows:
+            if metrics["variant"] == variant:
+                row["error_estimate_m"] = metrics.get("error_estimate_m")
     return tile, row

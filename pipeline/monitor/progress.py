@@ -1,4 +1,4 @@
-"""Show how a run goes: a live line on a terminal, plain lines elsewhere."""
+"""Progress of a run: a live display on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ from rich.text import Text
 from flexroad.pipeline.worker.tile import TileResult
 
 PLAIN_EVERY_S = 10.0
+"""Interval of plain progress lines (s)."""
 
 
 class ProgressDisplay:
-    """Told of every tile; shows counts by status and stage, and when it will be over."""
+    """Shows counts of tiles by status and stage, and the remaining time; called with each tile result."""
 
     def __init__(self, total: int, console: Console) -> None:
         self.total = total
         self.console = console
         self.status: Counter[str] = Counter()
         self.stages: Counter[str] = Counter()
-        self.start = self.said = time.monotonic()
+        self.start = self.last_line = time.monotonic()
         self.progress = Progress(
             SpinnerColumn(),
             BarColumn(24),
@@ -45,9 +46,11 @@ class ProgressDisplay:
             console=console,
         )
         self.bar = self.progress.add_task("tiles", total=total)
-        # Counts have a line of their own: beside the bar they would squeeze its figures.
-        self.below = Text("  starting", overflow="ellipsis", no_wrap=True)
-        self.live = Live(Group(self.progress, self.below), console=console) if console.is_terminal else None
+        # The counts have their own line: beside the bar there is too little space.
+        self.counts_line = Text("  starting", overflow="ellipsis", no_wrap=True)
+        self.live = (
+            Live(Group(self.progress, self.counts_line), console=console) if console.is_terminal else None
+        )
 
     def __enter__(self) -> ProgressDisplay:
         if self.live:
@@ -61,30 +64,30 @@ class ProgressDisplay:
             self.live.stop()
 
     def __call__(self, result: TileResult) -> None:
-        """Take note of a tile."""
+        """Add a tile's result."""
         self.status[result.status] += 1
         self.stages.update(result.computed)
         for failure in result.failures:
-            self._line(f"failed {failure.notice}")
+            self._print(f"failed {failure.notice}")
         self.progress.update(self.bar, advance=1)
-        self.below.plain = f"  {self.counts()}"
-        if not self.live and time.monotonic() - self.said > PLAIN_EVERY_S:
-            self.said = time.monotonic()
-            self._line(self.line())
+        self.counts_line.plain = f"  {self.counts()}"
+        if not self.live and time.monotonic() - self.last_line > PLAIN_EVERY_S:
+            self.last_line = time.monotonic()
+            self._print(self.line())
 
     def counts(self) -> str:
-        """Return the counts by status, then what was computed by stage."""
+        """Return the counts of tiles by status and of computed results by stage."""
         parts = [f"{self.status[name]} {name}" for name in ("done", "cached", "failed")]
         stages = " ".join(f"{stage}:{count}" for stage, count in self.stages.items())
         return ", ".join(parts) + (f" [{stages}]" if stages else "")
 
     def line(self) -> str:
-        """Return the state in one plain line."""
+        """Return the progress as one plain line."""
         tried = sum(self.status.values())
         spent = time.monotonic() - self.start
         left = spent / tried * (self.total - tried) if tried else float("nan")
         return f"{tried}/{self.total} tiles, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
 
-    def _line(self, text: str) -> None:
-        # As it is: no markup in file names, no breaks that would cut a path in two.
+    def _print(self, text: str) -> None:
+        # File names may contain markup characters, and paths must not be wrapped.
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""A run's state as a text file for Prometheus, by the textfile collector of its node exporter."""
+"""State of a run as a text file for the textfile collector of the Prometheus node exporter."""
 
 from __future__ import annotations
 
@@ -17,18 +17,23 @@ if TYPE_CHECKING:
     from flexroad.pipeline.worker.tile import TileResult
 
 EVERY_S = 10.0
+"""Interval between writes (s)."""
 STATES = ("done", "cached", "failed", "pending")
 
 
 class Textfile:
-    """Told of every tile and of the end; writes the file whole, every ten seconds and at the end.
+    """Writes the metrics of a run to a file, atomically, every ten seconds and at the end.
+
+    It is called with each tile result; `ended` adds the exit code.
 
     Parameters
     ----------
     path : Path
-        The file, which should end in ``.prom``; one for each run.
+        The file; its name should end in ``.prom``. Each run needs its own.
     run : str
-        What the label ``run`` says.
+        Value of the label ``run``.
+    every_s : float
+        Interval between writes (s).
     """
 
     def __init__(self, path: Path, run: str, every_s: float = EVERY_S) -> None:
@@ -41,8 +46,8 @@ class Textfile:
         self.seconds: Counter[str] = Counter()
         self.peak_mb = 0.0
         self.end: tuple[float, int] | None = None
-        self._guard = threading.Lock()
-        self._over = threading.Event()
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._keep_writing, name="prometheus", daemon=True)
 
     def __enter__(self) -> Textfile:
@@ -53,24 +58,25 @@ class Textfile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._over.set()
+        self._stop.set()
         self._thread.join()
         with contextlib.suppress(OSError):
             self.write()
 
     def __call__(self, result: TileResult) -> None:
-        """Take note of a tile."""
-        with self._guard:
+        """Add a tile's result."""
+        with self._lock:
             self.states[result.status] += 1
             self.seconds.update(result.seconds)
             self.peak_mb = max(self.peak_mb, *(span.peak_mb for span in result.spans.values()), 0.0)
 
-    def ended(self, exit_code: int, how: Summary | None) -> None:
-        """Take note of the end, and of how the run stands then, over all its tiles."""
+    def ended(self, exit_code: int, summary: Summary | None) -> None:
+        """Set the end of the run, its exit code and the states of all its tiles."""
         self.end = (time.time(), exit_code)
-        if how is not None:
-            self.total = how.tiles
-            self.states = Counter(done=how.done - how.cached, cached=how.cached, failed=how.failed)
+        if summary is not None:
+            self.total = summary.tiles
+            done = summary.done - summary.cached
+            self.states = Counter(done=done, cached=summary.cached, failed=summary.failed)
 
     def write(self) -> None:
         """Write the file.
@@ -78,42 +84,40 @@ class Textfile:
         Raises
         ------
         OSError
-            If the folder is not there or cannot be written.
+            If the folder does not exist or is not writable.
         """
         from prometheus_client import write_to_textfile
 
-        with self._guard:
-            found = self._registry()
-        write_to_textfile(str(self.path), found)
+        with self._lock:
+            registry = self._registry()
+        write_to_textfile(str(self.path), registry)
 
     def _keep_writing(self) -> None:
-        while not self._over.wait(self.every_s):
-            # A disk full for a while is no reason to stop.
+        while not self._stop.wait(self.every_s):
+            # The disk may be full for a while: try again at the next interval.
             with contextlib.suppress(OSError):
                 self.write()
 
     def _registry(self) -> CollectorRegistry:
         from prometheus_client import CollectorRegistry, Gauge
 
-        found = CollectorRegistry()
+        registry = CollectorRegistry()
+        gauges: dict[str, Gauge] = {}
 
         def gauge(name: str, meaning: str, value: float, **labels: str) -> None:
-            made = found_gauges.get(name) or Gauge(
-                f"flexroad_{name}", meaning, ["run", *labels], registry=found
-            )
-            found_gauges[name] = made
-            made.labels(self.run, *labels.values()).set(value)
+            if name not in gauges:
+                gauges[name] = Gauge(f"flexroad_{name}", meaning, ["run", *labels], registry=registry)
+            gauges[name].labels(self.run, *labels.values()).set(value)
 
-        found_gauges: dict[str, Gauge] = {}
         pending = max(0, self.total - sum(self.states.values()))
         for state, count in {**dict.fromkeys(STATES, 0), **self.states, "pending": pending}.items():
-            gauge("tiles", "Tiles by state; done and cached are apart.", count, state=state)
+            gauge("tiles", "Tiles by state; done does not include cached.", count, state=state)
         for stage, seconds in self.seconds.items():
             gauge("stage_seconds", "Time spent computing in this run, by stage.", seconds, stage=stage)
-        gauge("worker_peak_bytes", "Greatest memory of a worker process.", self.peak_mb * 2**20)
-        gauge("run_start_time_seconds", "When the run began.", self.start)
-        gauge("run_running", "1 while the run goes on.", self.end is None)
+        gauge("worker_peak_bytes", "Peak memory of a worker process.", self.peak_mb * 2**20)
+        gauge("run_start_time_seconds", "Start of the run.", self.start)
+        gauge("run_running", "1 while the run is in progress.", self.end is None)
         if self.end is not None:
-            gauge("run_end_time_seconds", "When the run ended.", self.end[0])
+            gauge("run_end_time_seconds", "End of the run.", self.end[0])
             gauge("run_exit_code", "0 done, 1 some failed, 2 could not start, 130 interrupted.", self.end[1])
-        return found
+        return registry

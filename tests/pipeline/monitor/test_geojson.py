@@ -1,4 +1,4 @@
-"""The map of the tiles' states: where the tiles are, as other programs read it, and how they stand."""
+"""Map of tile states: outlines and properties as other programs read them."""
 
 from dataclasses import replace
 
@@ -17,12 +17,13 @@ from flexroad.pipeline.store.records import Failure, TileRecord
 
 @pytest.fixture
 def run(made_survey, quick_config, tmp_path) -> Run:
-    """Four tiles: one done, one found done, one failed, one that the database does not know."""
+    """A run of four tiles: done, cached, failed, and one that is not in the database."""
     catalog = Catalog.read(made_survey / "catalog.parquet")
     run = Run.create(tmp_path / "run", load_config(quick_config), catalog)
     one, two, three, _ = (tile.id for tile in catalog.tiles)
     rows = tuple(
-        {"variant": name, "error_estimate_m": doubt} for name, doubt in (("rgt", 9.0), ("flexroad", 0.25))
+        {"variant": name, "error_estimate_m": estimate}
+        for name, estimate in (("rgt", 9.0), ("flexroad", 0.25))
     )
     with RunDatabase.open(run.path / NAME) as database:
         database.set_states([(one, "done"), (two, "cached"), (three, "failed")])
@@ -34,25 +35,25 @@ def run(made_survey, quick_config, tmp_path) -> Run:
     return run
 
 
-def test_other_programs_read_it(run, tmp_path):
+def test_write_states_is_read_by_gdal(run, tmp_path):
     write_states(run, tmp_path / "tiles.geojson")
     table = pyogrio.read_dataframe(tmp_path / "tiles.geojson")
     assert table.crs.to_epsg() == 4326
     assert table["id"].tolist() == [tile.id for tile in run.catalog.tiles]
     assert table.state.tolist() == ["done", "cached", "failed", "pending"]
     done, _, failed, pending = table.itertuples()
-    # Of the surface that is exported, not of the baselines.
+    # The error estimate is that of the exported surface, not of the baselines.
     assert (done.error_estimate_m, done.seconds) == (0.25, 1.5)
     assert done.finished.isoformat() == "2026-11-21T02:00:00+00:00"
     assert failed.error == "load: TaskError: no, file"
     assert table.loc[pending.Index, ["error", "seconds", "error_estimate_m", "finished"]].isna().all()
     crs = run.catalog.tiles[0].grid.crs
-    for tile, there in zip(run.catalog.tiles, table.to_crs(crs).geometry, strict=True):
-        assert there.bounds == pytest.approx(tile.grid.bounds, abs=0.02)
-        assert there.exterior.is_ccw
+    for tile, outline in zip(run.catalog.tiles, table.to_crs(crs).geometry, strict=True):
+        assert outline.bounds == pytest.approx(tile.grid.bounds, abs=0.02)
+        assert outline.exterior.is_ccw
 
 
-def test_tiles_of_several_systems_lie_where_they_are(made_survey):
+def test_outlines_of_several_crs_are_transformed(made_survey):
     one, two, *_ = Catalog.read(made_survey / "catalog.parquet").tiles
     other = replace(two, grid=replace(two.grid, crs="EPSG:32633"))
     rings = np.array([polygon.exterior.coords for polygon in outlines([one, other, one])])
@@ -61,11 +62,11 @@ def test_tiles_of_several_systems_lie_where_they_are(made_survey):
     to_wgs84 = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
     west, south, east, north = other.grid.bounds
     expected = [
-        to_wgs84.transform(*at) for at in ((east, south), (east, north), (west, north), (west, south))
+        to_wgs84.transform(*corner) for corner in ((east, south), (east, north), (west, north), (west, south))
     ]
     assert rings[1, :4] == pytest.approx(np.array(expected), abs=1e-7)
 
 
-def test_a_catalog_without_tiles_left_is_an_empty_map(run, tmp_path):
+def test_write_states_without_tiles_is_empty(run, tmp_path):
     write_states(replace(run, catalog=Catalog(())), tmp_path / "tiles.geojson")
     assert pyogrio.read_info(tmp_path / "tiles.geojson")["features"] == 0
