@@ -1,1 +1,1 @@
-"""Look into catalogs, runs, tiles and surfaces; fit one surface in memory."""
+"""Inspection of catalogs, runs, tiles and surfaces; fit of one surface in memory."""

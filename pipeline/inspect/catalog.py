@@ -1,4 +1,4 @@
-"""Look a catalog over: what its tiles have, what is missing, how far the photo lies off the heights."""
+"""Check of a catalog: layers per tile, missing files, shift of the orthophoto against the heights."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
 
-MOST = 12
-"""Tiles whose photo is compared with the heights: spread evenly over the catalog."""
-SHOWN = 5
-"""Missing files that are named."""
+MAX_PHOTO_TILES = 12
+"""Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
+MAX_MISSING_SHOWN = 5
+"""Number of missing files that are named."""
 
 
 @dataclass(frozen=True)
@@ -27,70 +27,72 @@ class Finding:
 
     text: str
     fault: bool = False
-    """Whether something should be mended before a run."""
+    """Whether this should be corrected before a run."""
 
 
 def check(catalog: Catalog) -> Iterator[Finding]:
-    """Tell what a catalog has and what is amiss, the quick things first."""
+    """Yield the contents and the faults of a catalog, the fast checks first."""
     tiles = catalog.tiles
     sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
     systems = sorted({short(tile.grid.crs) for tile in tiles})
     yield Finding(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
-    had = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
-    yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in had.items() if count))
+    counts = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
+    yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in counts.items() if count))
     for name in ("dsm", "dtm"):
-        if had[name] < len(tiles):
-            yield Finding(f"{len(tiles) - had[name]} tiles have no {name}: they will fail", fault=True)
+        if counts[name] < len(tiles):
+            yield Finding(f"{len(tiles) - counts[name]} tiles have no {name}: they will fail", fault=True)
     yield from _missing(tiles)
     yield from _photos([tile for tile in tiles if tile.layer("dop")])
 
 
 def _missing(tiles: Sequence[Tile]) -> Iterator[Finding]:
-    wanted: Counter[Location] = Counter(
+    files: Counter[Location] = Counter(
         path for tile in tiles for layer in tile.layers for path in tile.paths(layer)
     )
-    look = StatCache()
-    gone = [(path, count) for path, count in wanted.items() if look(path) is None]
-    for path, count in gone[:SHOWN]:
+    stat = StatCache()
+    missing = [(path, count) for path, count in files.items() if stat(path) is None]
+    for path, count in missing[:MAX_MISSING_SHOWN]:
         yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
-    if len(gone) > SHOWN:
-        yield Finding(f"missing: {len(gone) - SHOWN} files more", fault=True)
+    if len(missing) > MAX_MISSING_SHOWN:
+        yield Finding(f"missing: {len(missing) - MAX_MISSING_SHOWN} more files", fault=True)
 
 
 def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
-    """Compare photo and heights on some tiles, first by cell: only like lattices can be taken together."""
+    """Compare photos with heights on a sample of the tiles that have the most frequent cell size."""
     tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
     cells = Counter(tile.grid.cell for tile in tiles)
     tiles = [tile for tile in tiles if tile.grid.cell == cells.most_common(1)[0][0]]
-    some = [tiles[i * len(tiles) // min(MOST, len(tiles))] for i in range(min(MOST, len(tiles)))]
+    count = min(MAX_PHOTO_TILES, len(tiles))
+    sample = [tiles[i * len(tiles) // count] for i in range(count)]
     pairs: list[coregistration.Pair] = []
-    for tile in some:
+    for tile in sample:
         try:
             pairs.append(_pair(tile))
         except TaskError as error:
             yield Finding(f"{tile.id}: {error}", fault=True)
     if pairs:
-        yield _shift(pairs, some[0].grid.cell)
+        yield _shift(pairs, sample[0].grid.cell)
 
 
 def _pair(tile: Tile) -> coregistration.Pair:
     data = load.load(tile, load.Options(min_valid=0.0))
-    assert data.dop is not None  # only tiles with a photo are asked
+    assert data.dop is not None  # the caller selects tiles with a photo
     return coregistration.pair(data, read_photo(data.dop, data.grid))
 
 
 def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
-    found = coregistration.shift(pairs)
-    each = [coregistration.shift([pair], found.sun) for pair in pairs]
+    shift = coregistration.shift(pairs)
+    tile_shifts = [coregistration.shift([pair], shift.sun) for pair in pairs]
     scatter = median(
-        ((one.east_m - found.east_m) ** 2 + (one.north_m - found.north_m) ** 2) ** 0.5 for one in each
+        ((tile.east_m - shift.east_m) ** 2 + (tile.north_m - shift.north_m) ** 2) ** 0.5
+        for tile in tile_shifts
     )
     measured = (
-        f"{found} of the heights (over {len(pairs)} tile{'s' * (len(pairs) != 1)}, half of them within "
-        f"{scatter:.1f} m of that; sun at {found.sun[0]:.0f}°, {found.sun[1]:.0f}° high; "
-        f"confidence {found.confidence:.2f})"
+        f"{shift} of the heights (over {len(pairs)} tile{'s' * (len(pairs) != 1)}, half of them within "
+        f"{scatter:.1f} m of that; sun at {shift.sun[0]:.0f}°, {shift.sun[1]:.0f}° high; "
+        f"confidence {shift.confidence:.2f})"
     )
-    if not coregistration.matters(found, cell, scatter):
+    if not coregistration.matters(shift, cell, scatter):
         return Finding(f"dop: {measured}: not clearly off")
     return Finding(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",

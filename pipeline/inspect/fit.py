@@ -1,4 +1,4 @@
-"""Fit a surface to rasters that are in memory: the stages of a run, without files."""
+"""Fit of a surface to rasters in memory: the stages of a run, without files."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def fit(
 ) -> Surface:
     """Fit a smooth surface to the road and the terrain of one area.
 
-    The stages are those of a run over the same rasters, and so is the result. The area is fitted as one tile,
-    which suits 60 m x 60 m to about 500 m x 500 m. For more, make a catalog and a run.
+    The stages and the result are those of a run over the same rasters. The area is fitted as one tile, which
+    suits 60 m x 60 m to about 500 m x 500 m. For larger areas make a catalog and a run.
 
     Parameters
     ----------
     dsm : xarray.DataArray, (H, W)
         Digital surface model, heights in m. Its grid is that of the surface: square pixels, a projected CRS
         in metres (``dsm.rio.crs``), coordinates of the cell centres that ascend or descend. NaN and
-        ``dsm.rio.nodata`` mean unknown. Dask arrays are computed.
+        ``dsm.rio.nodata`` are nodata. Dask arrays are computed.
     dtm : xarray.DataArray, (H, W)
         Digital terrain model, heights in m, in the same CRS. If its cells do not coincide with those of the
         DSM, it is resampled bilinearly, with a warning.
     road_mask : xarray.DataArray, (H, W)
         Road where True or not 0, in the same CRS. If its cells do not coincide with those of the DSM, the
-        nearest cell is taken, with a warning. It takes the place of the configuration's ``segment``.
+        nearest cell is taken, with a warning. It replaces the configuration's ``segment``.
     config : str or Path
         A shipped configuration (``nightly`` for production, ``paper``) or a YAML file.
     variant : str, optional

@@ -1,4 +1,4 @@
-"""The GeoTIFFs of a run's tiles as one raster that is read block by block."""
+"""Mosaic of the GeoTIFFs of a run's tiles: one lazy raster, read block by block."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ from flexroad.tasks.io.raster import opened
 
 
 class LayerFile(NamedTuple):
-    """A raster among the products of a tile."""
+    """One kind of GeoTIFF among the products of a tile."""
 
     suffix: str
+    """The file name after the tile id and the variant."""
     dtype: str
     fill: float
-    """Value where no finished tile is."""
+    """Value of cells without a finished tile."""
 
 
 LAYERS = {
@@ -40,47 +41,50 @@ LAYERS = {
 
 
 class Window(NamedTuple):
-    """A part of a tile's rasters."""
+    """A rectangular part of a tile's rasters, in cells."""
 
     stem: str
-    """The path of the tile's products up to their suffix."""
+    """The path of the tile's products without the suffix."""
     row: int
-    """First row of the part, in the tile."""
+    """First row of the part in the tile."""
     column: int
+    """First column of the part in the tile."""
     height: int
     width: int
 
 
 @dataclass(frozen=True)
 class Mosaic:
-    """Blocks between all edges of tiles; each lies in one finished tile, or in none."""
+    """A raster divided into blocks by all tile edges; each block lies in at most one finished tile."""
 
     grid: Grid
     """The cells of the whole raster."""
     heights: tuple[int, ...]
-    """Rows of each row of blocks."""
+    """Number of cell rows of each row of blocks."""
     widths: tuple[int, ...]
+    """Number of cell columns of each column of blocks."""
     windows: dict[tuple[int, int], Window]
-    """What a block is read from, by its row and column; none where no finished tile is."""
+    """The source of each block by its (row, column); blocks without a finished tile are absent."""
 
     @classmethod
     def of(cls, run: Run, variant: str, bounds: Bounds | None) -> Mosaic:
-        """Lay out the finished tiles of a run over some bounds (m), or over all tiles.
+        """Return the mosaic of the finished tiles of a run in the bounds (m); None for all tiles.
 
         Raises
         ------
         ConfigError
-            If the bounds are empty, or the tiles have different cells.
+            If the bounds are empty, or tiles have different cell sizes or lattices.
         """
         tiles = run.catalog.tiles
         grid = _grid(tiles, bounds)
         near = [tile for tile in tiles if _meet(tile.grid, grid)]
-        spans = [(*_span(tile, grid), now) for tile, now in zip(near, peek_statuses(run, near), strict=True)]
+        statuses = peek_statuses(run, near)
+        spans = [(*_span(tile, grid), status) for tile, status in zip(near, statuses, strict=True)]
         rows = _edges([(top, bottom) for top, bottom, *_ in spans], grid.height)
         columns = _edges([(left, right) for _, _, left, right, _ in spans], grid.width)
         windows: dict[tuple[int, int], Window] = {}
-        for (top, bottom, left, right, now), tile in zip(spans, near, strict=True):
-            if not now.done:
+        for (top, bottom, left, right, status), tile in zip(spans, near, strict=True):
+            if not status.done:
                 continue
             stem = str(absolute(run.folder(tile.id).path) / f"{safe_name(tile.id)}_{variant}")
             for i in _between(rows, top, bottom):
@@ -90,13 +94,13 @@ class Mosaic:
         return cls(grid, _steps(rows), _steps(columns), windows)
 
     def layer(self, file: LayerFile) -> Any:
-        """Return one layer as Dask array, ``(H, W)``."""
+        """Return one layer as a Dask array, ``(H, W)``."""
         sources = {block: (window, file.suffix) for block, window in self.windows.items()}
         return lazy_raster(_read, sources, self.heights, self.widths, file.dtype, file.fill)
 
 
 def _grid(tiles: Sequence[Tile], bounds: Bounds | None) -> Grid:
-    """Return the cells of the tiles' lattice that cover the bounds."""
+    """Return the grid on the lattice of the first tile that covers the bounds; None for all tiles."""
     edges = np.array([tile.grid.bounds for tile in tiles])
     (west, south), (east, north) = edges[:, :2].min(axis=0), edges[:, 2:].max(axis=0)
     if bounds is not None:
@@ -117,26 +121,26 @@ def _meet(a: Grid, b: Grid) -> bool:
 
 
 def _span(tile: Tile, grid: Grid) -> tuple[int, int, int, int]:
-    """Return a tile's first and last row and column in the grid, which may lie beyond it."""
-    own = tile.grid
-    left, top = (own.west - grid.west) / grid.cell, (grid.north - own.north) / grid.cell
-    off = max(abs(left - round(left)), abs(top - round(top)))
-    if own.cell != grid.cell or off > LATTICE_TOLERANCE or not same(own.crs, grid.crs):
+    """Return first and end row, first and end column of a tile in the grid; they may lie outside it."""
+    cells = tile.grid
+    left, top = (cells.west - grid.west) / grid.cell, (grid.north - cells.north) / grid.cell
+    offset = max(abs(left - round(left)), abs(top - round(top)))
+    if cells.cell != grid.cell or offset > LATTICE_TOLERANCE or not same(cells.crs, grid.crs):
         raise ConfigError(
-            f"tile {own.cell:g} m at ({own.west:.10g}, {own.north:.10g}) is not on the {grid.cell:g} m cells "
-            f"of the first tile; give bounds without tile {tile.id}"
+            f"tile {tile.id} ({cells.cell:g} m cells from {cells.west:.10g}, {cells.north:.10g}) is not on "
+            f"the {grid.cell:g} m cells of the first tile; give bounds without this tile"
         )
-    return round(top), round(top) + own.height, round(left), round(left) + own.width
+    return round(top), round(top) + cells.height, round(left), round(left) + cells.width
 
 
 def _edges(spans: Sequence[tuple[int, int]], size: int) -> list[int]:
-    """Return where blocks begin and end along an axis of ``size`` cells."""
+    """Return the block edges along an axis of ``size`` cells, ascending, with 0 and ``size``."""
     inner = {edge for span in spans for edge in span if 0 < edge < size}
     return sorted({0, size} | inner)
 
 
 def _between(edges: Sequence[int], start: int, stop: int) -> range:
-    """Return the numbers of the blocks from ``start`` to ``stop``, which are edges or lie outside."""
+    """Return the indices of the blocks from ``start`` to ``stop``, which are edges or lie outside."""
     return range(np.searchsorted(edges, max(start, 0)), np.searchsorted(edges, min(stop, edges[-1])))
 
 

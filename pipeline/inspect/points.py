@@ -1,4 +1,4 @@
-"""Ask a run for the ground under points.
+"""Heights, normals, tiles and classes of a run at points.
 
 >>> from flexroad.pipeline.inspect.points import Ground
 >>> ground = Ground.open("RUN")                       # doctest: +SKIP
@@ -29,24 +29,24 @@ from flexroad.tasks.types import Floats, RoadMask, Surface
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What is known of n points; NaN and empty strings outside the run's tiles."""
+    """Values at n points; NaN and empty strings outside the finished tiles."""
 
     height: Floats
     """``(n,)``, m."""
     normal: Floats
-    """``(n, 3)``, upward unit vectors: east, north, up."""
+    """``(n, 3)``, upward unit normals: east, north, up."""
     tile: NDArray[np.str_]
     """``(n,)``, tile ids."""
     kind: NDArray[np.str_]
-    """``(n,)``, ``road`` or ``terrain`` by the segmented mask."""
+    """``(n,)``, ``road`` or ``terrain`` according to the segmented mask."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The fitted surfaces of a run's finished tiles as one ground.
+    """The fitted surfaces of a run's finished tiles.
 
-    Surfaces come from the store; the sources are not needed for NURBS surfaces. Only the tiles under the
-    points asked for are looked at.
+    Surfaces are read from the store; NURBS surfaces need no source files. Only the tiles under the requested
+    points are read.
     """
 
     run: Run
@@ -59,18 +59,18 @@ class Ground:
         Raises
         ------
         ConfigError
-            If it is no run, has no such variant, or no tile is done.
+            If the folder is no run, has no such variant, or no tile is done.
         """
         run = Run.open(parse_location(path))
         variant = variant or run.config.export.variants[0]
         if variant not in run.config.chains:
             raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-        if not any(found.done for found in peek_statuses(run, run.catalog.tiles)):
+        if not any(status.done for status in peek_statuses(run, run.catalog.tiles)):
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
         return cls(run, variant)
 
     def at(self, easting: Floats, northing: Floats) -> Answer:
-        """Return height, normal, tile and class under n points (m, in the run's CRS).
+        """Return height, normal, tile and class at n points (m, in the run's CRS).
 
         A point on the edge of two finished tiles belongs to the one first in the catalog.
         """
@@ -81,54 +81,53 @@ class Ground:
         tile = np.zeros(easting.shape, dtype=object)
         kind = np.full(easting.shape, "", dtype=object)
         tile[:] = ""
-        for graph, here in self._owners(easting, northing):
+        for graph, selected in self._owners(easting, northing):
             surface, road = self._tile(graph)
-            height[here] = surface.height(easting[here], northing[here])
-            normal[here] = surface.normal(easting[here], northing[here])
-            tile[here] = graph.tile.id
-            kind[here] = np.where(
-                road.mask[road.grid.cells(easting[here], northing[here])], "road", "terrain"
-            )
+            east, north = easting[selected], northing[selected]
+            height[selected] = surface.height(east, north)
+            normal[selected] = surface.normal(east, north)
+            tile[selected] = graph.tile.id
+            kind[selected] = np.where(road.mask[road.grid.cells(east, north)], "road", "terrain")
         return Answer(height, normal, tile.astype(str), kind.astype(str))
 
     def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileGraph, NDArray[np.intp]]]:
-        """Yield each finished tile that has points, with their numbers."""
+        """Yield the graph of each finished tile that has points, with the indices of the points."""
         tiles = self.run.catalog.tiles
         tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
         point, number = tree.query(points(easting, northing), predicate="intersects")
         if not point.size:
             return
         order = np.argsort(number, kind="stable")
-        under, starts = np.unique(number[order], return_index=True)
-        free = np.ones(easting.shape, dtype=bool)
-        stands = peek_statuses(self.run, [tiles[i] for i in under])
-        for found, here in zip(stands, np.split(point[order], starts[1:]), strict=True):
-            here = here[free[here]]
-            if found.done and here.size:
-                free[here] = False
-                yield found.graph, here
+        numbers, starts = np.unique(number[order], return_index=True)
+        unassigned = np.ones(easting.shape, dtype=bool)
+        statuses = peek_statuses(self.run, [tiles[i] for i in numbers])
+        for status, indices in zip(statuses, np.split(point[order], starts[1:]), strict=True):
+            indices = indices[unassigned[indices]]
+            if status.done and indices.size:
+                unassigned[indices] = False
+                yield status.graph, indices
 
     def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
-        pull = Evaluator(graph, ArtefactStore(self.run.store))
-        made = graph.variants[self.variant]
+        evaluate = Evaluator(graph, ArtefactStore(self.run.store))
+        nodes = graph.variants[self.variant]
         try:
-            return pull(made["fit"]), pull(made["segment"])
+            return evaluate(nodes["fit"]), evaluate(nodes["segment"])
         except StageError as error:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
 
 
 def query_csv(run: Location, csv: Path, variant: str | None, out: TextIO) -> int:
-    """Answer a CSV of points with a CSV: its columns, then height_m, nx, ny, nz, tile, class.
+    """Read a CSV of points and write it with the added columns height_m, nx, ny, nz, tile and class.
 
     Returns
     -------
     int
-        How many points lie on no finished tile.
+        Number of points outside the finished tiles.
 
     Raises
     ------
     ConfigError
-        If the file is missing or lacks the columns easting and northing, or a value is no number.
+        If the file is missing or lacks the columns easting and northing, or a value is not a number.
     """
     try:
         table = pd.read_csv(csv)

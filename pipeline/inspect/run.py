@@ -1,4 +1,4 @@
-"""A run as notebooks use it: its tiles, its tables, and its finished tiles as one ground."""
+"""A run in a notebook: its tiles, its tables, and heights and rasters of its finished tiles."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunView:
-    """A run to look into; made by `flexroad.open_run`. Nothing here changes the run.
+    """A read-only view of a run, opened by `flexroad.open_run`.
 
-    Every access reads the run's files as they are then, also while it runs.
+    Each access reads the current files of the run, also while the run is in progress.
     """
 
     run: Run
     """The opened run folder."""
     variant: str
-    """The variant whose surfaces are shown."""
+    """The variant whose surfaces are used."""
 
     def __repr__(self) -> str:
         counts = self.tiles["state"].value_counts()
@@ -55,8 +55,8 @@ class RunView:
         Returns
         -------
         geopandas.GeoDataFrame
-            One row per tile: ``id``; ``state``, which is ``done``, ``failed`` or ``pending`` (not tried, or
-            its sources or options have changed); ``geometry``, its outline in the CRS of the tiles.
+            One row per tile: ``id``; ``state``, which is ``done``, ``failed`` or ``pending`` (not computed,
+            or its sources or options have changed); ``geometry``, its outline in the CRS of the tiles.
 
         Examples
         --------
@@ -71,8 +71,8 @@ class RunView:
 
         tiles = self.run.catalog.tiles
         states = [
-            "done" if now.done else "failed" if now.failed else "pending"
-            for now in peek_statuses(self.run, tiles)
+            "done" if status.done else "failed" if status.failed else "pending"
+            for status in peek_statuses(self.run, tiles)
         ]
         bounds = np.array([tile.grid.bounds for tile in tiles]).reshape(-1, 4)
         return geopandas.GeoDataFrame(
@@ -83,12 +83,12 @@ class RunView:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """The figures of ``metrics.parquet``: one row per tile and variant.
+        """The metrics in ``metrics.parquet``: one row per tile and variant.
 
         Raises
         ------
         ConfigError
-            If there is no such file yet, or it is damaged.
+            If the file does not exist yet or is damaged.
 
         Examples
         --------
@@ -101,7 +101,7 @@ class RunView:
 
     @property
     def failures(self) -> pd.DataFrame:
-        """The failures of ``failures.csv``: one row per failure.
+        """The failures in ``failures.csv``: one row per failure.
 
         Returns
         -------
@@ -112,7 +112,7 @@ class RunView:
         Raises
         ------
         ConfigError
-            If there is no such file yet, or it is damaged.
+            If the file does not exist yet or is damaged.
 
         Examples
         --------
@@ -131,7 +131,7 @@ class RunView:
             raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the height under points.
+        """Return the height at points.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class RunView:
         Returns
         -------
         ndarray
-            Heights (m) in the broadcast shape; NaN where no finished tile is.
+            Heights (m) in the broadcast shape; NaN outside the finished tiles.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class RunView:
         return answer.height.reshape(shape)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal under points.
+        """Return the upward unit normal at points.
 
         Parameters
         ----------
@@ -168,7 +168,7 @@ class RunView:
         Returns
         -------
         ndarray, (..., 3)
-            East, north and up components; NaN where no finished tile is.
+            East, north and up components; NaN outside the finished tiles.
 
         Raises
         ------
@@ -185,26 +185,26 @@ class RunView:
         return answer.normal.reshape(*shape, 3)
 
     def to_xarray(self, bounds: Bounds | None = None) -> xr.Dataset:
-        """Return the height and the road mask of the finished tiles as one lazy raster.
+        """Return height and road mask of the finished tiles as one lazy raster.
 
         Parameters
         ----------
         bounds : tuple of float, optional
-            West, south, east, north (m), grown to whole cells; by default all tiles.
+            West, south, east, north (m), extended to whole cells; by default those of all tiles.
 
         Returns
         -------
         xarray.Dataset, (y, x)
-            ``height`` (m, float32; NaN where no finished tile is) and ``road`` (bool, the filtered mask),
+            ``height`` (m, float32; NaN outside the finished tiles) and ``road`` (bool, the filtered mask),
             backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is computed. Coordinates
-            ``x`` (ascending) and ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set. Of
-            tiles that overlap, the first of the catalog counts.
+            ``x`` (ascending) and ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set.
+            Where tiles overlap, the first one in the catalog is used.
 
         Raises
         ------
         ConfigError
             If the bounds are empty, the run does not export GeoTIFF (``cog``), or its tiles have different
-            cells.
+            cell sizes or lattices.
 
         Examples
         --------
@@ -236,7 +236,7 @@ class RunView:
         return placed
 
     def tile(self, tile_id: str) -> xr.Dataset:
-        """Return what went into one tile and what came out of it.
+        """Return the input rasters, masks and fitted surface of one tile.
 
         Parameters
         ----------
@@ -271,14 +271,14 @@ class RunView:
 
 
 def open_run(path: str | Path, variant: str | None = None) -> RunView:
-    """Open the folder of a run, finished or not.
+    """Open a run, finished or in progress.
 
     Parameters
     ----------
     path : str or Path
-        The folder that ``flexroad run --out`` made, or its address in a bucket (``s3://...``).
+        The folder given to ``flexroad run --out``, or its address in object storage (``s3://...``).
     variant : str, optional
-        Whose surfaces are shown; by default those of the first variant exported.
+        The variant whose surfaces are used; by default the first one exported.
 
     Raises
     ------

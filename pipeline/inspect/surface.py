@@ -1,4 +1,4 @@
-"""A fitted surface as notebooks use it: heights, normals, rasters, a mesh, and one file."""
+"""A fitted surface in a notebook: heights, normals, rasters, a mesh, and one file."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 AXES = {"z": "x east, y north, z up", "y": "x east, y up, z south"}
+"""Directions of the mesh axes by the upward axis."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Surface:
-    """The fitted ground of one area; made by `flexroad.fit` or `flexroad.open_surface`.
+    """The fitted surface of one area; returned by `flexroad.fit` and `flexroad.open_surface`.
 
     Examples
     --------
@@ -40,19 +41,19 @@ class Surface:
     """
 
     fitted: types.Surface
-    """What the stage ``fit`` made: a `NurbsSurface`, a plane or a raster."""
+    """The result of the stage ``fit``: a `NurbsSurface`, a plane or a raster."""
     crs: str
-    """CRS of x and y: ``EPSG:25832``, or WKT where there is no code."""
+    """CRS of x and y: ``EPSG:25832``, or WKT if there is no code."""
     bounds: Bounds
     """West, south, east, north (m)."""
     road: RoadMask | None
-    """The road mask before the filter, on the grid with its halo; None for a file that a run wrote."""
+    """The road mask before the filter, on the grid with its halo; None if read from a file of a run."""
     clusters: RoadClusters | None
-    """What the filter kept of it; None for a file that a run wrote."""
+    """The road clusters that the filter kept; None if read from a file of a run."""
     sampling: sample.Options
-    """How `to_mesh` samples."""
+    """Options of the sampling in `to_mesh`."""
     config: str
-    """The configuration that the surface was fitted with; empty if unknown."""
+    """Name of the configuration of the fit; empty if unknown."""
 
     def __repr__(self) -> str:
         west, south, east, north = (f"{edge:.10g}" for edge in self.bounds)
@@ -72,7 +73,7 @@ class Surface:
         )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the height under points.
+        """Return the height at points.
 
         Parameters
         ----------
@@ -93,10 +94,10 @@ class Surface:
         array([152.4, 152.5,   nan])
         """
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        return np.where(self._known(easting, northing), self.fitted.height(easting, northing), np.nan)[()]
+        return np.where(self._valid(easting, northing), self.fitted.height(easting, northing), np.nan)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal under points.
+        """Return the upward unit normal at points.
 
         Parameters
         ----------
@@ -117,11 +118,11 @@ class Surface:
         array([-0.03, -0.04,  1.  ])
         """
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        known = self._known(easting, northing)[..., None]
-        return np.where(known, self.fitted.normal(easting, northing), np.nan)
+        valid = self._valid(easting, northing)[..., None]
+        return np.where(valid, self.fitted.normal(easting, northing), np.nan)
 
     def to_xarray(self, resolution: float = 1.0) -> xr.Dataset:
-        """Return heights and road on a grid of square cells over `bounds`.
+        """Return heights and road mask on a grid of square cells over `bounds`.
 
         Parameters
         ----------
@@ -131,14 +132,14 @@ class Surface:
         Returns
         -------
         xarray.Dataset, (y, x)
-            ``height`` (m; NaN where the survey has no data) at the cell centres and, if the mask is known,
-            ``road``: the filtered road mask, of the nearest input cell. Coordinates ``x`` (ascending) and
+            ``height`` (m; NaN where the survey has no data) at the cell centres and, if there is a mask,
+            ``road``: the filtered road mask at the nearest input cell. Coordinates ``x`` (ascending) and
             ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set.
 
         Raises
         ------
         ConfigError
-            If the resolution is not above 0.
+            If the resolution is not a positive number.
 
         Examples
         --------
@@ -157,18 +158,18 @@ class Surface:
         grid = Grid.covering(self.crs, self.bounds, resolution)
         x, y = np.meshgrid(grid.eastings, grid.northings)
         heights = self.fitted.lattice(grid.eastings, grid.northings)
-        known = self._known(x, y)
-        heights[~known] = np.nan
+        valid = self._valid(x, y)
+        heights[~valid] = np.nan
         layers: dict[str, Any] = {"height": (("y", "x"), heights, {"units": "m"})}
         if self.road is not None and self.clusters is not None:
             road = _cut(self.clusters.mask, self.road)[self.road.core.cells(x, y)]
-            layers["road"] = ("y", "x"), road & known
+            layers["road"] = ("y", "x"), road & valid
         raster = xr.Dataset(layers, coords={"x": grid.eastings, "y": grid.northings})
         placed: xr.Dataset = raster.rio.write_crs(self.crs).rio.write_transform(grid.transform)
         return placed
 
     def to_mesh(self, up: Literal["z", "y"] = "z") -> trimesh.Trimesh:
-        """Return the surface as a triangle mesh, sampled as the configuration's ``sample`` says.
+        """Return the surface as a triangle mesh, sampled with the options `sampling`.
 
         Parameters
         ----------
@@ -178,14 +179,14 @@ class Surface:
         Returns
         -------
         trimesh.Trimesh
-            Vertices (m) relative to a whole-metre origin: float32 formats keep millimetres. ``metadata`` has
-            ``crs``, ``origin`` (easting, northing, height; m) and ``axes``; ``face_attributes["road"]``,
-            (F,), is True for faces on the road.
+            Vertices (m) relative to a whole-metre origin, so that float32 formats keep millimetres.
+            ``metadata`` has ``crs``, ``origin`` (easting, northing, height; m) and ``axes``;
+            ``face_attributes["road"]``, (F,), is True for faces on the road.
 
         Raises
         ------
         ConfigError
-            If the surface has no road mask: it was opened from a file that a run wrote.
+            If the surface has no road mask, as it was read from a file of a run.
 
         Examples
         --------
@@ -200,7 +201,7 @@ class Surface:
 
         if self.road is None or self.clusters is None:
             raise ConfigError(
-                "the surface has no road mask, as it comes from the file of a run; take the mesh of the run"
+                "the surface has no road mask, as it was read from a file of a run; use the mesh of the run"
             )
         mesh = sample.sample(self.fitted, self.road, self.clusters, self.sampling)
         east, north, height = mesh.vertices.T
@@ -213,8 +214,8 @@ class Surface:
     def save(self, path: str | Path) -> None:
         """Write the surface to one ``.npz`` file, for `flexroad.open_surface` or any NumPy.
 
-        The file holds knots, coefficients and weights in float64, as the ``.npz`` files of a run, and beside
-        them the road mask.
+        The file contains knots, coefficients and weights in float64, as the ``.npz`` files of a run do, and
+        the road mask.
 
         Parameters
         ----------
@@ -224,7 +225,7 @@ class Surface:
         Raises
         ------
         TaskError
-            If the surface is a plane or a raster, which the format does not hold.
+            If the surface is a plane or a raster, which the format cannot store.
 
         Examples
         --------
@@ -236,7 +237,9 @@ class Surface:
         True
         """
         if not isinstance(self.fitted, NurbsSurface):
-            raise TaskError(f"a {type(self.fitted).__name__} is no NURBS surface; save its to_xarray()")
+            raise TaskError(
+                f"a {type(self.fitted).__name__} is no NURBS surface; save the result of to_xarray()"
+            )
         buffer = io.BytesIO(npz.encode(self.fitted))
         if self.road is not None and self.clusters is not None:
             with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED) as archive:
@@ -245,8 +248,8 @@ class Surface:
                         np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
         Path(path).write_bytes(buffer.getvalue())
 
-    def _known(self, easting: Floats, northing: Floats) -> Bools:
-        """Return where points are inside the bounds and the survey."""
+    def _valid(self, easting: Floats, northing: Floats) -> Bools:
+        """Return which points are inside the bounds and where the survey has data."""
         west, south, east, north = self.bounds
         inside: Bools = (west <= easting) & (easting <= east) & (south <= northing) & (northing <= north)
         if self.road is None:
@@ -255,18 +258,18 @@ class Surface:
 
 
 def open_surface(path: str | Path) -> Surface:
-    """Open a surface that `Surface.save` or a run wrote.
+    """Open a surface file written by `Surface.save` or by a run.
 
     Parameters
     ----------
     path : str or Path
-        An ``.npz`` file, such as ``RUN/tiles/ID/ID_flexroad_surface.npz``. Files of a run hold no road mask:
-        the surface then has heights and normals over its whole domain, but no mesh.
+        An ``.npz`` file, such as ``RUN/tiles/ID/ID_flexroad_surface.npz``. Files of a run contain no road
+        mask: the surface then has heights and normals over its whole domain, but no mesh.
 
     Raises
     ------
     TaskError
-        If the file is missing, damaged, no surface, or of a later version.
+        If the file is missing, damaged, not a surface, or of a later version.
 
     Examples
     --------
@@ -296,7 +299,7 @@ def _cut(values: Bools, road: RoadMask) -> Bools:
 
 
 def _masks(road: RoadMask, clusters: RoadClusters, sampling: sample.Options, config: str) -> dict[str, Any]:
-    """Return what stands beside the spline's own arrays in the file."""
+    """Return the arrays that `Surface.save` adds to those of the spline, by name."""
     return {
         "grid": np.asarray(astuple(road.grid)[1:], np.float64),
         "core": np.asarray(astuple(road.core)[1:], np.float64),

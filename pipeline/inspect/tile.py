@@ -1,4 +1,4 @@
-"""One tile of a run as an xarray Dataset, to look into.
+"""One tile of a run as an xarray Dataset.
 
 >>> from flexroad.pipeline.inspect.tile import open_tile
 >>> tile = open_tile("RUN", "295500_5629250")                    # doctest: +SKIP
@@ -23,16 +23,16 @@ HEIGHTS = {"units": "m"}
 
 
 def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
-    """Return what went into a tile and what came out of it, on the tile's core.
+    """Return the input rasters, masks and fitted surface of a tile, on the tile's core.
 
     Parameters
     ----------
-    run : Place or str
+    run : Location or str
         The run's folder.
     tile_id : str
-        A tile of its catalog.
+        Id of a tile of the run's catalog.
     variant : str, optional
-        Whose filter and surface; by default the first one exported.
+        The variant of filter and surface; by default the first one exported.
 
     Returns
     -------
@@ -40,14 +40,14 @@ def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> 
         ``dsm``, ``dtm``, ``surface`` and, where the catalog has one, ``reference`` (m); ``road`` and
         ``road_filtered``, the masks before and after the filter, and ``reference_road``. Coordinates ``x``
         and ``y`` are eastings and northings (m) of the cell centres; the CRS is rioxarray's
-        ``spatial_ref``. Stored results are read, the rest is computed and not kept.
+        ``spatial_ref``. Stored results are read; others are computed and not stored.
 
     Raises
     ------
     ConfigError
-        If it is no run, the variant is unknown or a stage fails on the tile.
+        If the folder is no run, the variant is unknown or a stage fails on the tile.
     CatalogError
-        If the tile is unknown.
+        If the catalog has no such tile.
     """
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
@@ -57,10 +57,13 @@ def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> 
     if variant not in opened.config.chains:
         raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")
     (tile,) = opened.catalog.select([tile_id]).tiles
-    (stand,) = peek_statuses(opened, [tile])
-    pull, made = Evaluator(stand.graph, ArtefactStore(opened.store)), stand.graph.variants[variant]
+    (status,) = peek_statuses(opened, [tile])
+    evaluate = Evaluator(status.graph, ArtefactStore(opened.store))
+    nodes = status.graph.variants[variant]
     try:
-        data, road, clusters, surface = (pull(made[stage]) for stage in ("load", "segment", "ecsrc", "fit"))
+        data, road, clusters, surface = (
+            evaluate(nodes[stage]) for stage in ("load", "segment", "ecsrc", "fit")
+        )
     except StageError as error:
         raise ConfigError(f"tile {tile_id}: {error}") from error
     core, window = data.core, data.grid.window(data.core)
@@ -68,10 +71,10 @@ def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> 
     rasters |= {"road": road.mask, "road_filtered": clusters.mask}
     cut = {name: raster[window] for name, raster in rasters.items() if raster is not None}
     cut["surface"] = surface.lattice(core.eastings, core.northings)
-    found = xr.Dataset(
+    dataset = xr.Dataset(
         {name: (("y", "x"), raster, {} if raster.dtype == bool else HEIGHTS) for name, raster in cut.items()},
         coords={"x": core.eastings, "y": core.northings},
         attrs={"tile": tile.id, "variant": variant, "stratum": tile.stratum},
     )
-    placed: xr.Dataset = found.rio.write_crs(core.crs)
+    placed: xr.Dataset = dataset.rio.write_crs(core.crs)
     return placed

@@ -11,21 +11,21 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 
 
-def test_a_tile_as_a_dataset(survey, quick_config, tmp_path):
+def test_open_tile_returns_inputs_masks_and_surface(survey, quick_config, tmp_path):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == run.catalog.tiles[0])
     tile = run.catalog.tiles[0]
-    found = open_tile(run.path, tile.id)
-    assert set(found.data_vars) == {
+    dataset = open_tile(run.path, tile.id)
+    assert set(dataset.data_vars) == {
         "dsm", "dtm", "reference", "reference_road", "road", "road_filtered", "surface",
     }  # fmt: skip
-    assert found.rio.crs.to_epsg() == 25832
-    assert tuple(found.rio.bounds()) == tile.grid.bounds
-    assert not (found.road_filtered & ~found.road).any()
-    east, north = np.meshgrid(found.x, found.y)
+    assert dataset.rio.crs.to_epsg() == 25832
+    assert tuple(dataset.rio.bounds()) == tile.grid.bounds
+    assert not (dataset.road_filtered & ~dataset.road).any()
+    east, north = np.meshgrid(dataset.x, dataset.y)
     height = Ground.open(run.path).at(east.ravel(), north.ravel()).height
-    assert np.allclose(found.surface.values.ravel(), height, atol=1e-9)
-    assert np.array_equal(open_tile(run.path, tile.id, "rgt").surface, found.dsm)
+    assert np.allclose(dataset.surface.values.ravel(), height, atol=1e-9)
+    assert np.array_equal(open_tile(run.path, tile.id, "rgt").surface, dataset.dsm)
     with pytest.raises(ConfigError, match="no variant 'x'"):
         open_tile(run.path, tile.id, "x")
     with pytest.raises(CatalogError, match="did you mean"):
