@@ -1,4 +1,4 @@
-"""``flexroad clean``: free the disk of what no run needs any more."""
+"""``flexroad clean``: delete files that no run needs."""
 
 from __future__ import annotations
 
@@ -13,41 +13,42 @@ from flexroad.pipeline.errors import ConfigError
 
 def clean(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Name the files, drop nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files, delete nothing.")] = False,
     forget: Annotated[
         list[str] | None,
-        typer.Option(metavar="RUN", help="Another run of the same store that is no more; repeatable."),
+        typer.Option(metavar="RUN", help="Another run of the same store that no longer exists; repeatable."),
     ] = None,
 ) -> None:
-    """Drop what no run needs: artefacts, tiles and products that are gone, leftovers of killed writers."""
+    """Delete what no run needs: unused artefacts, files of removed tiles and products, temporary files."""
     from flexroad.catalog.storage.paths import absolute, parse_location
     from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
     from flexroad.pipeline.run.lock import run_lock
     from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.store_users import runs_using
-    from flexroad.pipeline.run.store_users import unregister as strike
+    from flexroad.pipeline.run.store_users import runs_using, unregister
 
     def say(line: str) -> None:
         typer.echo(f"note: {line}", err=True)
 
-    where, gone = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
-    with run_lock(where, say):
-        run = Run.open(where)
-        known = {str(known) for known in runs_using(run.store)}
-        for user in gone:
-            if str(user) not in known:
-                there = ", ".join(sorted(known)) or "none"
-                raise ConfigError(f"--forget {user}: no run of the store {run.store}; there are {there}")
+    location, forgotten = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
+    with run_lock(location, say):
+        run = Run.open(location)
+        users = {str(user) for user in runs_using(run.store)}
+        for user in forgotten:
+            if str(user) not in users:
+                choices = ", ".join(sorted(users)) or "none"
+                raise ConfigError(
+                    f"--forget {user}: no run of the store {run.store}; its runs are: {choices}"
+                )
         files, sizes = Counter[str](), Counter[str]()
-        with exclusive(run, gone, say) as runs:
-            found = find_garbage(runs)
-            for file in found if dry_run else delete(found):
+        with exclusive(run, forgotten, say) as runs:
+            garbage = find_garbage(runs)
+            for file in garbage if dry_run else delete(garbage):
                 files[file.kind] += 1
                 sizes[file.kind] += file.size
                 if dry_run:
                     typer.echo(str(file.path))
-            for user in () if dry_run else gone:
-                strike(run.store, user)
+            for user in () if dry_run else forgotten:
+                unregister(run.store, user)
     for kind, meaning in MEANING.items():
         if files[kind]:
             typer.echo(f"{meaning}: {files[kind]} files, {sizes[kind] / 1e6:.1f} MB")

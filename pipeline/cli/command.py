@@ -1,4 +1,4 @@
-"""What the commands add to Typer's: several values for one option, and an alarm for a line that is wrong."""
+"""Typer command class: options with several values, and a notification if the command line is invalid."""
 
 from __future__ import annotations
 
@@ -8,40 +8,42 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from flexroad.pipeline.cli.lifecycle import unread
+from flexroad.pipeline.cli.lifecycle import notify_invalid_command
 
 
 class Command(TyperCommand):
     """A command whose repeatable options take several values: ``--tile a b`` is ``--tile a --tile b``.
 
-    Its arguments, if it has any, must come first for that: of ``rerun --tile a b``, b is the run.
+    If the command has arguments, they must come first: in ``rerun --tile a b``, b is the run.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the words of a command line."""
+        """Parse the words of a command line."""
         try:
             return super().parse_args(ctx, self._repeated(args))
         except typer.TyperException:
-            # With resilient parsing what can be read is read, and nothing raises.
+            # Resilient parsing returns the valid options and raises nothing.
             lenient = {"resilient_parsing": True, "ignore_unknown_options": True}
-            readable = self.make_context(ctx.info_name, [*args], ctx.parent, **lenient).params
-            if target := readable.get("on_failure"):
-                unread(readable.get("out") or readable.get("path"), target)
+            params = self.make_context(ctx.info_name, [*args], ctx.parent, **lenient).params
+            if target := params.get("on_failure"):
+                notify_invalid_command(params.get("out") or params.get("path"), target)
             raise
 
     def _repeated(self, words: Sequence[str]) -> list[str]:
         if (
             words
             and words[0].startswith("-")
-            and any(one.param_type_name == "argument" for one in self.params)
+            and any(param.param_type_name == "argument" for param in self.params)
         ):
             return [*words]
-        several = {name for one in self.params if getattr(one, "multiple", False) for name in one.opts}
+        repeatable = {
+            name for param in self.params if getattr(param, "multiple", False) for name in param.opts
+        }
         out: list[str] = []
         option = ""
         for word in words:
             if word.startswith("-") and not word[1:].isdigit():
-                option = word if word in several else ""
+                option = word if word in repeatable else ""
             elif option and out[-1] != option:
                 out.append(option)
             out.append(word)

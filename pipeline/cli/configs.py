@@ -12,24 +12,24 @@ configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
 @configs.command("show")
 def config_show(
     name: Annotated[
-        str | None, typer.Argument(help="A YAML file or a shipped name; default: list them.")
+        str | None, typer.Argument(help="A YAML file or a shipped name; default: list the shipped ones.")
     ] = None,
 ) -> None:
-    """Show a configuration as it is resolved, every option of every variant."""
+    """Show every option of every variant of a configuration."""
     import yaml
 
     from flexroad.pipeline.config.loading import load_config, shipped
 
     if name is None:
-        for known, path in shipped().items():
-            typer.echo(f"{known:10} {path.read_text().splitlines()[0].lstrip('# ')}")
+        for shipped_name, path in shipped().items():
+            typer.echo(f"{shipped_name:10} {path.read_text().splitlines()[0].lstrip('# ')}")
         return
-    found = load_config(name)
+    config = load_config(name)
     chains = {
         variant: {stage: options.model_dump(mode="json") for stage, options in chain.items()}
-        for variant, chain in found.chains.items()
+        for variant, chain in config.chains.items()
     }
-    sections = {name: getattr(found, name).model_dump(mode="json") for name in ("export", "cluster")}
+    sections = {key: getattr(config, key).model_dump(mode="json") for key in ("export", "cluster")}
     typer.echo(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
 
 

@@ -1,4 +1,4 @@
-"""What a run would do: the graph in words, for ``--dry-run``."""
+"""Text of ``--dry-run``: the graph of a run and what is still to do."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from flexroad.pipeline.store.products import TileProducts
 def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterator[str]:
     """Yield one line per tile and stage node, then the totals.
 
-    A node is ``stored`` if the store has it, ``to do`` if not; nodes that are never stored (what `load`
-    reads) are done again whenever a node after them is.
+    A node is ``stored`` if its result is in the store, else ``to do``. Nodes that are never stored (the
+    rasters that `load` reads) are computed again when a later node needs them.
     """
     artefacts, totals, tiles = ArtefactStore(store), Counter[tuple[str, str]](), 0
     for graph in graphs:
@@ -27,10 +27,10 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
         for node in graph.nodes.values():
             state = "stored" if node.stored and artefacts.has(node) else "to do"
             totals[node.stage, "done" if done else state] += 1
-            takes = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in node.inputs) or "files"
+            inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in node.inputs) or "files"
             yield (
                 f"  {node.stage:9}{node.fingerprint[:8]}  {'done' if done else state:7} "
-                f"<- {takes}  ({', '.join(users[node.fingerprint])})"
+                f"<- {inputs}  ({', '.join(users[node.fingerprint])})"
             )
     yield f"{tiles} tiles"
     for stage in STAGE_NAMES:
@@ -39,8 +39,9 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
 
 
 def _users(graph: TileGraph) -> dict[str, list[str]]:
+    """Return the variants that use each node, by the node's fingerprint."""
     users: dict[str, list[str]] = {}
-    for variant, made in graph.variants.items():
-        for fingerprint in made.values():
+    for variant, nodes in graph.variants.items():
+        for fingerprint in nodes.values():
             users.setdefault(fingerprint, []).append(variant)
     return users

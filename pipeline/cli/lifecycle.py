@@ -1,4 +1,4 @@
-"""How a command about a run ends, and who is told: exit code, operator's alarm, file for Prometheus."""
+"""End of a ``run`` or ``rerun`` command: exit code, notification of the operator, Prometheus file."""
 
 from __future__ import annotations
 
@@ -24,38 +24,41 @@ if TYPE_CHECKING:
 CANNOT_START = 2
 INTERRUPTED = 130
 ON_FAILURE = "FLEXROAD_ON_FAILURE"
-"""Says the same as `--on-failure`: an address may be a secret, which the list of processes shows to all."""
+"""Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
 
 
 @dataclass
 class Outcome:
-    """How it ends; whoever does the work fills it in."""
+    """Result of a command; filled in while it works."""
 
     exit_code: int = 0
     text: str = ""
-    """In one line, for people."""
-    how: Summary | None = None
+    """The result in one line."""
+    summary: Summary | None = None
+    """The state of the run; None if no tile was processed."""
     textfile: Textfile | None = None
-    """Told of every tile, if it is wanted."""
+    """The Prometheus file, called with every tile result; None without ``--prometheus``."""
 
 
-def format_summary(how: Summary) -> str:
-    """Return how a run stands in one line."""
-    now = f"{how.done} done ({how.cached} cached), {how.failed} failed, {how.pending} pending"
-    since = f"{how.new} new, {how.changed} changed, {how.vanished} vanished"
-    return f"{how.tiles} tiles: {now}; {since}; {how.seconds:.0f} s"
+def format_summary(summary: Summary) -> str:
+    """Return the state of a run in one line."""
+    states = (
+        f"{summary.done} done ({summary.cached} cached), {summary.failed} failed, {summary.pending} pending"
+    )
+    changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
+    return f"{summary.tiles} tiles: {states}; {changes}; {summary.seconds:.0f} s"
 
 
 def warn(line: str, kind: str = "warning") -> None:
-    """Print a line beside the results, on standard error."""
+    """Print a line to standard error."""
     typer.echo(f"{kind}: {line}", err=True)
 
 
 @contextlib.contextmanager
-def supervised(run: Location, on_failure: str | None, prometheus: Path | None) -> Iterator[Outcome]:
-    """See to it that whatever ends the work inside is told to those who asked to be.
+def report_outcome(run: Location, on_failure: str | None, prometheus: Path | None) -> Iterator[Outcome]:
+    """Record how the block ends, in the Prometheus file and, if it fails, in a notification.
 
-    An interruption ends here; everything else goes on.
+    An interruption is recorded and not raised again; all other exceptions are.
 
     Raises
     ------
@@ -65,54 +68,54 @@ def supervised(run: Location, on_failure: str | None, prometheus: Path | None) -
     from flexroad.pipeline.run.summary import read_summary
 
     before = read_summary(run)
-    ending = Outcome()
-    with _end_as_ctrl_c(), contextlib.ExitStack() as stack:
-        # Leaves in the opposite order: the alarm rings when the file is written.
-        stack.callback(_alarm, ending, run, before, on_failure)
+    outcome = Outcome()
+    with _signals_interrupt(), contextlib.ExitStack() as stack:
+        # The stack is left in reverse order: the notification follows the Prometheus file.
+        stack.callback(_notify, outcome, run, before, on_failure)
         try:
-            ending.textfile = _textfile(stack, run, prometheus)
-            yield ending
+            outcome.textfile = _textfile(stack, run, prometheus)
+            yield outcome
         except KeyboardInterrupt:
-            ending.exit_code = INTERRUPTED
-            ending.text = "interrupted; the same command goes on from here"
+            outcome.exit_code = INTERRUPTED
+            outcome.text = "interrupted; the same command goes on from here"
         except BaseException as error:
-            ending.exit_code, ending.text = _told_by(error)
+            outcome.exit_code, outcome.text = _describe(error)
             raise
         finally:
-            if ending.textfile is not None:
-                ending.textfile.ended(ending.exit_code, ending.how)
+            if outcome.textfile is not None:
+                outcome.textfile.ended(outcome.exit_code, outcome.summary)
 
 
-def unread(run: Path | None, target: str) -> None:
-    """Tell the alarm that the command line of a run could not be read."""
+def notify_invalid_command(run: Path | None, target: str) -> None:
+    """Notify the operator that the command line of a run is invalid."""
     text = "the command line could not be read; `flexroad run --help` shows it"
-    _alarm(Outcome(CANNOT_START, text), run or Path(), {}, target)
+    _notify(Outcome(CANNOT_START, text), run or Path(), {}, target)
 
 
 @contextlib.contextmanager
-def _end_as_ctrl_c() -> Iterator[None]:
-    """Let an operator's `kill`, or a terminal that goes away, end it as Ctrl-C does; the first one counts."""
-    before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    heard = False
+def _signals_interrupt() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; ignore further ones."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    interrupted = False
 
     def interrupt(*_: object) -> None:
-        nonlocal heard
-        heard = True
-        for which in before:
-            # The ending takes seconds. Whoever cannot wait would make it longer, and leave workers behind.
-            signal.signal(which, lambda *_: None)
+        nonlocal interrupted
+        interrupted = True
+        for number in before:
+            # Shutdown takes seconds. A second signal would interrupt it and leave workers running.
+            signal.signal(number, lambda *_: None)
         raise KeyboardInterrupt
 
-    for which, handler in before.items():
-        # Who started it in the background or with nohup wants it to go on.
-        if which == signal.SIGTERM or handler is not signal.SIG_IGN:
-            signal.signal(which, interrupt)
+    for number, handler in before.items():
+        # Background processes and nohup ignore SIGINT or SIGHUP: these stay ignored.
+        if number == signal.SIGTERM or handler is not signal.SIG_IGN:
+            signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for which, handler in before.items():
-            # The process is about to end with its exit code; an impatient signal must not give it another.
-            signal.signal(which, signal.SIG_IGN if heard else handler)
+        for number, handler in before.items():
+            # After an interruption a late signal must not change the exit code.
+            signal.signal(number, signal.SIG_IGN if interrupted else handler)
 
 
 def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
@@ -126,28 +129,30 @@ def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> 
         raise ConfigError(f"cannot write --prometheus {path}: {error.strerror or error}") from error
 
 
-def _told_by(error: BaseException) -> tuple[int, str]:
+def _describe(error: BaseException) -> tuple[int, str]:
+    """Return the exit code and the text for an exception."""
     if isinstance(error, CatalogError | ConfigError | OSError):
         return CANNOT_START, f"could not start: {error}"
     return 1, f"{type(error).__name__}: {error}"
 
 
-def _alarm(ending: Outcome, run: Location, before: dict[str, Any], target: str | None) -> None:
-    if not target or not ending.exit_code:
+def _notify(outcome: Outcome, run: Location, before: dict[str, Any], target: str | None) -> None:
+    """Send the outcome to the target if the exit code is not 0."""
+    if not target or not outcome.exit_code:
         return
     from flexroad.pipeline.monitor.alerts import notify
     from flexroad.pipeline.run.summary import read_summary
 
-    now = read_summary(run)
-    told = {
-        # What web addresses of chats show.
-        "text": f"flexroad {run} on {socket.gethostname()}: {ending.text}",
-        # Of an earlier run it would mislead.
-        **(now if now != before else {}),
+    after = read_summary(run)
+    message = {
+        # Chat services show this key.
+        "text": f"flexroad {run} on {socket.gethostname()}: {outcome.text}",
+        # An unchanged summary belongs to an earlier run.
+        **(after if after != before else {}),
         "run": str(run),
         "host": socket.gethostname(),
         "flexroad": importlib.metadata.version("flexroad"),
-        "exit_code": ending.exit_code,
+        "exit_code": outcome.exit_code,
     }
-    if why := notify(target, told):
-        warn(f"--on-failure: {why}")
+    if reason := notify(target, message):
+        warn(f"--on-failure: {reason}")

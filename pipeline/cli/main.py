@@ -1,4 +1,4 @@
-"""``flexroad ...``: the command line. Exit code 0: all done, 1: some tiles failed, 2: nothing could start."""
+"""``flexroad ...``: the command line. Exit code 0: all done, 1: some tiles failed, 2: could not start."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ for command in (train, run, rerun, status, clean, report, tables, figures, query
 
 
 def main() -> None:
-    """Run the command line; what the user did wrong becomes one line and exit code 2."""
+    """Run the command line; a user error is printed as one line, with exit code 2."""
     try:
         app()
     except (CatalogError, ConfigError) as error:
@@ -50,7 +50,7 @@ def main() -> None:
             try:
                 stream.flush()
             except OSError:
-                # A full disk, or a closed pipe: what is still in the buffer would change the exit code.
+                # A full disk or a closed pipe: the flush at exit would fail and change the exit code.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

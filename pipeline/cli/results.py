@@ -1,4 +1,4 @@
-"""``flexroad report``, ``tables``, ``figures``, ``query``: what came of a run."""
+"""``flexroad report``, ``tables``, ``figures`` and ``query``: results of a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def report(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
 ) -> None:
-    """Write RUN/report.<format>: the paper's main table over the run, worst tiles, steps, failures."""
+    """Write RUN/report.<format>: the paper's main table for this run, worst tiles, height steps, failures."""
     from flexroad.catalog.storage.paths import read
     from flexroad.pipeline.report import FORMATS, write_report
     from flexroad.pipeline.run.record import Run
@@ -32,23 +32,23 @@ def tables(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     true: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="The same run classed by the true mask.")
+        Path | None, typer.Option(metavar="RUN", help="The same tiles, run with the true road mask.")
     ] = None,
     dsc3d: Annotated[
         Path | None,
-        typer.Option(metavar="RUN", help="A run for the rows of DSC3D: its scenes, or the stand-in's."),
+        typer.Option(metavar="RUN", help="A run for the rows of DSC3D: of its scenes or of synthetic ones."),
     ] = None,
     dsc3d_true: Annotated[
         Path | None,
-        typer.Option("--dsc3d-true", metavar="RUN", help="The same scenes with the true reference."),
+        typer.Option("--dsc3d-true", metavar="RUN", help="The same scenes, run with the true reference."),
     ] = None,
 ) -> None:
-    """Write the paper's tables and claims with a run's figures beside them: Markdown, LaTeX, CSV, HTML."""
+    """Write the paper's tables and claims next to the values of a run: Markdown, LaTeX, CSV, HTML."""
     from flexroad.pipeline.reproduce.tables import write_comparison
     from flexroad.pipeline.run.record import Run
 
-    others = [Run.open(other) if other else None for other in (true, dsc3d, dsc3d_true)]
-    for written in write_comparison(Run.open(path), others[0], output, *others[1:]):
+    runs = [Run.open(folder) if folder else None for folder in (true, dsc3d, dsc3d_true)]
+    for written in write_comparison(Run.open(path), runs[0], output, *runs[1:]):
         typer.echo(str(written))
 
 
@@ -56,7 +56,7 @@ def figures(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")],
     tile: Annotated[
-        str | None, typer.Option(help="Tile of the maps; default: the one of median road L2.")
+        str | None, typer.Option(help="Tile of the maps; default: the one with the median road L2.")
     ] = None,
 ) -> None:
     """Draw the paper's figures from a run, as PDF and PNG with a page of captions."""
@@ -71,11 +71,15 @@ def figures(
 def query(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     points: Annotated[Path, typer.Option(help="CSV with columns easting and northing (m).")],
-    variant: Annotated[str | None, typer.Option(help="Which surface; default: the exported one.")] = None,
+    variant: Annotated[
+        str | None, typer.Option(help="Variant of the surface; default: the exported one.")
+    ] = None,
 ) -> None:
-    """Tell height, unit normal, tile and class of the ground under points, as CSV."""
+    """Print height, unit normal, tile and class at points, as CSV."""
     from flexroad.pipeline.inspect.points import query_csv
 
-    missed = query_csv(path, points, variant, sys.stdout)
-    if missed:
-        typer.echo(f"note: {missed} points lie on no finished tile; their columns are empty", err=True)
+    outside = query_csv(path, points, variant, sys.stdout)
+    if outside:
+        typer.echo(
+            f"note: {outside} points lie on no finished tile; their columns are empty", err=True
+        )

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from typing import IO, Any
 
 
-class Patient:
-    """A text stream that ignores write errors; all else is the stream's own."""
+class LenientStream:
+    """A text stream that ignores write errors; other attributes are those of the wrapped stream."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -18,22 +18,22 @@ class Patient:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write, unless that fails."""
+        """Write the text; ignore errors."""
         with contextlib.suppress(OSError):
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush, unless that fails."""
+        """Flush the stream; ignore errors."""
         with contextlib.suppress(OSError):
             self._stream.flush()
 
 
 @contextlib.contextmanager
-def patient() -> Iterator[None]:
+def ignore_write_errors() -> Iterator[None]:
     """Ignore write errors of this process's standard output and error, which may be None."""
     with (
-        contextlib.redirect_stdout(sys.stdout and Patient(sys.stdout)),
-        contextlib.redirect_stderr(sys.stderr and Patient(sys.stderr)),
+        contextlib.redirect_stdout(sys.stdout and LenientStream(sys.stdout)),
+        contextlib.redirect_stderr(sys.stderr and LenientStream(sys.stderr)),
     ):
         yield

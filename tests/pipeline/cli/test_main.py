@@ -1,4 +1,4 @@
-"""The command line as a user has it: its output, its exit code."""
+"""Output and exit codes of the command line."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def flexroad(*words, expect: int = 0) -> str:
 
 @pytest.fixture(scope="module")
 def words(made_survey, tmp_path_factory) -> list:
-    """The words of a run of the whole survey, but for where to and by whom."""
+    """The words of a run command over the whole survey, without --out and --executor."""
     config = tmp_path_factory.mktemp("cli") / "quick.yaml"
     config.write_text(
         "fit: {control_points: [12, 12], iterations: 30}\n"
@@ -35,7 +35,7 @@ def words(made_survey, tmp_path_factory) -> list:
 
 @pytest.fixture(scope="module")
 def finished(words, tmp_path_factory) -> Path:
-    """A run of the whole survey, made by the command line."""
+    """A finished run of the whole survey, made by the command line."""
     out = tmp_path_factory.mktemp("cli") / "run"
     said = flexroad(*words, "--out", out, "--executor", "serial")
     assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said
@@ -43,7 +43,7 @@ def finished(words, tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_process_with_workers_of_its_own_makes_the_same_run(words, finished, tmp_path):
+def test_run_with_worker_processes_equals_serial_run(words, finished, tmp_path):
     said = process(*words, "--out", tmp_path / "run", "--workers", 2).expected(0)
     assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
     tables = [read_metrics(run).drop(columns="seconds") for run in (finished, tmp_path / "run")]
@@ -51,7 +51,7 @@ def test_a_process_with_workers_of_its_own_makes_the_same_run(words, finished, t
 
 
 def parsed(*words) -> dict:
-    """The parameters that a command gets of a command line, unchecked."""
+    """The parameters of a command after parsing, unchecked."""
     command = typer.main.get_command(app)
     for name in words[: 2 if words[0] == "catalog" else 1]:
         command = command.commands[name]
@@ -59,7 +59,7 @@ def parsed(*words) -> dict:
     return command.make_context(command.name, rest, resilient_parsing=True).params
 
 
-def test_an_option_takes_several_values():
+def test_parse_repeatable_option_takes_several_values():
     run = parsed("run", "--tile", "a", "b", "--out", "x")
     assert (run["tile"], run["out"]) == (["a", "b"], Path("x"))
     rasters = parsed("catalog", "rasters", "root", "--road-value", "1", "-3", "-o", "c.json")
@@ -69,32 +69,32 @@ def test_an_option_takes_several_values():
 
 
 @pytest.mark.slow
-def test_figures(finished, tmp_path):
+def test_figures_writes_page_and_drawings(finished, tmp_path):
     tile = Catalog.read(finished / "catalog.parquet").tiles[1].id
     said = flexroad("figures", "--tile", tile, finished, "-o", tmp_path)
     assert str(tmp_path / "figures.md") in said
     assert tile in (tmp_path / "figures.md").read_text()
-    # A run without the ablation has these, and says what it lacks.
+    # A run without the variants of the ablation has only these figures.
     drawn = ["dataset.pdf", "error_and_smoothness.pdf", "road_profile.pdf"]
     assert sorted(path.name for path in tmp_path.glob("*.pdf")) == drawn
     assert "no tile '0_0'" in flexroad("figures", finished, "--tile", "0_0", "-o", tmp_path, expect=2)
 
 
-def test_status(finished):
-    found = json.loads(flexroad("status", finished, "--json"))
-    counts = {key: found[key] for key in ("tiles", "done", "failed", "cached", "pending")}
+def test_status_of_finished_run_counts_tiles(finished):
+    values = json.loads(flexroad("status", finished, "--json"))
+    counts = {key: values[key] for key in ("tiles", "done", "failed", "cached", "pending")}
     assert counts == {"tiles": 4, "done": 4, "failed": 0, "cached": 0, "pending": 0}
-    assert found["failures"] == []
+    assert values["failures"] == []
     assert "4 tiles: 4 done" in flexroad("status", finished)
 
 
-def test_rerun_says_that_nothing_changed(finished):
+def test_rerun_unchanged_is_cached_and_noted(finished):
     said = flexroad("rerun", finished, "--executor", "serial")
     assert "4 done (4 cached)" in said
     assert "nothing had changed" in said
 
 
-def test_query(finished, made_survey, tmp_path):
+def test_query_writes_csv_with_heights(finished, made_survey, tmp_path):
     catalog = Catalog.read(made_survey / "catalog.parquet")
     grid = catalog.tiles[0].grid
     points = tmp_path / "points.csv"
@@ -114,18 +114,18 @@ def test_query(finished, made_survey, tmp_path):
     assert np.isnan(outside.height_m)
     assert pd.isna(outside.tile)
     assert "needs easting and northing" in flexroad(
-        "query", finished, "--points", _headless(tmp_path), expect=2
+        "query", finished, "--points", _without_columns(tmp_path), expect=2
     )
     assert "has no variant 'x'" in flexroad("query", finished, "--points", points, "--variant", "x", expect=2)
 
 
-def _headless(folder: Path) -> Path:
-    path = folder / "headless.csv"
+def _without_columns(folder: Path) -> Path:
+    path = folder / "no_columns.csv"
     path.write_text("x,y\n1,2\n")
     return path
 
 
-def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
+def test_ground_at_rgt_equals_dsm(finished, made_survey):
     import rasterio
 
     from flexroad.pipeline.inspect.points import Ground
@@ -138,7 +138,7 @@ def test_python_agrees_with_the_sources_of_rgt(finished, made_survey):
 
 
 @pytest.mark.parametrize("form", ["md", "csv", pytest.param("html", marks=pytest.mark.slow)])
-def test_report(finished, form):
+def test_report_writes_every_format(finished, form):
     said = flexroad("report", finished, "--format", form)
     text = (finished / f"report.{form}").read_text()
     if form != "html":
@@ -152,7 +152,7 @@ def test_report(finished, form):
         assert "http" not in text.split("<body>")[1].split("Configuration")[0]
 
 
-def test_dry_run_shows_the_graph_and_writes_nothing(made_survey, tmp_path):
+def test_run_dry_run_prints_graph_and_writes_nothing(made_survey, tmp_path):
     said = flexroad(
         "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
         "--dry-run",
@@ -163,7 +163,7 @@ def test_dry_run_shows_the_graph_and_writes_nothing(made_survey, tmp_path):
     assert "(plane, rgt, flexroad)" in said
 
 
-def test_only_the_tiles_asked_for(made_survey, tmp_path):
+def test_run_with_tile_or_bbox_selects_tiles(made_survey, tmp_path):
     catalog = Catalog.read(made_survey / "catalog.parquet")
     one, two = catalog.tiles[0], catalog.tiles[3]
     said = flexroad(
@@ -183,7 +183,7 @@ def test_only_the_tiles_asked_for(made_survey, tmp_path):
     assert one.id not in said
 
 
-def test_asking_for_a_tile_keeps_the_others_of_the_run(survey, tmp_path):
+def test_run_with_tile_keeps_other_tiles_of_the_run(survey, tmp_path):
     catalog = Catalog.read(survey)
     config = tmp_path / "c.yaml"
     config.write_text("fit: {control_points: [12, 12], iterations: 5}\n")
@@ -206,7 +206,7 @@ def test_asking_for_a_tile_keeps_the_others_of_the_run(survey, tmp_path):
     assert "4 tiles: 4 done (2 cached)" in flexroad(*words)
 
 
-def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
+def test_run_with_failed_tile_exits_with_1(survey, tmp_path):
     catalog = Catalog.read(survey)
     tile = catalog.tiles[2]
     path = tile.paths(tile.layer("dtm"))[0]
@@ -244,7 +244,7 @@ def test_a_failed_tile_makes_exit_code_1(survey, tmp_path):
         (["config", "show", "nope"], "no configuration 'nope'"),
     ],
 )
-def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_survey, tmp_path, monkeypatch):
+def test_command_that_cannot_start_exits_with_2(words, message, made_survey, tmp_path, monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
     (tmp_path / "file").write_text("")
     places = {
@@ -258,21 +258,21 @@ def test_what_cannot_start_is_one_line_and_exit_code_2(words, message, made_surv
     assert "Traceback" not in said
 
 
-def test_a_process_that_cannot_start_ends_in_one_line_and_exit_code_2():
+def test_process_that_cannot_start_prints_one_line_and_exits_with_2():
     said = process("config", "show", "papr").expected(2)
     assert said.out == ""
     (line,) = said.err.splitlines()
     assert "did you mean paper?" in line
 
 
-def test_config_commands():
+def test_config_commands_print_options():
     assert "paper" in flexroad("config", "show")
     assert "theta_z_m: 0.5" in flexroad("config", "show", "paper")
     assert "theta_z_m: 0.5" in flexroad("config", "template")
     assert "theta_z_m" in json.dumps(json.loads(flexroad("config", "schema"))["properties"]["ecsrc"])
 
 
-def test_catalog_show(made_survey):
+def test_catalog_show_lists_layers_and_count(made_survey):
     said = flexroad("catalog", "show", made_survey / "catalog.parquet")
     assert said.splitlines()[-1] == "4 tiles, EPSG:25832"
     assert "dsm(1) dtm(1) road_mask(1) reference(1) reference_road(1)" in said

@@ -1,4 +1,4 @@
-"""Runs as an operator has them: the same command every night, who hears of what went wrong, tidying up."""
+"""Nightly operation: repeated runs, notifications of failures, clean."""
 
 import json
 import os
@@ -20,7 +20,7 @@ QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}
 
 @pytest.fixture
 def flexroad(monkeypatch, capfd):
-    """Run a command line; return what it wrote to both outputs, its exit code checked."""
+    """Run a command line; check its exit code, return standard output and standard error."""
 
     def call(*words, expect: int = 0) -> str:
         monkeypatch.setattr(sys, "argv", ["flexroad", *map(str, words)])
@@ -28,8 +28,8 @@ def flexroad(monkeypatch, capfd):
         try:
             with same_signals():
                 main()
-        except SystemExit as ended:
-            code = ended.code or 0
+        except SystemExit as exit_:
+            code = exit_.code or 0
         out, err = capfd.readouterr()
         assert code == expect, out + err
         return out + err
@@ -39,7 +39,7 @@ def flexroad(monkeypatch, capfd):
 
 @pytest.fixture
 def nightly(survey, tmp_path) -> list:
-    """The words of a run of four tiles of one's own, in RUN = tmp_path / "run"."""
+    """The words of a run command over the four tiles of `survey`; RUN is tmp_path / "run"."""
     config = tmp_path / "quick.yaml"
     config.write_text(QUICK)
     return ["run", "--config", config, "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial"]
@@ -47,22 +47,22 @@ def nightly(survey, tmp_path) -> list:
 
 @pytest.fixture
 def alarm(tmp_path):
-    """An alarm that writes down what it is told, and what that was."""
+    """A notification command that stores what it receives; ``received`` returns and removes it."""
 
     class Alarm:
-        words = ("--on-failure", f"cat > {tmp_path}/told.json")
+        words = ("--on-failure", f"cat > {tmp_path}/received.json")
 
         @property
-        def told(self):
-            path = tmp_path / "told.json"
-            found = json.loads(path.read_text()) if path.exists() else None
+        def received(self):
+            path = tmp_path / "received.json"
+            summary = json.loads(path.read_text()) if path.exists() else None
             path.unlink(missing_ok=True)
-            return found
+            return summary
 
     return Alarm()
 
 
-def test_every_night_tells_what_is_new_changed_and_vanished(flexroad, nightly, survey, alarm, tmp_path):
+def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, alarm, tmp_path):
     whole = Catalog.read(survey)
     Catalog(whole.tiles[:3]).write(survey)
     said = flexroad(*nightly, *alarm.words)
@@ -73,27 +73,27 @@ def test_every_night_tells_what_is_new_changed_and_vanished(flexroad, nightly, s
     assert "3 tiles: 3 done (1 cached), 0 failed, 0 pending; 1 new, 1 changed, 1 vanished; " in said
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["exit_code"], summary["new"], summary["cached"]) == (0, 1, 1)
-    # Of the same size, but not the bytes that its marker vouches for.
+    # Same size, but not the checksum in item.json.
     product = next((tmp_path / "run" / "tiles" / whole.tiles[2].id).glob("*.glb"))
     data = bytearray(product.read_bytes())
     data[-1] ^= 1
     product.write_bytes(data)
     assert "3 done (3 cached)" in flexroad(*nightly)
     assert "3 done (2 cached)" in flexroad(*nightly, "--verify")
-    assert alarm.told is None
+    assert alarm.received is None
     states = json.loads((tmp_path / "run" / "tiles.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["cached", "done", "cached"]
 
 
-def test_a_failed_tile_rings_the_alarm_and_is_on_the_map(flexroad, nightly, survey, alarm, tmp_path):
+def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(flexroad, nightly, survey, alarm, tmp_path):
     tiles = Catalog.read(survey).tiles[:2]
     Catalog(tiles).write(survey)
     tiles[1].paths(tiles[1].layer("dtm"))[0].unlink()
     flexroad(*nightly, *alarm.words, "--prometheus", tmp_path / "run.prom", expect=1)
-    told = alarm.told
-    assert (told["exit_code"], told["failed"], told["interrupted"]) == (1, 1, False)
-    assert told["failures"][0]["tile_id"] == tiles[1].id
-    assert "2 tiles: 1 done (0 cached), 1 failed" in told["text"]
+    received = alarm.received
+    assert (received["exit_code"], received["failed"], received["interrupted"]) == (1, 1, False)
+    assert received["failures"][0]["tile_id"] == tiles[1].id
+    assert "2 tiles: 1 done (0 cached), 1 failed" in received["text"]
     flexroad("status", tmp_path / "run", "--geojson", tmp_path / "map.geojson")
     states = json.loads((tmp_path / "map.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["done", "failed"]
@@ -102,41 +102,39 @@ def test_a_failed_tile_rings_the_alarm_and_is_on_the_map(flexroad, nightly, surv
     assert (values["flexroad_run_exit_code"], values["flexroad_run_running"]) == (1, 0)
 
 
-def test_the_alarm_rings_when_nothing_could_start(flexroad, nightly, alarm, tmp_path, monkeypatch):
+def test_run_that_cannot_start_notifies(flexroad, nightly, alarm, tmp_path, monkeypatch):
     said = flexroad(*nightly, *alarm.words, "--executor", "x", expect=2)
-    told = alarm.told
-    assert told["exit_code"] == 2
-    assert "could not start: --executor x: there are dask and serial" in told["text"]
+    received = alarm.received
+    assert received["exit_code"] == 2
+    assert "could not start: --executor x: there are dask and serial" in received["text"]
     assert "dask and serial" in said
-    # A run before this one tells nothing of it.
-    assert "tiles" not in told
+    # There is no summary of this run.
+    assert "tiles" not in received
     with run_lock(tmp_path / "run"):
         flexroad(*nightly, *alarm.words, expect=2)
-    assert f"is in use by pid {os.getpid()}" in alarm.told["text"]
+    assert f"is in use by pid {os.getpid()}" in alarm.received["text"]
     flexroad(*nightly, "--wrokers", 2, *alarm.words, expect=2)
-    assert "the command line could not be read" in alarm.told["text"]
+    assert "the command line could not be read" in alarm.received["text"]
     monkeypatch.setenv("FLEXROAD_ON_FAILURE", alarm.words[1])
     flexroad("rerun", tmp_path / "nowhere", expect=2)
-    assert "is no run" in alarm.told["text"]
+    assert "is no run" in alarm.received["text"]
     flexroad("status", tmp_path / "nowhere", "--wach", expect=2)
-    assert alarm.told is None
+    assert alarm.received is None
 
 
-def test_an_interruption_rings_the_alarm_and_a_broken_alarm_changes_nothing(
-    flexroad, nightly, alarm, monkeypatch
-):
+def test_run_interrupted_notifies_and_failed_notification_only_warns(flexroad, nightly, alarm, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("flexroad.pipeline.run.runner.run_tiles", interrupted)
     said = flexroad(*nightly, *alarm.words, expect=130)
     assert "interrupted; the same command goes on from here" in said
-    assert alarm.told["exit_code"] == 130
+    assert alarm.received["exit_code"] == 130
     said = flexroad(*nightly, "--on-failure", "exit 9", expect=130)
     assert "warning: --on-failure: `exit 9` ended with exit code 9" in said
 
 
-def test_a_catalog_names_only_what_is_allowed_and_rerun_remembers(flexroad, nightly, survey, tmp_path):
+def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey, tmp_path):
     tile = Catalog.read(survey).tiles[0]
     (tmp_path / "dtm").mkdir()
     shutil.move(tile.paths(tile.layer("dtm"))[0], tmp_path / "dtm" / "a.tif")
@@ -153,26 +151,26 @@ def test_a_catalog_names_only_what_is_allowed_and_rerun_remembers(flexroad, nigh
     assert option in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
 
 
-def test_clean_names_what_it_would_drop_then_drops_it(flexroad, nightly, survey, tmp_path):
+def test_clean_dry_run_lists_files_that_clean_deletes(flexroad, nightly, survey, tmp_path):
     tiles = Catalog.read(survey).tiles
     Catalog(tiles[:2]).write(survey)
     flexroad(*nightly)
     Catalog(tiles[:1]).write(survey)
     flexroad(*nightly)
     said = flexroad("clean", tmp_path / "run", "--dry-run")
-    *named, artefacts, files, total = said.splitlines()
+    *paths, artefacts, files, total = said.splitlines()
     assert artefacts.startswith("artefacts that no run needs: ")
     assert files.startswith("files of tiles that the catalog no longer has: ")
-    assert total.startswith(f"would free {len(named)} files, ")
-    assert all(Path(name).exists() for name in named)
-    assert f"freed {len(named)} files, " in flexroad("clean", tmp_path / "run")
-    assert not any(Path(name).exists() for name in named)
+    assert total.startswith(f"would free {len(paths)} files, ")
+    assert all(Path(path).exists() for path in paths)
+    assert f"freed {len(paths)} files, " in flexroad("clean", tmp_path / "run")
+    assert not any(Path(path).exists() for path in paths)
     assert flexroad("clean", tmp_path / "run") == "freed 0 files, 0.0 MB\n"
     assert "no run of the store" in flexroad("clean", tmp_path / "run", "--forget", "x", expect=2)
     assert "1 done (1 cached)" in flexroad(*nightly)
 
 
-def test_status_tells_who_is_at_work(flexroad, nightly, survey, tmp_path):
+def test_status_of_locked_run_shows_owner(flexroad, nightly, survey, tmp_path):
     Catalog(Catalog.read(survey).tiles[:1]).write(survey)
     flexroad(*nightly)
     assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"] is None
