@@ -1,6 +1,6 @@
-"""Faults of a night: afterwards the same command gives what a run gives that nothing happens to.
+"""Faults during a run: afterwards the same command gives the results of an undisturbed run.
 
-The faults that belong to one part are tested beside that part; `docs/operations.md` lists them all.
+Faults of a single module are tested in that module's tests; `docs/operations.md` lists all of them.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ def config(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(made_survey, config, tmp_path_factory) -> Path:
-    """A run that nothing happened to; not to be touched."""
+    """A finished run without faults; tests must not change it."""
     catalog = Catalog.read(made_survey / "catalog.parquet")
     run = Run.create(tmp_path_factory.mktemp("undisturbed") / "run", load_config(config), catalog)
     run_tiles(run, SerialExecutor())
@@ -68,13 +68,13 @@ def out(tmp_path) -> Path:
 
 @pytest.fixture
 def finished(undisturbed, out) -> Path:
-    """A finished run of one's own, to spoil."""
+    """A copy of the finished run, for tests to damage."""
     return shutil.copytree(undisturbed, out)
 
 
 @pytest.fixture
 def night(flexroad, config, made_survey, out):
-    """The command of every night."""
+    """The run command that is repeated every night."""
 
     def call(*more, catalog=made_survey / "catalog.parquet"):
         words = ["--config", config, "--catalog", catalog, "--out", out, "--executor", "serial"]
@@ -88,7 +88,7 @@ def rows(out: Path) -> pd.DataFrame:
 
 
 def products(out: Path) -> dict[str, bytes]:
-    """The files of all tiles but their markers, which tell the time."""
+    """The contents of all tile files except the markers, which contain times."""
     return {
         path.relative_to(out).as_posix(): path.read_bytes()
         for path in out.glob("tiles/*/*")
@@ -97,13 +97,13 @@ def products(out: Path) -> dict[str, bytes]:
 
 
 def times(out: Path) -> dict[str, int]:
-    """When each product, marker and artefact was written."""
+    """Modification time of each product, marker and artefact (ns)."""
     paths = (path for part in ("tiles", "store") for path in (out / part).rglob("*") if path.is_file())
     return {path.relative_to(out).as_posix(): path.stat().st_mtime_ns for path in paths}
 
 
 def assert_whole(out: Path, undisturbed: Path) -> None:
-    """The run is as if nothing had happened, and tidy."""
+    """The run equals the undisturbed one, without temporary files or a lock."""
     pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
     assert products(out) == products(undisturbed)
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
@@ -112,13 +112,13 @@ def assert_whole(out: Path, undisturbed: Path) -> None:
 
 
 def computed(out: Path, since: int = 0) -> Counter[str]:
-    """How many nodes of each stage the log says were computed, from some event on."""
+    """Number of computed nodes by stage in the log, from event number ``since`` on."""
     events = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()][since:]
-    found = Counter[str]()
+    counts = Counter[str]()
     for event in events:
         if event["event"] == "stage":
-            found[event["stage"]] += event["computed"]
-    return +found
+            counts[event["stage"]] += event["computed"]
+    return +counts
 
 
 def events(out: Path) -> int:
@@ -127,13 +127,13 @@ def events(out: Path) -> int:
 
 @pytest.fixture
 def before_tile(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
-    """Make something happen in mid-run, before the n-th tile that is done."""
+    """Call a function during the run, before the n-th computed tile."""
 
-    def arrange(n: int, happen: Callable[[], object]) -> None:
+    def arrange(n: int, action: Callable[[], object]) -> None:
         def map_(self, function, jobs, lost, probe=None):
             for i, job in enumerate(jobs):
                 if i == n:
-                    happen()
+                    action()
                 yield function(job)
 
         monkeypatch.setattr(SerialExecutor, "map", map_)
@@ -144,29 +144,29 @@ def before_tile(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
 # --- processes ----------------------------------------------------------------------------------------
 
 
-def test_a_scheduler_that_is_killed(
+def test_run_scheduler_killed_keeps_done_tiles(
     processes, config, made_survey, flexroad, night, monkeypatch, undisturbed, out
 ):
-    """The run ends with what is done, in one line; the next goes on from there, here without a cluster."""
+    """The run ends with one error line; the next one, without a cluster, computes the other tiles."""
     scheduler = processes.scheduler()
     processes.worker()
     wait_for(processes.address, 1)
-    noted = EventLog.tile
+    log_tile = EventLog.tile
 
     def kill(self, result) -> None:
-        noted(self, result)
+        log_tile(self, result)
         scheduler.kill()
 
     monkeypatch.setattr(EventLog, "tile", kill)
     words = ["--config", config, "--catalog", made_survey / "catalog.parquet", "--out", out]
     said = flexroad("run", *words, "--scheduler", processes.address)
     assert said.code == 1
-    there = f"the Dask scheduler at {processes.address}"
-    assert said.errors == [f"error: {there} is gone; the same command goes on from here"]
-    told = json.loads((out / "summary.json").read_text())
-    assert told["exit_code"] == 1
-    assert 1 <= told["done"] < 4
-    assert rows(out).tile_id.nunique() == told["done"]
+    name = f"the Dask scheduler at {processes.address}"
+    assert said.errors == [f"error: {name} is gone; the same command goes on from here"]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["exit_code"] == 1
+    assert 1 <= summary["done"] < 4
+    assert rows(out).tile_id.nunique() == summary["done"]
     before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
     processes.end()
     assert night().code == 0
@@ -174,7 +174,7 @@ def test_a_scheduler_that_is_killed(
     assert all(path.stat().st_mtime_ns == written for path, written in before.items())
 
 
-def test_workers_that_cannot_be_started_are_said_in_one_line(config, made_survey, night, undisturbed, out):
+def test_run_workers_cannot_start_exits_with_one_line(config, made_survey, night, undisturbed, out):
     call = [
         sys.executable,
         "-c",
@@ -208,7 +208,7 @@ def _cut(path: Path) -> None:
 
 DAMAGES = {
     "gone": Path.unlink,
-    # A power failure leaves names without bytes.
+    # A power failure can leave empty files.
     "empty": lambda path: path.write_bytes(b""),
     "cut off": _cut,
     "flipped": _flip,
@@ -216,30 +216,30 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_whatever_files_of_a_run_are_damaged(seed, finished, undisturbed, night):
-    """A third of all files, each in some way; what is sound stays as it is."""
+def test_run_any_files_damaged_recomputes_only_those(seed, finished, undisturbed, night):
+    """A third of all files are damaged in random ways; undamaged files are not written again."""
     random_ = random.Random(seed)
     damaged = set()
     for path in sorted(path for path in finished.rglob("*") if path.is_file()):
         name = path.relative_to(finished).as_posix()
-        # A flipped bit is told by a checksum; markers and the run's own small files have none.
-        summed = name.startswith(("store/", "tiles/")) and path.suffix != ".json"
-        how = random_.choice([how for how in DAMAGES if summed or how != "flipped"])
+        # Only files with checksums can reveal a flipped bit; markers and small files of the run have none.
+        has_checksum = name.startswith(("store/", "tiles/")) and path.suffix != ".json"
+        damage = random_.choice([kind for kind in DAMAGES if has_checksum or kind != "flipped"])
         if random_.random() < 1 / 3:
-            DAMAGES[how](path)
+            DAMAGES[damage](path)
             damaged.add(name)
     before = times(finished)
     said = night("--verify")
     assert said.code == 0, said
     assert_whole(finished, undisturbed)
-    spoilt = {name.split("/")[1] for name in damaged if name.startswith("tiles/")}
+    damaged_tiles = {name.split("/")[1] for name in damaged if name.startswith("tiles/")}
     after = times(finished)
     for name, written in before.items():
-        kept = name.split("/")[1] not in spoilt if name.startswith("tiles/") else name not in damaged
-        assert not kept or after[name] == written, f"{name} was made again"
+        kept = name.split("/")[1] not in damaged_tiles if name.startswith("tiles/") else name not in damaged
+        assert not kept or after[name] == written, f"{name} was written again"
 
 
-def test_an_empty_configuration_is_not_taken_for_the_default(finished, undisturbed, night, flexroad):
+def test_rerun_empty_configuration_raises(finished, undisturbed, night, flexroad):
     (finished / "config.yaml").write_bytes(b"")
     said = flexroad("rerun", finished, "--executor", "serial")
     assert said.code == 2
@@ -248,20 +248,20 @@ def test_an_empty_configuration_is_not_taken_for_the_default(finished, undisturb
     assert_whole(finished, undisturbed)
 
 
-def test_a_lost_record_leaves_meshes_where_they_are(night, made_survey, config, out, tmp_path):
-    """Though a catalog that grew would place them otherwise."""
+def test_run_record_lost_keeps_mesh_origin(night, made_survey, config, out, tmp_path):
+    """Although a new run over the larger catalog would have another origin."""
     tiles = Catalog.read(made_survey / "catalog.parquet").tiles
     east = tuple(tile for tile in tiles if tile.grid.west > tiles[0].grid.west)
     run = Run.create(out, load_config(config), Catalog(east))
     run_tiles(run, SerialExecutor())
     (out / "run.json").unlink()
     assert night().code == 0
-    found = Run.open(out)
-    assert found.origin == run.origin
-    assert found.origin != Run.create(tmp_path / "new", run.config, Catalog(tiles)).origin
+    opened = Run.open(out)
+    assert opened.origin == run.origin
+    assert opened.origin != Run.create(tmp_path / "new", run.config, Catalog(tiles)).origin
 
 
-def test_a_tile_folder_deleted_by_hand_costs_its_export(finished, undisturbed, night):
+def test_run_tile_folder_deleted_repeats_only_export(finished, undisturbed, night):
     shutil.rmtree(min((finished / "tiles").iterdir()))
     since = events(finished)
     assert "4 done (3 cached)" in night().out
@@ -269,7 +269,7 @@ def test_a_tile_folder_deleted_by_hand_costs_its_export(finished, undisturbed, n
     assert_whole(finished, undisturbed)
 
 
-def test_a_run_that_was_moved_goes_on_where_it_is(finished, undisturbed, night, flexroad, tmp_path):
+def test_rerun_moved_run_is_cached(finished, undisturbed, night, flexroad, tmp_path):
     elsewhere = finished.rename(tmp_path / "elsewhere")
     assert "nothing had changed" in flexroad("rerun", elsewhere, "--executor", "serial").out
     assert_whole(elsewhere, undisturbed)
@@ -281,7 +281,7 @@ def test_a_run_that_was_moved_goes_on_where_it_is(finished, undisturbed, night, 
 
 @contextlib.contextmanager
 def no_file_above(size: int) -> Iterator[None]:
-    """Let every write fail in its middle that would make a file larger, as if the disk were full."""
+    """Let writes beyond this file size (bytes) fail, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -291,36 +291,36 @@ def no_file_above(size: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def obeying() -> Iterator[None]:
-    """Let permissions count in this thread, also for root, by giving up what lets root ignore them."""
+def permissions_enforced() -> Iterator[None]:
+    """Enforce file permissions in this thread, also for root, by dropping capabilities."""
     libc = ctypes.CDLL(None, use_errno=True)
-    header, had = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
-    assert libc.capget(header, had) == 0
-    fewer = (ctypes.c_uint32 * 6)(*had)
-    # The effective ones of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
+    header, before = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, before) == 0
+    fewer = (ctypes.c_uint32 * 6)(*before)
+    # The effective bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
     fewer[0] &= ~0b110
     assert libc.capset(header, fewer) == 0
     try:
         yield
     finally:
-        assert libc.capset(header, had) == 0
+        assert libc.capset(header, before) == 0
 
 
 @pytest.mark.parametrize(
-    ("size", "told"),
+    ("size", "message"),
     [
         pytest.param(30_000, "database.sqlite", id="products and the database"),
         pytest.param(40_000, "3 failed", id="products"),
     ],
 )
-def test_a_disk_that_is_full_in_the_middle_of_a_write(
-    size, told, flexroad, night, undisturbed, config, made_survey, out
+def test_run_disk_full_during_write_leaves_no_half_file(
+    size, message, flexroad, night, undisturbed, config, made_survey, out
 ):
     Run.create(out, load_config(config), Catalog.read(made_survey / "catalog.parquet"))
     with no_file_above(size):
         said = flexroad("rerun", out, "--executor", "serial")
     assert said.code == 1
-    assert told in said.out + said.err
+    assert message in said.out + said.err
     failed = [line for line in said.errors if "File too large" in line]
     assert failed
     assert all(str(out) in line for line in failed)
@@ -335,10 +335,10 @@ def test_a_disk_that_is_full_in_the_middle_of_a_write(
     assert all(after[name] == before[name] for name in kept)
 
 
-def test_a_store_that_may_not_be_written_is_refused_before_anything(night, out, undisturbed, tmp_path):
+def test_run_store_read_only_exits_before_any_tile(night, out, undisturbed, tmp_path):
     store = tmp_path / "store"
     store.mkdir(mode=0o555)
-    with obeying():
+    with permissions_enforced():
         said = night("--store", store)
     assert said.code == 2
     (line,) = said.errors
@@ -352,16 +352,16 @@ def test_a_store_that_may_not_be_written_is_refused_before_anything(night, out, 
 
 
 @pytest.mark.parametrize("part", ["store", ".", "tiles"])
-def test_what_becomes_unwritable_in_the_middle(part, night, before_tile, undisturbed, out):
+def test_run_folder_read_only_midway_keeps_done_tiles(part, night, before_tile, undisturbed, out):
     folders: list[Path] = []
 
-    def shut() -> None:
+    def make_read_only() -> None:
         folders.extend([out / part, *(path for path in (out / part).rglob("*") if path.is_dir())])
         for folder in folders:
             folder.chmod(0o555)
 
-    before_tile(2, shut)
-    with obeying():
+    before_tile(2, make_read_only)
+    with permissions_enforced():
         said = night()
     for folder in folders:
         folder.chmod(0o755)
@@ -369,9 +369,9 @@ def test_what_becomes_unwritable_in_the_middle(part, night, before_tile, undistu
     assert said.errors
     assert all(str(out) in line for line in said.errors)
     if (out / "lock.json").exists():
-        # It could not be removed; by the next night this process would be gone.
-        gone = replace(Owner.me(), pid=2**22 + 1)
-        (out / "lock.json").write_bytes(gone.data)
+        # The lock could not be removed; in operation its process would have ended by the next night.
+        ended = replace(Owner.me(), pid=2**22 + 1)
+        (out / "lock.json").write_bytes(ended.data)
     before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/*/item.json")}
     assert len(before) == 2
     before_tile(9, folders.clear)
@@ -380,17 +380,17 @@ def test_what_becomes_unwritable_in_the_middle(part, night, before_tile, undistu
     assert all(path.stat().st_mtime_ns == written for path, written in before.items())
 
 
-def test_a_log_that_cannot_be_written_stops_nothing(night, undisturbed, out):
+def test_run_log_not_writable_completes(night, undisturbed, out):
     out.mkdir()
-    # Takes nothing, as a full disk does.
+    # /dev/full rejects every write, as a full disk does.
     (out / "log.jsonl").symlink_to("/dev/full")
     assert night().code == 0
     assert_whole(out, undisturbed)
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
-def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, night, out, undisturbed):
-    """As when the disk of cron's log is full; one tile fails, and that is said at once."""
+def test_run_output_not_writable_completes(stream, survey, config, night, out, undisturbed):
+    """The disk of cron's log is full, and one tile fails, which is printed at once."""
     tile = Catalog.read(survey).tiles[0]
     (file,) = tile.paths(tile.layer("dsm"))
     whole = file.with_suffix(".whole")
@@ -416,7 +416,7 @@ def test_words_that_nobody_can_hear_stop_nothing(stream, survey, config, night, 
     assert_whole(out, undisturbed)
 
 
-def test_a_lock_is_given_back_on_a_full_disk(monkeypatch, tmp_path):
+def test_run_lock_on_full_disk_is_released(monkeypatch, tmp_path):
     def full(**_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -425,8 +425,8 @@ def test_a_lock_is_given_back_on_a_full_disk(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
-    """Numba refuses to be imported where it can keep nothing."""
+def test_import_read_only_installation_without_home(tmp_path):
+    """Numba raises on import if it has no writable cache folder; FlexRoad sets one."""
     root = Path(__file__).parents[3]
     for name in ("catalog", "tasks", "pipeline"):
         shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -434,7 +434,7 @@ def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
         root / "flexroad", tmp_path / "flexroad", symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
     )
     for folder in (tmp_path / "tasks", tmp_path / "tasks" / "fit"):
-        # Not to be written by root, either.
+        # A file in place of the folder: root cannot write there, either.
         (folder / "__pycache__").touch()
     code = "import os, flexroad.pipeline, flexroad.tasks.fit.nurbs; print(os.environ['NUMBA_CACHE_DIR'])"
     elsewhere = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
@@ -449,32 +449,32 @@ def test_an_installation_of_roots_and_a_user_without_a_home(tmp_path):
 # --- clocks -------------------------------------------------------------------------------------------
 
 
-def test_a_clock_set_back_in_mid_run(night, before_tile, monkeypatch, undisturbed, out):
-    """What is written later has earlier times; the next night finds nothing to do all the same."""
+def test_run_clock_set_back_midway_is_cached_next_time(night, before_tile, monkeypatch, undisturbed, out):
+    """Files written later have earlier times; the next run still has nothing to do."""
     write, now = paths.write, time.time
 
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
         frozen = "2001-01-01T00:00:00.000+00:00"
         for module in ("worker.profiling", "worker.tile", "run.event_log", "run.runner"):
-            monkeypatch.setattr(f"flexroad.pipeline.{module}.utc_now", lambda: frozen)
-        monkeypatch.setattr(paths, "write", write_then)
+            monkeypatch.setattr(f"flexroad.pipeline.{module}.now", lambda: "2001-01-01T00:00:00.000+00:00")
+        monkeypatch.setattr(paths, "write", write_with_old_time)
 
-    def write_then(where, data) -> None:
-        write(where, data)
-        os.utime(where, (now() - 5 * DAY_S,) * 2)
+    def write_with_old_time(location, data) -> None:
+        write(location, data)
+        os.utime(location, (now() - 5 * DAY_S,) * 2)
 
     before_tile(2, set_back)
     assert night().code == 0
     assert sum(path.stat().st_mtime < now() - DAY_S for path in out.glob("tiles/*/item.json")) == 2
-    told = json.loads((out / "summary.json").read_text())
-    assert told["end"] < told["start"]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["end"] < summary["start"]
     assert_whole(out, undisturbed)
     assert "4 done (4 cached)" in night().out
 
 
-def test_a_clock_set_back_between_nights(survey, night, undisturbed, out):
-    """Sources and results are of the future; a source that changes now is older than both."""
+def test_run_clock_set_back_between_runs_detects_change(survey, night, undisturbed, out):
+    """Sources and results have times in the future; a source that changes now is older than both."""
     for path in survey.parent.rglob("*"):
         os.utime(path, (time.time() + 10 * DAY_S,) * 2)
     assert night(catalog=survey).code == 0
@@ -497,7 +497,7 @@ def test_a_clock_set_back_between_nights(survey, night, undisturbed, out):
 # --- others -------------------------------------------------------------------------------------------
 
 
-def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, undisturbed):
+def test_run_in_locked_folder_exits_and_changes_nothing(finished, night, flexroad, undisturbed):
     me = Owner.me()
     with run_lock(finished):
         before = paths.listing(finished)
@@ -514,34 +514,35 @@ def test_a_second_run_of_one_folder_touches_nothing(finished, night, flexroad, u
     assert_whole(finished, undisturbed)
 
 
-def test_a_catalog_that_points_elsewhere(night, flexroad, made_survey, undisturbed, out, tmp_path):
-    there = Catalog.read(made_survey / "catalog.parquet")
-    listed = tmp_path / "elsewhere" / "catalog.json"
-    listed.parent.mkdir()
-    there.write(listed, movable=False)
-    said = night(catalog=listed)
+def test_run_catalog_with_files_outside_needs_allow(night, flexroad, made_survey, undisturbed, out, tmp_path):
+    original = Catalog.read(made_survey / "catalog.parquet")
+    moved = tmp_path / "elsewhere" / "catalog.json"
+    moved.parent.mkdir()
+    original.write(moved, movable=False)
+    said = night(catalog=moved)
     assert said.code == 2
     (line,) = said.errors
-    assert f"tile {there.tiles[0].id}: dsm names {made_survey}/dsm/" in line
+    assert f"tile {original.tiles[0].id}: dsm names {made_survey}/dsm/" in line
     assert not out.exists()
     option = line.partition("add ")[2].split()
     assert option == ["--allow", f"{made_survey}/dsm"]
-    assert night("--allow", made_survey, catalog=listed).code == 0
+    assert night("--allow", made_survey, catalog=moved).code == 0
     pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
     assert "4 cached" in flexroad("rerun", out, "--executor", "serial").out
-    # Somebody else's hand in the run's own catalog.
-    tile = there.tiles[0]
-    wicked = tuple(replace(one, files=("/etc/passwd",)) if one.name == "dsm" else one for one in tile.layers)
-    Catalog((replace(tile, layers=wicked), *there.tiles[1:])).write(out / "catalog.parquet", movable=False)
+    # The run's own catalog was changed.
+    tile = original.tiles[0]
+    layers = tuple(
+        replace(layer, files=("/etc/passwd",)) if layer.name == "dsm" else layer for layer in tile.layers
+    )
+    Catalog((replace(tile, layers=layers), *original.tiles[1:])).write(out / "catalog.parquet", movable=False)
     said = flexroad("rerun", out, "--executor", "serial")
     assert said.code == 2
     assert "dsm names /etc/passwd" in said.errors[0]
 
 
-def test_a_catalog_that_points_to_a_url(night, made_survey, out, tmp_path):
-    there = Catalog.read(made_survey / "catalog.parquet")
-    tile, url = there.tiles[0], "https://example.org/dsm.tif"
-    layers = tuple(replace(one, files=(url,)) if one.name == "dsm" else one for one in tile.layers)
+def test_run_catalog_with_url_exits(night, made_survey, out, tmp_path):
+    tile, url = Catalog.read(made_survey / "catalog.parquet").tiles[0], "https://example.org/dsm.tif"
+    layers = tuple(replace(layer, files=(url,)) if layer.name == "dsm" else layer for layer in tile.layers)
     Catalog((replace(tile, layers=layers),)).write(tmp_path / "catalog.json", movable=False)
     said = night("--allow", made_survey, "--allow", "https://example.org", catalog=tmp_path / "catalog.json")
     assert said.code == 2
@@ -549,8 +550,8 @@ def test_a_catalog_that_points_to_a_url(night, made_survey, out, tmp_path):
     assert not out.exists()
 
 
-def test_a_survey_that_is_not_mounted_for_one_night(survey, night, undisturbed, out):
-    """Refused at once, not told by each tile; the night after, nothing has to be done."""
+def test_run_survey_not_mounted_changes_nothing(survey, night, undisturbed, out):
+    """The run exits at once instead of failing tile by tile; the next run has nothing to do."""
     assert night(catalog=survey).code == 0
     for name in ("dsm", "dtm"):
         (survey.parent / name).rename(survey.parent / f"{name} elsewhere")

@@ -1,4 +1,4 @@
-"""Processes are killed in mid-run; the same command then finishes, to the same tables."""
+"""Processes killed during a run; the same command then finishes with the same tables."""
 
 import os
 import signal
@@ -24,29 +24,29 @@ CONFIG = """
 fit: {control_points: [20, 20], iterations: 3000}
 variants: {plane: {fit: plane, sample: corners}, flexroad: {}}
 """
-"""Slow enough to be caught at it."""
+"""Slow enough for the processes to be killed before the end."""
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def folder(tmp_path_factory):
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
-    folder = tmp_path_factory.mktemp("kill")
-    (folder / "slow.yaml").write_text(CONFIG)
-    write_scenes(folder / "survey", 9, seed=5, size_m=80)
-    return folder
+    path = tmp_path_factory.mktemp("kill")
+    (path / "slow.yaml").write_text(CONFIG)
+    write_scenes(path / "survey", 9, seed=5, size_m=80)
+    return path
 
 
 @pytest.fixture(scope="module")
-def undisturbed(place) -> pd.DataFrame:
-    catalog = Catalog.read(place / "survey" / "catalog.parquet")
-    run = Run.create(place / "undisturbed", load_config(place / "slow.yaml"), catalog)
+def undisturbed(folder) -> pd.DataFrame:
+    catalog = Catalog.read(folder / "survey" / "catalog.parquet")
+    run = Run.create(folder / "undisturbed", load_config(folder / "slow.yaml"), catalog)
     run_tiles(run, SerialExecutor())
     return read_metrics(run.path).drop(columns="seconds")
 
 
-def command(place, out) -> list[str]:
-    words = ["--config", place / "slow.yaml", "--catalog", place / "survey" / "catalog.parquet"]
+def command(folder, out) -> list[str]:
+    words = ["--config", folder / "slow.yaml", "--catalog", folder / "survey" / "catalog.parquet"]
     call = "from flexroad.pipeline.cli.main import main; main()"
     return [sys.executable, "-c", call, "run", *map(str, words), "--out", str(out), "--workers", "2"]
 
@@ -61,16 +61,16 @@ def workers(pid: int) -> list[psutil.Process]:
 
 
 @pytest.mark.parametrize("kill", [os.killpg, os.kill], ids=["with its workers", "alone"])
-def test_the_whole_run_is_killed(place, undisturbed, tmp_path, kill):
+def test_run_killed_resumes_to_same_tables(folder, undisturbed, tmp_path, kill):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(place, out), start_new_session=True, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command(folder, out), start_new_session=True, stderr=subprocess.DEVNULL)
     until(lambda: len(markers(out)) >= 2)
     left = workers(process.pid)
     kill(process.pid, signal.SIGKILL)
     process.wait()
     kept = {path: path.stat().st_mtime_ns for path in markers(out)}
     assert 2 <= len(kept) < 9
-    subprocess.run(command(place, out), check=True, capture_output=True)
+    subprocess.run(command(folder, out), check=True, capture_output=True)
     assert all(path.stat().st_mtime_ns == before for path, before in kept.items())
     until(lambda: not any(worker.is_running() for worker in left))
     table = read_metrics(out).drop(columns="seconds")
@@ -78,9 +78,9 @@ def test_the_whole_run_is_killed(place, undisturbed, tmp_path, kill):
 
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)], ids=["one", "all"])
-def test_workers_are_killed(place, undisturbed, tmp_path, which):
+def test_run_workers_killed_completes(folder, undisturbed, tmp_path, which):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(place, out), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command(folder, out), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     until(lambda: len(markers(out)) >= 1)
     for worker in workers(process.pid)[which]:
         worker.kill()
@@ -89,13 +89,15 @@ def test_workers_are_killed(place, undisturbed, tmp_path, which):
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)
 
 
-@pytest.mark.parametrize("how", ["ctrl-c", "kill"])
-def test_an_interrupt_ends_in_seconds_and_keeps_what_is_done(place, undisturbed, tmp_path, how):
+@pytest.mark.parametrize("signal_sent", ["ctrl-c", "kill"])
+def test_run_interrupted_ends_soon_and_keeps_done_tiles(folder, undisturbed, tmp_path, signal_sent):
     out = tmp_path / "run"
-    process = subprocess.Popen(command(place, out), start_new_session=True, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command(folder, out), start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
     until(lambda: len(markers(out)) >= 1)
-    if how == "ctrl-c":
-        # A terminal sends it to all processes of the command, workers too; and somebody is impatient.
+    if signal_sent == "ctrl-c":
+        # A terminal sends SIGINT to the workers, too; a user may press Ctrl-C several times.
         for _ in range(3):
             os.killpg(process.pid, signal.SIGINT)
             time.sleep(0.3)
@@ -107,6 +109,6 @@ def test_an_interrupt_ends_in_seconds_and_keeps_what_is_done(place, undisturbed,
     assert "Traceback" not in said
     rows = read_metrics(out)
     assert 1 <= rows.tile_id.nunique() < 9
-    subprocess.run(command(place, out), check=True, capture_output=True)
+    subprocess.run(command(folder, out), check=True, capture_output=True)
     table = read_metrics(out).drop(columns="seconds")
     pd.testing.assert_frame_equal(table, undisturbed, check_exact=True)

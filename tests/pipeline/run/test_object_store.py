@@ -1,4 +1,4 @@
-"""Catalog, sources, store and run in a bucket: as on disk, also when the storage stumbles."""
+"""Catalog, sources, store and run in object storage: results as on disk, also with faulty storage."""
 
 import io
 import sys
@@ -42,7 +42,7 @@ CONFIG = compose(LIGHT, "light")
 
 @pytest.fixture(scope="module")
 def local(made_survey, tmp_path_factory):
-    """The same run on disk, where nothing happens to it."""
+    """The same run on disk, without faults."""
     return on_disk(made_survey, tmp_path_factory.mktemp("local"), CONFIG)
 
 
@@ -54,7 +54,7 @@ def on_disk(survey, folder, config):
 
 @pytest.fixture
 def survey(made_survey, bucket):
-    """The survey, put into a bucket."""
+    """The survey, copied into a bucket."""
     home = bucket / "survey"
     for file in made_survey.rglob("*"):
         if file.is_file():
@@ -80,25 +80,26 @@ def flexroad(monkeypatch, capsys):
 
 
 def bring_up_to_date(run):
+    """Run all tiles; return the summary and the results by tile id."""
     results = []
-    how = run_tiles(run, SerialExecutor(), watch=results.append)
-    return how, {result.tile_id: result for result in results}
+    state = run_tiles(run, SerialExecutor(), watch=results.append)
+    return state, {result.tile_id: result for result in results}
 
 
 def assert_same(run, local):
-    """Rows and products alike, to the byte."""
-    ours, theirs = (read_metrics(each.path).drop(columns="seconds") for each in (run, local))
-    pd.testing.assert_frame_equal(ours, theirs)
+    """Metrics and products are equal, products byte for byte."""
+    actual, expected = (read_metrics(each.path).drop(columns="seconds") for each in (run, local))
+    pd.testing.assert_frame_equal(actual, expected)
     for tile in run.catalog.tiles:
-        one, other = (each.folder(tile.id).path for each in (run, local))
-        names = paths.listing(one).keys()
-        assert names == paths.listing(other).keys()
+        folder, local_folder = (each.folder(tile.id).path for each in (run, local))
+        names = paths.listing(folder).keys()
+        assert names == paths.listing(local_folder).keys()
         for name in names - {"item.json"}:
-            assert paths.read(one / name) == paths.read(other / name), name
+            assert paths.read(folder / name) == paths.read(local_folder / name), name
 
 
-def assert_nothing_half(run):
-    """Every artefact is whole, and so are the products of every tile that counts as done."""
+def assert_files_complete(run):
+    """All artefacts can be decoded; done tiles have all products with correct checksums."""
     for name in paths.listing(run.store):
         if name.endswith(".npz"):
             assert codec.decode(paths.read(run.store / name))
@@ -107,19 +108,19 @@ def assert_nothing_half(run):
         assert folder.verified() == paths.exists(folder.path / "item.json")
 
 
-def test_a_run_in_a_bucket_is_the_one_on_disk(survey, made_survey, bucket, tmp_path):
+def test_run_in_bucket_equals_run_on_disk(survey, made_survey, bucket, tmp_path):
     config = compose(QUICK, "quick")
     local = on_disk(made_survey, tmp_path, config)
     run = Run.create(bucket / "run", config, Catalog.read(survey))
-    how, results = bring_up_to_date(run)
-    assert (how.exit_code, {result.status for result in results.values()}) == (0, {"done"})
+    state, results = bring_up_to_date(run)
+    assert (state.exit_code, {result.status for result in results.values()}) == (0, {"done"})
     assert_same(run, local)
-    how, results = bring_up_to_date(Run.open(parse_location(str(run.path))))
-    assert (how.exit_code, {result.status for result in results.values()}) == (0, {"cached"})
-    assert (how.done, how.cached, how.failed) == (4, 4, 0)
+    state, results = bring_up_to_date(Run.open(parse_location(str(run.path))))
+    assert (state.exit_code, {result.status for result in results.values()}) == (0, {"cached"})
+    assert (state.done, state.cached, state.failed) == (4, 4, 0)
 
 
-def test_what_was_made_can_be_asked_for(run, local):
+def test_report_tile_and_ground_of_run_in_bucket(run, local):
     run_tiles(run, SerialExecutor())
     opened = Run.open(run.path)
     assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
@@ -127,12 +128,12 @@ def test_what_was_made_can_be_asked_for(run, local):
     tile = opened.catalog.tiles[0]
     assert open_tile(str(run.path), tile.id).identical(open_tile(local.path, tile.id))
     east, north = tile.grid.west + 10.3, tile.grid.north - 20.7
-    ours, theirs = (Ground.open(each.path).at(east, north) for each in (run, local))
-    assert ours.height == theirs.height
-    assert list(ours.tile) == [tile.id]
+    actual, expected = (Ground.open(each.path).at(east, north) for each in (run, local))
+    assert actual.height == expected.height
+    assert list(actual.tile) == [tile.id]
 
 
-def test_a_source_with_other_bytes_is_noticed(run):
+def test_run_source_changed_recomputes_tile(run):
     run_tiles(run, SerialExecutor())
     tile = run.catalog.tiles[1]
     file = tile.paths(tile.layer("dsm"))[0]
@@ -140,9 +141,9 @@ def test_a_source_with_other_bytes_is_noticed(run):
     paths.write(file, paths.read(file) + b"\0")
     paths.write(file, paths.read(file)[:-1] + b"\1")
     assert paths.stat(file).size == before.size + 1
-    how, results = bring_up_to_date(Run.open(run.path))
+    state, results = bring_up_to_date(Run.open(run.path))
     assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
-    assert how.exit_code == 0
+    assert state.exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -159,64 +160,64 @@ def test_a_source_with_other_bytes_is_noticed(run):
         ),
     ],
 )
-def test_storage_that_stumbles_changes_nothing(survey, bucket, storage, local, faults):
+def test_run_with_temporary_storage_faults_completes(survey, bucket, storage, local, faults):
     storage.fail(*faults)
     run = Run.create(bucket / "run", CONFIG, Catalog.read(survey))
-    how, _ = bring_up_to_date(run)
+    state, _ = bring_up_to_date(run)
     storage.fail()
-    assert (how.exit_code, how.done) == (0, 4)
+    assert (state.exit_code, state.done) == (0, 4)
     assert_same(run, local)
 
 
 @pytest.mark.parametrize(("answer", "skip"), [("denied", 0), ("error", 20)])
-def test_writes_that_fail_from_some_moment_on(run, storage, local, answer, skip):
+def test_run_with_permanent_write_faults_fails_tiles(run, storage, local, answer, skip):
     storage.fail(Fault(answer, "PUT", "/run/(tiles|store)", skip=skip))
-    how, results = bring_up_to_date(run)
+    state, results = bring_up_to_date(run)
     storage.fail()
     failed = {name for name, result in results.items() if result.status == "failed"}
-    assert (how.exit_code, how.failed) == (1, len(failed))
+    assert (state.exit_code, state.failed) == (1, len(failed))
     assert failed
     rows = read_metrics(run.path)
     assert set(rows[rows.status == "failed"].tile_id) == failed
     assert rows[rows.status == "failed"].error.str.contains(f"{run.path}/").all()
     assert read_summary(run.path)["exit_code"] == 1
-    assert_nothing_half(run)
+    assert_files_complete(run)
 
-    how, results = bring_up_to_date(Run.open(run.path))
-    assert how.exit_code == 0
+    state, results = bring_up_to_date(Run.open(run.path))
+    assert state.exit_code == 0
     assert {name for name, result in results.items() if result.status == "done"} == failed
     assert_same(run, local)
 
 
-def test_storage_that_goes_away_altogether_leaves_what_is_done(run, storage, local):
+def test_run_storage_unreachable_keeps_done_tiles(run, storage, local):
     storage.fail(Fault("cut", path="/run/", skip=40))
     with pytest.raises(OSError, match=str(run.path)):
         run_tiles(run, SerialExecutor())
     storage.fail()
-    assert_nothing_half(run)
-    how, _ = bring_up_to_date(Run.open(run.path))
-    assert how.exit_code == 0
+    assert_files_complete(run)
+    state, _ = bring_up_to_date(Run.open(run.path))
+    assert state.exit_code == 0
     assert_same(run, local)
 
 
 @pytest.mark.parametrize("answer", ["slow", "denied", "half"])
-def test_a_source_that_cannot_be_read_is_one_failed_tile(run, storage, local, answer):
+def test_run_source_unreadable_fails_only_its_tile(run, storage, local, answer):
     tile = run.catalog.tiles[2]
     file = tile.paths(tile.layer("dsm"))[0]
     storage.fail(Fault(answer, "GET", f"/{file.path}"))
-    how, results = bring_up_to_date(run)
+    state, results = bring_up_to_date(run)
     storage.fail()
-    assert (how.exit_code, how.done, how.failed) == (1, 3, 1)
+    assert (state.exit_code, state.done, state.failed) == (1, 3, 1)
     (failure,) = results[tile.id].failures
     assert (failure.stage, failure.file) == ("load", str(file))
 
-    how, results = bring_up_to_date(Run.open(run.path))
-    assert how.exit_code == 0
+    state, results = bring_up_to_date(Run.open(run.path))
+    assert state.exit_code == 0
     assert {name for name, result in results.items() if result.status == "done"} == {tile.id}
     assert_same(run, local)
 
 
-def test_a_run_that_cannot_be_asked_for_is_not_called_none(run, storage):
+def test_open_run_without_access_is_not_reported_as_missing(run, storage):
     storage.fail(Fault("denied"))
     with pytest.raises(ConfigError, match=r"cannot read s3://.*/run.json"):
         Run.open(run.path)
@@ -225,18 +226,18 @@ def test_a_run_that_cannot_be_asked_for_is_not_called_none(run, storage):
         Run.open(run.path / "none")
 
 
-def test_a_missing_source_is_named_by_its_address(run):
+def test_run_source_missing_names_its_address(run):
     tile = run.catalog.tiles[0]
     file = tile.paths(tile.layer("dtm"))[0]
     paths.remove(file)
-    how, results = bring_up_to_date(run)
+    state, results = bring_up_to_date(run)
     (failure,) = results[tile.id].failures
     assert failure.file == str(file)
     assert "is missing" in failure.message
-    assert (how.done, how.failed) == (3, 1)
+    assert (state.done, state.failed) == (3, 1)
 
 
-def test_a_photo_with_a_world_file_is_placed_as_on_disk(bucket, tmp_path):
+def test_read_photo_with_world_file_equals_disk(bucket, tmp_path):
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 40, 40)
     grey = np.random.default_rng(0).integers(0, 255, (80, 80), np.uint8)
     photo = tmp_path / "dop.tif"
@@ -244,37 +245,39 @@ def test_a_photo_with_a_world_file_is_placed_as_on_disk(bucket, tmp_path):
     photo.with_suffix(".tfw").write_text("0.5\n0\n0\n-0.5\n295500.25\n5629499.75\n")
     for file in (photo, photo.with_suffix(".tfw")):
         paths.write(bucket / file.name, file.read_bytes())
-    theirs, ours = (
+    expected, actual = (
         read_photo(Source("dop", (home / "dop.tif",), grid.crs), grid) for home in (tmp_path, bucket)
     )
-    assert ours.known.all()
-    assert np.array_equal(ours.colour, theirs.colour)
+    assert actual.known.all()
+    assert np.array_equal(actual.colour, expected.colour)
 
 
-def test_roads_in_a_bucket_are_those_on_disk(made_survey, survey, storage, tmp_path):
+def test_read_near_roads_in_bucket_equal_disk(made_survey, survey, storage, tmp_path):
     crs, bounds = "EPSG:25832", (499900.0, 5599900.0, 500200.0, 5600200.0)
-    homes = (made_survey, survey.parent)
-    asked = [Query(home / "roads.gpkg", None, None, ("highway", "width"), None, crs) for home in homes]
+    folders = (made_survey, survey.parent)
+    queries = [
+        Query(folder / "roads.gpkg", None, None, ("highway", "width"), None, crs) for folder in folders
+    ]
     storage.fail(Fault("half", "GET", "gpkg", first=1))
-    theirs, ours = (read_near(each, bounds) for each in asked)
-    assert len(ours) > 3
-    assert ours.equals(theirs)
-    # Another version is another file; one that cannot be had is a fault of one line.
+    expected, actual = (read_near(query, bounds) for query in queries)
+    assert len(actual) > 3
+    assert actual.equals(expected)
+    # A new version of the file is read again; a file that cannot be read raises one line.
     write_roads(tmp_path / "one.gpkg", [LineString([(500000, 5600000), (500050, 5600000)])], width=[6])
-    paths.write(asked[1].path, (tmp_path / "one.gpkg").read_bytes())
-    assert len(read_near(asked[1], bounds)) == 1
+    paths.write(queries[1].path, (tmp_path / "one.gpkg").read_bytes())
+    assert len(read_near(queries[1], bounds)) == 1
     for answer in ("error", "half"):
-        paths.write(asked[1].path, answer.encode())
+        paths.write(queries[1].path, answer.encode())
         storage.fail(Fault(answer, "GET", "gpkg"))
         with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be read: .*; run again"):
-            read_near(asked[1], bounds)
+            read_near(queries[1], bounds)
     storage.fail()
-    paths.remove(asked[1].path)
+    paths.remove(queries[1].path)
     with pytest.raises(TaskError, match=r"s3://.*/roads.gpkg cannot be opened .no such file.; put it back"):
-        read_near(asked[1], bounds)
+        read_near(queries[1], bounds)
 
 
-def test_a_damaged_artefact_is_made_anew(run, local):
+def test_run_artefact_damaged_is_recomputed(run, local):
     run_tiles(run, SerialExecutor())
     name = next(name for name in paths.listing(run.store) if name.startswith("evaluate/"))
     whole = paths.read(run.store / name)
@@ -286,25 +289,25 @@ def test_a_damaged_artefact_is_made_anew(run, local):
     assert_same(run, local)
 
 
-def test_requests_grow_with_the_tiles_only_where_tiles_are_done(run, storage):
+def test_run_cached_makes_few_requests(run, storage):
     storage.requests()
     run_tiles(run, SerialExecutor())
     first = storage.requests()
-    # Of each file and artefact: looked for, written or read, looked at again.
+    # Requests per file and artefact: stat, write or read, stat.
     assert len(first) / 4 < 45
     run_tiles(Run.open(run.path), SerialExecutor())
     again = [path for _, path in storage.requests()]
-    # A list of the products, one of each folder of sources, and the run's own files.
+    # One listing of the products, one per source folder, and the files of the run.
     assert len(again) <= 20
     assert not [path for path in again if "/tiles/" in path or "/store/" in path or "/survey/" in path]
 
 
-def test_commands_take_addresses(survey, bucket, tmp_path, local, flexroad):
+def test_commands_accept_s3_addresses(survey, bucket, tmp_path, local, flexroad):
     config = tmp_path / "light.yaml"
     config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
     home = str(bucket / "run")
-    asked = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--workers", "1"]
-    flexroad(*asked)
+    words = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--workers", "1"]
+    flexroad(*words)
     assert_same(Run.open(bucket / "run"), local)
     assert "4 done" in flexroad("status", home)
     flexroad("report", home)
