@@ -1,4 +1,4 @@
-"""The command line in this process, and as a process of its own."""
+"""The command line, run in this process or in a new one."""
 
 import contextlib
 import io
@@ -14,7 +14,7 @@ import pytest
 from flexroad.pipeline.cli.main import main
 
 PROCESS = (sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()")
-"""Followed by the words of a command line."""
+"""Command of a new process; the words of a command line follow."""
 
 
 class Said(NamedTuple):
@@ -24,33 +24,33 @@ class Said(NamedTuple):
 
     @property
     def errors(self) -> list[str]:
-        """The lines that tell of faults."""
+        """The error lines on standard error."""
         return error_lines(self.err)
 
     def expected(self, code: int) -> "Said":
-        """Insist on an exit code."""
+        """Assert the exit code."""
         assert self.code == code, self.out + self.err
         return self
 
 
 def error_lines(text: str) -> list[str]:
-    """The lines that tell of faults, among those of progress."""
+    """The error lines in a text that also has progress lines."""
     return [line for line in text.splitlines() if line.startswith(("error: ", "failed "))]
 
 
 @contextlib.contextmanager
 def same_signals():
-    """A command takes some signals over; here it is no process of its own."""
-    before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    """Restore the signal handlers, which a command replaces in this process."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:
-        for which, handler in before.items():
-            signal.signal(which, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def call(*words) -> Said:
-    """Run a command line in this process; no traceback ever."""
+    """Run a command line in this process; fail on a traceback."""
     out, err = io.StringIO(), io.StringIO()
     with (
         same_signals(),
@@ -67,7 +67,7 @@ def call(*words) -> Said:
 
 
 def process(*words) -> Said:
-    """Run a command line as a user does, with an interpreter of its own."""
+    """Run a command line in a new process."""
     done = subprocess.run(
         [*PROCESS, *map(str, words)],
         capture_output=True,

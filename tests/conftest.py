@@ -1,4 +1,4 @@
-"""What the tests share: a small made survey, a quick configuration, and both executors."""
+"""Fixtures shared by all tests: a small synthetic survey, a quick configuration, executors, storage."""
 
 import os
 import shutil
@@ -19,11 +19,11 @@ QUICK = {
         "flexroad": {},
     },
 }
-"""The paper's three variants with a light fit: tests of the machinery want no accuracy."""
+"""The paper's three variants with a quick, inaccurate fit."""
 
 
 def pytest_collection_modifyitems(config, items):
-    """Begin with the files of slow tests, so that the last of several processes does not end alone."""
+    """Run files with slow tests first, so that parallel test processes end at about the same time."""
     if hasattr(config, "workerinput"):
         slow = {item.path for item in items if item.get_closest_marker("slow")}
         items.sort(key=lambda item: item.path not in slow)
@@ -31,7 +31,7 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(scope="session")
 def flexroad():
-    """The command line, in this process; no traceback ever."""
+    """The command line, run in this process; fails on a traceback."""
     return command_line.call
 
 
@@ -45,7 +45,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def made_survey(tmp_path_factory) -> Path:
-    """A folder of four neighbouring tiles of 60 m with known truth."""
+    """A folder with a survey of four adjacent tiles of 60 m with ground truth."""
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
     folder = tmp_path_factory.mktemp("survey")
@@ -55,7 +55,7 @@ def made_survey(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def survey(made_survey, tmp_path) -> Path:
-    """A catalog of one's own, to spoil."""
+    """The catalog of a copy of the survey, for tests to change."""
     return shutil.copytree(made_survey, tmp_path / "survey") / "catalog.parquet"
 
 
@@ -78,12 +78,12 @@ def cluster():
 
 @pytest.fixture
 def processes(tmp_path):
-    """Scheduler and workers of one's own, to kill."""
+    """Scheduler and worker processes for one test, which may kill them."""
     from tests.dask_processes import Processes
 
-    found = Processes(tmp_path)
-    yield found
-    found.end()
+    started = Processes(tmp_path)
+    yield started
+    started.end()
 
 
 @pytest.fixture(params=["serial", "dask"])
@@ -103,7 +103,7 @@ def storage_server():
 
 @pytest.fixture
 def storage(storage_server, monkeypatch):
-    """Object storage on loopback that can be told to fail; what speaks S3 in this process finds it."""
+    """Object storage on loopback with configurable faults; S3 clients in this process use it."""
     storage_server.fail()
     settings = {
         "AWS_ENDPOINT_URL": storage_server.url,
@@ -121,9 +121,9 @@ def storage(storage_server, monkeypatch):
 
 @pytest.fixture
 def bucket(storage, request):
-    """A folder in a bucket of one's own."""
+    """A folder in a new bucket."""
     from flexroad.catalog.storage.paths import parse_location
 
-    made = parse_location(f"s3://{abs(hash(request.node.nodeid)):x}/area")
-    made.fs.mkdir(made.parent.path)
-    return made
+    folder = parse_location(f"s3://{abs(hash(request.node.nodeid)):x}/area")
+    folder.fs.mkdir(folder.parent.path)
+    return folder

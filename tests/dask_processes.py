@@ -1,4 +1,4 @@
-"""A Dask cluster of real processes on loopback, for tests to kill."""
+"""Dask scheduler and workers as separate processes on loopback, which tests may kill."""
 
 import contextlib
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 class Processes:
-    """A scheduler and workers, each a process started by Dask's own commands."""
+    """A scheduler and workers, each started by the ``dask`` command."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -19,7 +19,7 @@ class Processes:
         self.address = ""
 
     def scheduler(self) -> subprocess.Popen:
-        """Start one, where it was before if there was one; its settings are others than one's own."""
+        """Start a scheduler, at the previous address if any; its settings differ from the client's."""
         file = self.folder / "scheduler.json"
         file.unlink(missing_ok=True)
         port = self.address.rpartition(":")[2] or "0"
@@ -29,10 +29,12 @@ class Processes:
         return process
 
     def worker(self, *options: str, **env: str) -> subprocess.Popen:
+        """Start a worker process with these options and environment variables."""
         options = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder), *options)
         return self._start("worker", self.address, *options, **env)
 
     def end(self) -> None:
+        """Kill all processes."""
         for process in self.started:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -40,25 +42,27 @@ class Processes:
 
     def _start(self, *words, **env: str) -> subprocess.Popen:
         command = [sys.executable, "-m", "dask", *map(str, words)]
-        with (self.folder / "said.txt").open("a") as said:
+        with (self.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(
-                command, env={**os.environ, **env}, stdout=said, stderr=said, start_new_session=True
+                command, env={**os.environ, **env}, stdout=output, stderr=output, start_new_session=True
             )
         self.started.append(process)
         return process
 
 
 def until(condition, seconds: float = 60):
+    """Call a function until its result is true; return the result."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
+        result = condition()
+        if result:
+            return result
         time.sleep(0.02)
-    raise AssertionError("waited in vain")
+    raise AssertionError(f"condition not met within {seconds:g} s")
 
 
 def wait_for(address: str, workers: int) -> None:
+    """Wait until a scheduler has this number of workers."""
     from distributed import Client
 
     with Client(address, set_as_default=False) as client:

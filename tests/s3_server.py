@@ -1,6 +1,6 @@
-"""Object storage on loopback for tests: moto's S3 in a process of its own, which can be told to fail.
+"""Object storage on loopback for tests: moto's S3 server in a separate process, with configurable faults.
 
-GDAL may hold the interpreter's lock while it waits for an answer, so that a thread would not do.
+A thread is not possible: GDAL may hold the interpreter's lock while it waits for an answer.
 """
 
 import json
@@ -29,34 +29,36 @@ ANSWERS = {
 
 @dataclass
 class Fault:
-    """What goes wrong with which requests."""
+    """A fault and the requests that it affects."""
 
     answer: str
-    """One of `ANSWERS`, or how the connection ends: "cut" (reset), "shut" (no answer), "half" (amid one)."""
+    """One of `ANSWERS`, or how the connection ends: "cut" (reset), "shut" (no answer), "half" (cut off)."""
     method: str = ""
-    """A regular expression, like the next."""
+    """Regular expression for the method."""
     path: str = ""
+    """Regular expression for the path."""
     skip: int = 0
-    """How many such requests go well first."""
+    """Number of matching requests that succeed first."""
     first: int | None = None
-    """How many then go wrong, of each path; None: all of them."""
+    """Number of requests per path that fail then; None for all."""
     share: float = 1.0
-    """How many of these do in the end, by chance."""
+    """Probability that such a request fails."""
     seed: int = 0
 
 
-class Due:
-    """When a fault is due."""
+class FaultState:
+    """A fault and the counts of its requests."""
 
     def __init__(self, fault: Fault):
-        self.fault, self.random, self.met, self.failed = fault, random.Random(fault.seed), 0, Counter()
+        self.fault, self.random, self.matched, self.failed = fault, random.Random(fault.seed), 0, Counter()
 
-    def hits(self, method: str, path: str) -> bool:
+    def applies(self, method: str, path: str) -> bool:
+        """Count a request; return whether it fails."""
         fault = self.fault
         if not (re.search(fault.method, method) and re.search(fault.path, path)):
             return False
-        self.met += 1
-        if self.met <= fault.skip or (fault.first is not None and self.failed[path] >= fault.first):
+        self.matched += 1
+        if self.matched <= fault.skip or (fault.first is not None and self.failed[path] >= fault.first):
             return False
         if self.random.random() >= fault.share:
             return False
@@ -64,8 +66,8 @@ class Due:
         return True
 
 
-class Faulty:
-    """Answers for the storage where a fault is due."""
+class FaultyApp:
+    """WSGI application that answers with a fault if one applies, else passes the request on."""
 
     def __init__(self, app):
         self.app, self.faults, self.requests = app, [], []
@@ -73,13 +75,13 @@ class Faulty:
     def __call__(self, environ, start_response):
         method, path = environ["REQUEST_METHOD"], environ["PATH_INFO"]
         if path == "/_faults":
-            self.faults = [Due(Fault(**given)) for given in json.loads(_body(environ))]
+            self.faults = [FaultState(Fault(**fields)) for fields in json.loads(_body(environ))]
             return _answer(start_response, "200 OK", b"")
         if path == "/_requests":
-            found, self.requests = self.requests, []
-            return _answer(start_response, "200 OK", json.dumps(found).encode())
+            requests, self.requests = self.requests, []
+            return _answer(start_response, "200 OK", json.dumps(requests).encode())
         self.requests.append([method, path])
-        fault = next((due.fault for due in self.faults if due.hits(method, path)), None)
+        fault = next((state.fault for state in self.faults if state.applies(method, path)), None)
         if fault is None:
             return self.app(environ, start_response)
         if fault.answer in ANSWERS:
@@ -90,7 +92,7 @@ class Faulty:
             return _half(self.app(environ, start_response), environ)
         connection = environ["werkzeug.socket"]
         if fault.answer == "cut":
-            # Closing it will send a reset.
+            # With this option closing sends a reset.
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection._real_close()
         else:
@@ -115,24 +117,24 @@ def _answer(start_response, status, text):
 
 @dataclass(frozen=True)
 class Storage:
-    """A server that runs."""
+    """A running server."""
 
     url: str
 
     def fail(self, *faults: Fault) -> None:
-        """Let these things go wrong from now on, and no others."""
+        """Replace the current faults by these."""
         body = json.dumps([asdict(fault) for fault in faults]).encode()
         urllib.request.urlopen(urllib.request.Request(f"{self.url}/_faults", body, method="PUT")).close()
 
     def requests(self) -> list[tuple[str, str]]:
-        """Return method and path of what was asked since the last call."""
+        """Return method and path of the requests since the last call."""
         with urllib.request.urlopen(f"{self.url}/_requests") as answer:
             return [tuple(pair) for pair in json.load(answer)]
 
 
 @contextmanager
 def storage():
-    """Run a server."""
+    """Run a server in a separate process."""
     with subprocess.Popen(
         [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:
@@ -142,9 +144,9 @@ def storage():
 
 if __name__ == "__main__":
     server = make_server(
-        "127.0.0.1", 0, Faulty(DomainDispatcherApplication(create_backend_app)), threaded=True
+        "127.0.0.1", 0, FaultyApp(DomainDispatcherApplication(create_backend_app)), threaded=True
     )
     print(server.port, flush=True)  # noqa: T201
-    # Ends with the tests, however they end.
+    # Standard input closes when the tests end, even if they are killed.
     threading.Thread(target=server.serve_forever, daemon=True).start()
     sys.stdin.read()

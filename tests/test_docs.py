@@ -1,4 +1,4 @@
-"""The docs stay true: the commands of docs/cli.md run as they stand, links lead somewhere."""
+"""Documentation: the commands of docs/cli.md run, links have targets, named tests exist."""
 
 import re
 import shlex
@@ -18,7 +18,7 @@ def console_lines(page: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_command_lines_of_the_docs_run(tmp_path, monkeypatch):
+def test_docs_cli_commands_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")
     lines = console_lines(ROOT / "docs" / "cli.md")
@@ -31,18 +31,18 @@ def test_the_command_lines_of_the_docs_run(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-def test_every_fault_has_the_test_that_the_table_names():
+def test_operations_faults_name_existing_tests():
     table = (ROOT / "docs" / "operations.md").read_text().split("## Faults")[1].split("\n## ")[0]
     rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
     assert len(rows) > 15
     for row in rows:
-        named = re.findall(r"`(test_\w+\.py)::(test_\w+)`", row)
-        assert named, row
-        for file, test in named:
-            there = any(f"def {test}(" in path.read_text() for path in (ROOT / "tests").rglob(file))
-            assert there, f"no {file} has {test}"
+        names = re.findall(r"`(test_\w+\.py)::(test_\w+)`", row)
+        assert names, row
+        for file, test in names:
+            exists = any(f"def {test}(" in path.read_text() for path in (ROOT / "tests").rglob(file))
+            assert exists, f"no {file} has {test}"

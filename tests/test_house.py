@@ -1,4 +1,4 @@
-"""Rules of the house that the linters do not hold: names, lengths, and a light start of the command line."""
+"""Project rules that linters do not check: file names, file lengths, imports of the command line."""
 
 import subprocess
 import sys
@@ -12,20 +12,20 @@ FILES = sorted(
 )
 
 
-def test_no_file_is_a_drawer_for_everything():
-    drawers = {"utils", "util", "common", "helpers", "misc"}
-    assert not [path for path in FILES if path.stem in drawers]
+def test_file_names_are_specific():
+    unspecific = {"utils", "util", "common", "helpers", "misc"}
+    assert not [path for path in FILES if path.stem in unspecific]
 
 
-def test_no_file_is_longer_than_400_lines():
+def test_files_have_at_most_400_lines():
     assert not [path for path in FILES if len(path.read_text().splitlines()) > 400]
 
 
-def test_pipeline_has_at_most_16_rooms():
-    rooms = [
+def test_pipeline_has_at_most_16_packages():
+    packages = [
         path for path in (ROOT / "pipeline").iterdir() if path.stem.strip("_") not in ("init", "pycache")
     ]
-    assert len(rooms) <= 16
+    assert len(packages) <= 16
 
 
 @pytest.mark.parametrize("module", ["flexroad.pipeline.cli.main"])

@@ -1,4 +1,4 @@
-"""`make reproduce` does what README says of it; `make test` leaves out what is slow."""
+"""`make reproduce` runs the commands that README lists; `make test` omits slow tests."""
 
 import shutil
 import subprocess
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "reproduce") -> list[list[str]]:
-    """Return the words of a program's calls that make would run in a fresh checkout that is set up."""
+    """Return the words of a program's calls that make would run in a fresh, installed checkout."""
     tmp_path.mkdir(exist_ok=True)
     shutil.copy(ROOT / "Makefile", tmp_path)
     (tmp_path / ".venv").mkdir()
@@ -28,7 +28,7 @@ def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "re
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_made_tiles_are_classed_by_both_masks(tmp_path):
+def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
     catalog, _, first, second, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
     assert catalog[:2] == ["catalog", "synthetic"]
     assert {"--preset", "gerod", "--tiles", "3", "--seed", "5"} <= set(catalog)
@@ -42,7 +42,7 @@ def test_made_tiles_are_classed_by_both_masks(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_real_tiles_take_the_place_of_made_ones(tmp_path):
+def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path):
     catalog, _, run, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
     assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
     assert "ablation" in run
@@ -52,7 +52,7 @@ def test_real_tiles_take_the_place_of_made_ones(tmp_path):
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 @pytest.mark.parametrize("words", [["SEED=5"], ["SEED=5", "GEROD_ROOT=/data/gerod"]])
-def test_made_scenes_stand_in_for_dsc3d_by_both_references(tmp_path, words):
+def test_reproduce_synthetic_scenes_run_with_both_references(tmp_path, words):
     _, scenes, *_, circular, true, tables, _ = commands(tmp_path, *words)
     assert scenes[:4] == ["catalog", "synthetic", "--preset", "dsc3d"]
     assert scenes[-2:] == ["--seed", "5"]
@@ -67,11 +67,20 @@ def test_made_scenes_stand_in_for_dsc3d_by_both_references(tmp_path, words):
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_tests_run_in_two_processes_and_only_make_test_leaves_slow_ones_out(tmp_path):
-    for target, chosen in (("test", ["-m", '"not', 'slow"']), ("test-all", [])):
+def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
+    for target, selection in (("test", ["-m", '"not', 'slow"']), ("test-all", [])):
         (words,) = commands(tmp_path / target, program="python", target=target)
-        assert words == ["-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *chosen]
+        assert words == [
+            "-m",
+            "pytest",
+            "-n",
+            "2",
+            "--dist",
+            "loadfile",
+            "--no-loadscope-reorder",
+            *selection,
+        ]
 
 
-def test_ci_checks_style_and_runs_all_tests():
+def test_ci_runs_lint_and_all_tests():
     assert (ROOT / ".ci" / "run").read_text().splitlines()[-2:] == ["make lint", "make test-all"]

@@ -1,4 +1,4 @@
-"""The units of docs/operations are what their programs take, and the commands in them what FlexRoad takes."""
+"""Units in docs/operations: valid for systemd, cron, Kubernetes and SLURM, with valid flexroad commands."""
 
 import re
 import shlex
@@ -22,7 +22,7 @@ def text(name: str) -> str:
 
 
 def command(name: str) -> list[str]:
-    """The words of the flexroad command in a unit, as its shell would give them."""
+    """The words of the flexroad command in a unit, after parsing by the shell."""
     if name == "cronjob.yaml":
         return POD["containers"][0]["command"][1:]
     (line,) = re.findall(r"^[^#\n]*/bin/flexroad (.*)$", text(name), flags=re.MULTILINE)
@@ -30,7 +30,7 @@ def command(name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["flexroad.service", "flexroad.cron", "cronjob.yaml", "flexroad.sbatch"])
-def test_its_command_runs(name, made_survey, tmp_path, capsys):
+def test_unit_command_runs(name, made_survey, tmp_path, capsys):
     words = command(name)
     words[words.index("--catalog") + 1] = str(made_survey / "catalog.parquet")
     words[words.index("--out") + 1] = str(tmp_path / "run")
@@ -38,30 +38,30 @@ def test_its_command_runs(name, made_survey, tmp_path, capsys):
     assert "to do" in capsys.readouterr().out
 
 
-def test_no_command_needs_flock():
-    # The lock is FlexRoad's own: on another machine's disk and in a bucket, too.
+def test_units_do_not_use_flock():
+    # FlexRoad locks runs itself, also on network disks and in object storage.
     for unit in UNITS.iterdir():
         assert not re.search(r"^[^#]*\bflock\b", unit.read_text(), flags=re.MULTILINE)
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd is not installed")
-def test_systemd_takes_service_and_timer(tmp_path):
-    there = shutil.which("true")
+def test_systemd_accepts_service_and_timer(tmp_path):
+    program = shutil.which("true")
     (tmp_path / "flexroad.service").write_text(
-        text("flexroad.service").replace("/opt/flexroad/bin/flexroad", there)
+        text("flexroad.service").replace("/opt/flexroad/bin/flexroad", program)
     )
     (tmp_path / "flexroad.timer").write_text(text("flexroad.timer"))
     units = [tmp_path / "flexroad.service", tmp_path / "flexroad.timer"]
     done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, check=False)
-    # Of the machine's own units it may complain, too.
+    # The output may also have complaints about units of the machine.
     complaints = [line for line in done.stderr.splitlines() if "flexroad" in line]
     assert not complaints
     assert done.returncode == 0, done.stderr
-    when = re.search(r"OnCalendar=(.*)", text("flexroad.timer"))[1]
-    subprocess.run(["systemd-analyze", "calendar", when], capture_output=True, check=True)
+    calendar = re.search(r"OnCalendar=(.*)", text("flexroad.timer"))[1]
+    subprocess.run(["systemd-analyze", "calendar", calendar], capture_output=True, check=True)
 
 
-def test_service_and_timer_leave_the_run_the_time_it_needs():
+def test_service_and_timer_have_required_settings():
     service = text("flexroad.service")
     assert "Type=oneshot" in service
     assert "KillMode=mixed" in service
@@ -69,25 +69,25 @@ def test_service_and_timer_leave_the_run_the_time_it_needs():
     assert "Persistent=true" in text("flexroad.timer")
 
 
-def test_cron_takes_the_line():
+def test_cron_line_is_valid():
     (line,) = [line for line in text("flexroad.cron").splitlines() if re.match(r"[\d*]", line)]
-    *when, user, what = line.split(maxsplit=6)[:7]
+    *schedule, user, shell_command = line.split(maxsplit=6)[:7]
     assert user == "flexroad"
-    for field, most in zip(when, (59, 23, 31, 12, 7), strict=True):
-        assert field == "*" or 0 <= int(field) <= most
-    # In a crontab it would end the line.
-    assert "%" not in what
-    subprocess.run(["sh", "-n", "-c", what], check=True)
+    for field, maximum in zip(schedule, (59, 23, 31, 12, 7), strict=True):
+        assert field == "*" or 0 <= int(field) <= maximum
+    # A percent sign ends the command in a crontab.
+    assert "%" not in shell_command
+    subprocess.run(["sh", "-n", "-c", shell_command], check=True)
 
 
-def test_the_job_of_kubernetes_runs_alone_and_ends():
+def test_cronjob_runs_alone_with_deadline():
     assert (JOB["apiVersion"], JOB["kind"]) == ("batch/v1", "CronJob")
     spec = JOB["spec"]
     assert spec["concurrencyPolicy"] == "Forbid"
     assert len(spec["schedule"].split()) == 5
     job = spec["jobTemplate"]["spec"]
     assert job["activeDeadlineSeconds"] > 0
-    # Kubernetes takes a policy on failures only of pods that are not restarted.
+    # Kubernetes accepts a podFailurePolicy only with restartPolicy Never.
     assert POD["restartPolicy"] == "Never"
     rules = job["podFailurePolicy"]["rules"]
     assert {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget"}]} in rules
@@ -96,7 +96,7 @@ def test_the_job_of_kubernetes_runs_alone_and_ends():
     assert POD["terminationGracePeriodSeconds"] >= 60
 
 
-def test_the_pod_of_kubernetes_asks_for_what_its_workers_need():
+def test_cronjob_pod_requests_one_cpu_per_worker():
     (container,) = POD["containers"]
     assert container["name"] == "flexroad"
     limits = container["resources"]["limits"]
@@ -108,11 +108,11 @@ def test_the_pod_of_kubernetes_asks_for_what_its_workers_need():
     }
 
 
-def test_slurm_takes_the_script():
+def test_sbatch_script_is_valid():
     subprocess.run(["bash", "-n", UNITS / "flexroad.sbatch"], check=True)
     options = dict(re.findall(r"^#SBATCH --([a-z-]+)=(\S+)$", text("flexroad.sbatch"), flags=re.MULTILINE))
     assert len(options) == text("flexroad.sbatch").count("\n#SBATCH ")
-    # To the batch script alone, which the run has replaced.
+    # B: sends the signal to the batch shell, which exec replaces by flexroad.
     assert re.fullmatch(r"B:TERM@\d+", options["signal"])
     assert "\nexec " in text("flexroad.sbatch")
     assert options["nodes"] == options["ntasks"] == "1"

@@ -1,4 +1,4 @@
-"""What `pip install flexroad` puts into site-packages."""
+"""Contents of the wheel."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
 
 
-def test_wheel_holds_one_import_package(tmp_path):
+def test_wheel_contains_one_import_package(tmp_path):
     build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT]
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")

@@ -1,4 +1,4 @@
-"""The library: `import flexroad` in a notebook."""
+"""The public library, `import flexroad`, as used in a notebook."""
 
 import contextlib
 import doctest
@@ -37,7 +37,7 @@ CENTRE = 500210.0, 5600030.0
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory) -> Path:
-    """A folder with a survey of two tiles of 60 m and ``runs/city``, which has done the first."""
+    """A folder with a survey of two tiles of 60 m and ``runs/city``, in which the first tile is done."""
     folder = tmp_path_factory.mktemp("library")
     catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=0, size_m=60))
     run = Run.create(folder / "runs" / "city", load_config("nightly"), catalog)
@@ -47,7 +47,7 @@ def city(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def rasters(city) -> dict[str, xr.DataArray]:
-    """The files of the first tile."""
+    """The rasters of the first tile by layer."""
     return {
         layer: rioxarray.open_rasterio(city / "survey" / layer / "499980_5599980.tif")
         for layer in ("dsm", "dtm", "road_mask")
@@ -65,14 +65,14 @@ def surface(scene) -> flexroad.Surface:
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_examples_of_docstrings_run(name, city, monkeypatch):
+def test_docstring_examples_run(name, city, monkeypatch):
     monkeypatch.chdir(city)
     failed, tried = doctest.testmod(importlib.import_module(name))
     assert not failed
     assert tried
 
 
-def test_every_public_method_has_an_example():
+def test_public_methods_have_examples():
     for owner in (flexroad.Surface, flexroad.RunView):
         members = {name: member for name, member in vars(owner).items() if name[0] != "_" and member.__doc__}
         for name, member in members.items():
@@ -80,7 +80,7 @@ def test_every_public_method_has_an_example():
                 assert ">>> " in member.__doc__, f"{owner.__name__}.{name}"
 
 
-def test_page_of_the_docs_runs(city, tmp_path, monkeypatch, flexroad):
+def test_docs_library_page_runs(city, tmp_path, monkeypatch, flexroad):
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "library.md").read_text()
     names: dict[str, object] = {}
@@ -105,18 +105,18 @@ def test_import_loads_no_heavy_library():
     assert done.stdout.strip() == "[]"
 
 
-def test_every_public_name_is_there():
+def test_public_names_exist():
     assert set(flexroad.__all__) <= set(dir(flexroad))
     assert all(hasattr(flexroad, name) for name in flexroad.__all__)
     assert not hasattr(flexroad, "unknown")
 
 
-def test_example_refuses_a_size_out_of_range():
+def test_example_size_out_of_range_raises():
     with pytest.raises(flexroad.ConfigError, match="size_m 10: give"):
         flexroad.example(size_m=10)
 
 
-def test_environment_of_a_notebook_stays():
+def test_import_after_numpy_leaves_environment_unchanged():
     code = (
         "import os, numpy, numba; before = dict(os.environ); import flexroad; flexroad.fit; "
         "print(before == dict(os.environ))"
@@ -125,46 +125,48 @@ def test_environment_of_a_notebook_stays():
     assert done.stdout.strip() == "True"
 
 
-def test_fit_equals_a_run_over_the_same_rasters(city, rasters):
-    ours = flexroad.fit(**rasters)
+def test_fit_equals_run_over_same_rasters(city, rasters):
+    fitted = flexroad.fit(**rasters)
     run = flexroad.open_run(city / "runs" / "city")
-    west, south, east, north = ours.bounds
+    west, south, east, north = fitted.bounds
     x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
-    np.testing.assert_allclose(ours.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.normal(x, y), run.normal(x, y), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fitted.normal(x, y), run.normal(x, y), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(
-        ours.clusters.mask[50:-50, 50:-50], run.tile("499980_5599980").road_filtered
+        fitted.clusters.mask[50:-50, 50:-50], run.tile("499980_5599980").road_filtered
     )
     stored = flexroad.open_surface(
         city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad_surface.npz"
     )
-    np.testing.assert_allclose(stored.height(x, y), ours.height(x, y), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(stored.height(x, y), fitted.height(x, y), rtol=0, atol=1e-9)
     with pytest.raises(flexroad.ConfigError, match="no road mask"):
         stored.to_mesh()
     mesh = trimesh.load(city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad.glb")
-    assert sum(len(part.faces) for part in mesh.geometry.values()) == len(ours.to_mesh().faces)
+    assert sum(len(part.faces) for part in mesh.geometry.values()) == len(fitted.to_mesh().faces)
 
 
-def test_fit_takes_coordinates_in_either_direction(scene, surface):
-    turned = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
-    same = flexroad.fit(turned.dsm, scene.dtm, turned.road_mask.astype("uint8").expand_dims("band"))
+def test_fit_with_reversed_coordinates_equals_original(scene, surface):
+    reversed_scene = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
+    same = flexroad.fit(
+        reversed_scene.dsm, scene.dtm, reversed_scene.road_mask.astype("uint8").expand_dims("band")
+    )
     assert same.height(*CENTRE) == surface.height(*CENTRE)
     assert same.road.core == surface.road.core
 
 
-def test_fit_takes_arrays_without_coordinates(scene, surface):
+def test_fit_without_coordinates_uses_transform(scene, surface):
     bare = scene.rio.write_transform().drop_vars(["x", "y"])
     assert flexroad.fit(bare.dsm, bare.dtm, bare.road_mask).height(*CENTRE) == surface.height(*CENTRE)
 
 
-def test_fit_takes_dask_arrays_and_nodata(scene, surface):
-    numbers = scene.dsm.where(scene.x > 500202, -9999.0).rio.write_nodata(-9999.0).chunk(20)
-    lacking = flexroad.fit(numbers, scene.dtm, scene.road_mask)
+def test_fit_dask_arrays_with_nodata_equals_nan(scene, surface):
+    with_nodata = scene.dsm.where(scene.x > 500202, -9999.0).rio.write_nodata(-9999.0).chunk(20)
+    lazy = flexroad.fit(with_nodata, scene.dtm, scene.road_mask)
     missing = flexroad.fit(scene.dsm.where(scene.x > 500202), scene.dtm, scene.road_mask)
-    assert lacking.height(*CENTRE) == missing.height(*CENTRE)
+    assert lazy.height(*CENTRE) == missing.height(*CENTRE)
 
 
-def test_other_grid_is_resampled_with_a_warning(scene, surface):
+def test_fit_dtm_on_other_grid_is_resampled_with_warning(scene, surface):
     wider = flexroad.example(size_m=80)
     assert (
         flexroad.fit(scene.dsm, wider.dtm.sel(y=scene.y, x=scene.x), scene.road_mask).bounds == surface.bounds
@@ -183,12 +185,12 @@ def feet(array):
 def rotated(array):
     from affine import Affine
 
-    turn = Affine.translation(500200, 5600060) @ Affine.rotation(10) @ Affine.scale(1, -1)
-    return array.drop_vars(["x", "y"]).rio.write_transform(turn)
+    transform = Affine.translation(500200, 5600060) @ Affine.rotation(10) @ Affine.scale(1, -1)
+    return array.drop_vars(["x", "y"]).rio.write_transform(transform)
 
 
 @pytest.mark.parametrize(
-    ("layer", "spoil", "message"),
+    ("layer", "change", "message"),
     [
         ("dsm", lambda a: a.drop_vars("spatial_ref"), "dsm has no CRS; write it"),
         ("dtm", lambda a: a.rio.write_crs(4326), "dtm is in EPSG:4326, a geographic CRS in degrees"),
@@ -211,23 +213,23 @@ def rotated(array):
         ("dsm", lambda a: a[:1], "dsm has 1 x 60 cells; give at least 2 x 2"),
     ],
 )  # fmt: skip
-def test_unusable_array_is_refused_in_one_line(scene, layer, spoil, message):
+def test_fit_unusable_array_raises_one_line(scene, layer, change, message):
     plain = {name: scene[name].copy() for name in ("dsm", "dtm", "road_mask")}
     for array in plain.values():
         array.attrs = {}
     with pytest.raises(flexroad.TaskError, match=message) as error:
-        flexroad.fit(**{**plain, layer: spoil(plain[layer])})
+        flexroad.fit(**{**plain, layer: change(plain[layer])})
     assert "\n" not in str(error.value)
 
 
-def test_unknown_configuration_or_variant_is_refused(scene):
+def test_fit_unknown_configuration_or_variant_raises(scene):
     with pytest.raises(flexroad.ConfigError, match="did you mean nightly"):
         flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, config="nightli")
     with pytest.raises(flexroad.ConfigError, match="no variant 'plane'"):
         flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, variant="plane")
 
 
-def test_surface_to_xarray_has_heights_and_road(surface):
+def test_surface_to_xarray_has_height_and_road(surface):
     raster = surface.to_xarray()
     assert raster.rio.crs.to_epsg() == 25832
     assert tuple(raster.rio.bounds()) == surface.bounds
@@ -241,7 +243,7 @@ def test_surface_to_xarray_has_heights_and_road(surface):
         surface.to_xarray(0)
 
 
-def test_surface_survives_its_file(surface, tmp_path):
+def test_surface_saved_and_opened_is_equal(surface, tmp_path):
     surface.save(tmp_path / "road.npz")
     again = flexroad.open_surface(tmp_path / "road.npz")
     assert repr(again) == repr(surface)
@@ -252,7 +254,7 @@ def test_surface_survives_its_file(surface, tmp_path):
         flexroad.open_surface(tmp_path / "road.npz")
 
 
-def test_plane_and_raster_are_surfaces_too(scene, tmp_path):
+def test_fit_plane_and_raster_have_heights_but_no_file(scene, tmp_path):
     for variant, kind in (("plane", "plane"), ("rgt", "raster")):
         flat = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, "ablation", variant)
         assert repr(flat).startswith(f"<flexroad.Surface: {kind}, config ablation>")
@@ -261,7 +263,7 @@ def test_plane_and_raster_are_surfaces_too(scene, tmp_path):
             flat.save(tmp_path / "flat.npz")
 
 
-def test_mesh_lies_on_the_surface(surface):
+def test_surface_to_mesh_has_surface_heights(surface):
     mesh = surface.to_mesh()
     east, north, up = (mesh.vertices + mesh.metadata["origin"]).T
     np.testing.assert_allclose(up, surface.height(east, north), atol=1e-6)
@@ -271,7 +273,7 @@ def test_mesh_lies_on_the_surface(surface):
     assert (upright.face_normals[:, 1] > 0).all()
 
 
-def test_run_to_xarray_is_lazy_and_equals_the_surface(city):
+def test_run_to_xarray_is_lazy_and_equals_heights(city):
     run = flexroad.open_run(city / "runs" / "city")
     raster = run.to_xarray()
     assert raster.height.chunks == ((60,), (60, 60))
@@ -291,7 +293,7 @@ def test_run_to_xarray_is_lazy_and_equals_the_surface(city):
         run.to_xarray((1, 1, 0, 0))
 
 
-def test_run_to_xarray_needs_geotiffs(city, tmp_path):
+def test_run_to_xarray_without_geotiffs_raises(city, tmp_path):
     (tmp_path / "light.yaml").write_text("extends: nightly\nexport: {formats: [npz]}\n")
     catalog = Catalog.read(city / "survey" / "catalog.parquet")
     run = Run.create(tmp_path / "run", load_config(tmp_path / "light.yaml"), catalog)
@@ -299,7 +301,7 @@ def test_run_to_xarray_needs_geotiffs(city, tmp_path):
         flexroad.open_run(run.path).to_xarray()
 
 
-def test_run_lists_failures(city, tmp_path):
+def test_run_with_failed_tile_lists_failures(city, tmp_path):
     catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
     (tmp_path / "survey" / "dsm" / "499980_5599980.tif").unlink()
     run = Run.create(tmp_path / "run", load_config("nightly"), catalog)
