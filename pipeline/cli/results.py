@@ -80,6 +80,4 @@ def query(
 
     outside = query_csv(path, points, variant, sys.stdout)
     if outside:
-        typer.echo(
-            f"note: {outside} points lie on no finished tile; their columns are empty", err=True
-        )
+        typer.echo(f"note: {outside} points lie on no finished tile; their columns are empty", err=True)

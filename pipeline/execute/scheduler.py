@@ -38,9 +38,9 @@ def task_function() -> Callable[[bytes, str], tuple[str, Any]]:
 def retry_blocker(client_id: str, check: str) -> SchedulerPlugin:
     """Return a scheduler plugin that fails a client's tasks at the first death of their worker.
 
-    By default a scheduler retries such tasks on other workers, as often as its setting
-    ``distributed.scheduler.allowed-failures`` says, so that a tile that kills its worker would kill others,
-    too. Tasks of other clients are not affected. When the client disconnects or is killed, the plugins are
+    By default a scheduler retries such tasks on other workers (setting
+    ``distributed.scheduler.allowed-failures``), so that a tile that kills its worker would kill others, too.
+    Tasks of other clients are not affected. When the client disconnects or is killed, the plugins are
     removed.
     """
 

@@ -93,7 +93,7 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
         f"confidence {shift.confidence:.2f})"
     )
     if not coregistration.matters(shift, cell, scatter):
-        return Finding(f"dop: {measured}: not clearly off")
+        return Finding(f"dop: {measured}: no significant shift")
     return Finding(
         f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",
         fault=True,

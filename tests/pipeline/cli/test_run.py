@@ -46,10 +46,10 @@ def nightly(survey, tmp_path) -> list:
 
 
 @pytest.fixture
-def alarm(tmp_path):
+def notification(tmp_path):
     """A notification command that stores what it receives; ``received`` returns and removes it."""
 
-    class Alarm:
+    class Notification:
         words = ("--on-failure", f"cat > {tmp_path}/received.json")
 
         @property
@@ -59,17 +59,17 @@ def alarm(tmp_path):
             path.unlink(missing_ok=True)
             return summary
 
-    return Alarm()
+    return Notification()
 
 
-def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, alarm, tmp_path):
+def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey, notification, tmp_path):
     whole = Catalog.read(survey)
     Catalog(whole.tiles[:3]).write(survey)
-    said = flexroad(*nightly, *alarm.words)
+    said = flexroad(*nightly, *notification.words)
     assert "3 tiles: 3 done (0 cached), 0 failed, 0 pending; 3 new, 0 changed, 0 vanished; " in said
     Catalog(whole.tiles[1:]).write(survey)
     os.utime(whole.tiles[1].paths(whole.tiles[1].layer("dsm"))[0], (1, 1))
-    said = flexroad(*nightly, *alarm.words)
+    said = flexroad(*nightly, *notification.words)
     assert "3 tiles: 3 done (1 cached), 0 failed, 0 pending; 1 new, 1 changed, 1 vanished; " in said
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["exit_code"], summary["new"], summary["cached"]) == (0, 1, 1)
@@ -80,17 +80,19 @@ def test_run_repeated_counts_new_changed_and_vanished(flexroad, nightly, survey,
     product.write_bytes(data)
     assert "3 done (3 cached)" in flexroad(*nightly)
     assert "3 done (2 cached)" in flexroad(*nightly, "--verify")
-    assert alarm.received is None
+    assert notification.received is None
     states = json.loads((tmp_path / "run" / "tiles.geojson").read_text())["features"]
     assert [state["properties"]["state"] for state in states] == ["cached", "done", "cached"]
 
 
-def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(flexroad, nightly, survey, alarm, tmp_path):
+def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(
+    flexroad, nightly, survey, notification, tmp_path
+):
     tiles = Catalog.read(survey).tiles[:2]
     Catalog(tiles).write(survey)
     tiles[1].paths(tiles[1].layer("dtm"))[0].unlink()
-    flexroad(*nightly, *alarm.words, "--prometheus", tmp_path / "run.prom", expect=1)
-    received = alarm.received
+    flexroad(*nightly, *notification.words, "--prometheus", tmp_path / "run.prom", expect=1)
+    received = notification.received
     assert (received["exit_code"], received["failed"], received["interrupted"]) == (1, 1, False)
     assert received["failures"][0]["tile_id"] == tiles[1].id
     assert "2 tiles: 1 done (0 cached), 1 failed" in received["text"]
@@ -102,34 +104,36 @@ def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(flexroad, nightly
     assert (values["flexroad_run_exit_code"], values["flexroad_run_running"]) == (1, 0)
 
 
-def test_run_that_cannot_start_notifies(flexroad, nightly, alarm, tmp_path, monkeypatch):
-    said = flexroad(*nightly, *alarm.words, "--executor", "x", expect=2)
-    received = alarm.received
+def test_run_that_cannot_start_notifies(flexroad, nightly, notification, tmp_path, monkeypatch):
+    said = flexroad(*nightly, *notification.words, "--executor", "x", expect=2)
+    received = notification.received
     assert received["exit_code"] == 2
     assert "could not start: --executor x: there are dask and serial" in received["text"]
     assert "dask and serial" in said
     # There is no summary of this run.
     assert "tiles" not in received
     with run_lock(tmp_path / "run"):
-        flexroad(*nightly, *alarm.words, expect=2)
-    assert f"is in use by pid {os.getpid()}" in alarm.received["text"]
-    flexroad(*nightly, "--wrokers", 2, *alarm.words, expect=2)
-    assert "the command line could not be read" in alarm.received["text"]
-    monkeypatch.setenv("FLEXROAD_ON_FAILURE", alarm.words[1])
+        flexroad(*nightly, *notification.words, expect=2)
+    assert f"is in use by pid {os.getpid()}" in notification.received["text"]
+    flexroad(*nightly, "--wrokers", 2, *notification.words, expect=2)
+    assert "the command line could not be read" in notification.received["text"]
+    monkeypatch.setenv("FLEXROAD_ON_FAILURE", notification.words[1])
     flexroad("rerun", tmp_path / "nowhere", expect=2)
-    assert "is no run" in alarm.received["text"]
+    assert "is no run" in notification.received["text"]
     flexroad("status", tmp_path / "nowhere", "--wach", expect=2)
-    assert alarm.received is None
+    assert notification.received is None
 
 
-def test_run_interrupted_notifies_and_failed_notification_only_warns(flexroad, nightly, alarm, monkeypatch):
+def test_run_interrupted_notifies_and_failed_notification_only_warns(
+    flexroad, nightly, notification, monkeypatch
+):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("flexroad.pipeline.run.runner.run_tiles", interrupted)
-    said = flexroad(*nightly, *alarm.words, expect=130)
+    said = flexroad(*nightly, *notification.words, expect=130)
     assert "interrupted; the same command goes on from here" in said
-    assert alarm.received["exit_code"] == 130
+    assert notification.received["exit_code"] == 130
     said = flexroad(*nightly, "--on-failure", "exit 9", expect=130)
     assert "warning: --on-failure: `exit 9` ended with exit code 9" in said
 
