@@ -1,10 +1,10 @@
-"""Tiny DINOv2 models with random weights, saved as folders, so that tests need no download."""
+"""Tiny DINOv2 models with random weights, saved as folders, for tests without a download."""
 
 from pathlib import Path
 
 
 def save_backbone(folder: Path, registers: int = 0, seed: int = 0, hidden_size: int = 48) -> Path:
-    """Save a model of three layers; with ``registers`` > 0 it is a DINOv2 model with registers."""
+    """Save a model of three layers; with ``registers`` above 0 it is a model with register tokens."""
     import torch
     from transformers.models.dinov2.configuration_dinov2 import Dinov2Config
     from transformers.models.dinov2.modeling_dinov2 import Dinov2Model
@@ -23,7 +23,7 @@ def save_backbone(folder: Path, registers: int = 0, seed: int = 0, hidden_size: 
         "mlp_ratio": 2,
         "image_size": 56,
         "patch_size": 14,
-        # With default weights random layers hardly change their input; larger ones let tokens interact.
+        # Random layers hardly change their input; larger weights make tokens attend to others.
         "initializer_range": 0.1,
     }
     if registers:

@@ -8,7 +8,7 @@ from pyproj import CRS
 
 
 def write_cloud(path: Path, xyz, kind=1, crs=None, colour=None, withheld=None, scale=0.01) -> Path:
-    """Write a LAS or LAZ file of points ``(n, 3)`` with one class or one per point and colours ``(n, 3)``."""
+    """Write a LAS or LAZ file of points ``(n, 3)``; one class for all or per point; colours ``(n, 3)``."""
     xyz = np.asarray(xyz, np.float64).reshape(-1, 3)
     header = laspy.LasHeader(point_format=6 if colour is None else 7, version="1.4")
     header.scales = [scale] * 3

@@ -1,4 +1,4 @@
-"""Synthetic photographs of a hill from known positions, with the EXIF tags of a drone."""
+"""Rendered photographs of a synthetic hill from given positions, with the tags that a drone writes."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -20,23 +20,23 @@ FLYING_M = 40.0
 
 
 @dataclass(frozen=True)
-class Photo:
-    """One synthetic photograph."""
+class Photograph:
+    """One photograph."""
 
     path: Path
     centre: np.ndarray
-    """Easting, northing and height of the camera (m)."""
+    """Easting, northing, height."""
     rotation: np.ndarray
-    """Rotation matrix from world to camera, ``(3, 3)``."""
+    """World to camera."""
 
     def pixels(self, points):
         """Return column and row of world points, ``(n, 2)``."""
-        camera = (points - self.centre) @ self.rotation.T
-        return FOCAL * camera[:, :2] / camera[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+        local = (points - self.centre) @ self.rotation.T
+        return FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)
 
 
 def ground(easting, northing):
-    """Return the true height (m): hills 3 m high and about 30 m wide on a slope."""
+    """Return the true height (m): waves 3 m high, about 30 m long, on a slope."""
     x, y = easting - CORNER[0], northing - CORNER[1]
     return DATUM_M + 1.5 * np.sin(x / 5) * np.cos(y / 6) + 0.03 * x
 
@@ -52,7 +52,7 @@ def texture():
 
 
 def photographs(folder, **tags):
-    """Write two strips of four nadir photographs with small rotations and tilts; return them."""
+    """Write two strips of four nadir photographs with small rotations; return them."""
     rng = np.random.default_rng(5)
     colours, photos = texture(), []
     for number in range(8):
@@ -63,28 +63,28 @@ def photographs(folder, **tags):
         path = folder / f"DJI_{number:04}.JPG"
         image = render(centre, rotation, colours)
         Image.fromarray(image).save(path, quality=95, exif=exif(centre, **tags))
-        photos.append(Photo(path, centre, rotation))
+        photos.append(Photograph(path, centre, rotation))
     return photos
 
 
 def render(centre, rotation, colours):
-    """Return the image of the ground in a camera, ``(h, w, 3)``."""
+    """Return the image of the ground from a camera, ``(h, w, 3)``."""
     col, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = (
         np.stack([(col - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones(col.shape)], -1) @ rotation
     )
     height = np.full(col.shape, DATUM_M)
     for _ in range(25):
-        # The ground is less steep than the rays, so that the fixed-point iteration converges.
-        point = centre + rays * ((height - centre[2]) / rays[..., 2])[..., None]
-        height = ground(point[..., 0], point[..., 1])
-    texel = [(point[..., axis] - CORNER[axis]) / TEXEL_M - 0.5 for axis in (1, 0)]
+        # The ground is less steep than the rays, so this fixed-point iteration converges.
+        place = centre + rays * ((height - centre[2]) / rays[..., 2])[..., None]
+        height = ground(place[..., 0], place[..., 1])
+    texel = [(place[..., axis] - CORNER[axis]) / TEXEL_M - 0.5 for axis in (1, 0)]
     bands = [map_coordinates(colours[..., band], texel, order=1, mode="mirror") for band in range(3)]
     return np.rint(np.stack(bands, -1)).astype(np.uint8)
 
 
 def exif(centre, film_mm=FILM_MM, offset=(0, 0, 0), model="Made"):
-    """Return the EXIF tags of a drone at ``centre`` with a GPS error of ``offset`` (m)."""
+    """Return a drone's tags for a camera at ``centre`` whose GNSS position has the error ``offset`` (m)."""
     tags = Image.Exif()
     tags[ExifTags.Base.Make], tags[ExifTags.Base.Model] = "Test", model
     detail = tags.get_ifd(ExifTags.IFD.Exif)
@@ -107,7 +107,7 @@ def exif(centre, film_mm=FILM_MM, offset=(0, 0, 0), model="Made"):
 
 
 def _rotation(roll, pitch, yaw):
-    """Return the rotation from world to camera: a nadir view with row 0 in the north, then rotated."""
+    """Return the rotation from world to camera: nadir view, columns east, rows south, then rotated."""
     down = np.diag([1.0, -1.0, -1.0])
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])

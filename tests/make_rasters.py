@@ -1,4 +1,4 @@
-"""Small raster files for tests, in the formats of survey data."""
+"""Small raster files for tests, in formats that surveys deliver."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def write(
     tags: dict[str, str] | None = None,
     **profile,
 ) -> Path:
-    """Write one band with its north-west corner at (``west``, ``north``)."""
+    """Write a raster of one band with its north-west corner at ``west`` and ``north``."""
     values = np.asarray(values)
     path.parent.mkdir(parents=True, exist_ok=True)
     form = {"driver": driver, "dtype": values.dtype, "count": 1, "crs": crs, **profile}
@@ -41,7 +41,7 @@ def write(
 
 
 def write_xyz(path: Path, values, west: float, north: float, *, northward: bool = False) -> Path:
-    """Write one point per line, as state surveys do; ``northward`` starts in the south-west."""
+    """Write one point per line, as state surveys do; with ``northward`` rows start in the south."""
     values = np.asarray(values, dtype=float)
     rows = range(values.shape[0])
     lines = [

@@ -9,16 +9,15 @@ from flexroad.catalog import Grid
 from flexroad.tasks.types import Source, TileData
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 100, 100)
-"""The grid of the tile with the roads."""
+"""The tile that the roads lie on."""
 
 
-def on_grid(*offsets: tuple[float, float]) -> list[tuple[float, float]]:
-    """Return coordinates from offsets (m) from the grid's south-west corner."""
-    return [(GRID.west + x, GRID.south + y) for x, y in offsets]
+def on_grid(*places: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return eastings and northings of places relative to the grid's south-west corner."""
+    return [(GRID.west + x, GRID.south + y) for x, y in places]
 
 
 def write(path: Path, shapes, crs: str | None = GRID.crs, layer: str | None = None, **columns) -> Path:
-    """Write shapes with attribute columns to a vector file."""
     geopandas.GeoDataFrame(columns or {"id": range(len(shapes))}, geometry=shapes, crs=crs).to_file(
         path, layer=layer
     )
@@ -26,7 +25,7 @@ def write(path: Path, shapes, crs: str | None = GRID.crs, layer: str | None = No
 
 
 def tile(*paths: Path, grid: Grid = GRID, core: Grid | None = None, crs: str | None = None) -> TileData:
-    """A flat tile with these road files; without files it has no layer of roads."""
+    """Return a flat tile whose layer ``roads`` has these files; without files it has no such layer."""
     flat = np.zeros(grid.shape)
     source = Source("roads", paths, crs) if paths else None
     return TileData("a", grid, core or grid, flat, flat, roads=source)
@@ -39,14 +38,13 @@ OSM = """<?xml version="1.0"?><osm version="0.6">
 
 
 def write_osm(path: Path, ways: dict[str, list[tuple[float, float]]]) -> Path:
-    """Write an OSM XML file from ``{"k=v;k=v": [(longitude, latitude), ...]}``; equal points share a node."""
-    points = dict.fromkeys(point for way in ways.values() for point in way)
-    numbers = {point: i + 1 for i, point in enumerate(points)}
+    """Write an OSM file; ways by tags ``k=v;k=v`` as longitudes and latitudes; equal places are one node."""
+    numbers = {place: i + 1 for i, place in enumerate(dict.fromkeys(p for way in ways.values() for p in way))}
     nodes = [f'<node id="{i}" lon="{x:.9f}" lat="{y:.9f}"/>' for (x, y), i in numbers.items()]
     lines = []
-    for i, (tags, way) in enumerate(ways.items()):
-        tag_elements = "".join('<tag k="{}" v="{}"/>'.format(*tag.split("=")) for tag in tags.split(";"))
-        refs = "".join(f'<nd ref="{numbers[point]}"/>' for point in way)
-        lines.append(f'<way id="{i + 1}">{refs}{tag_elements}</way>')
+    for i, (tags, places) in enumerate(ways.items()):
+        xml_tags = "".join('<tag k="{}" v="{}"/>'.format(*tag.split("=")) for tag in tags.split(";"))
+        refs = "".join(f'<nd ref="{numbers[place]}"/>' for place in places)
+        lines.append(f'<way id="{i + 1}">{refs}{xml_tags}</way>')
     path.write_text(OSM.format(nodes="\n".join(nodes), ways="\n".join(lines)))
     return path

@@ -1,4 +1,4 @@
-"""Published results: pages match the metrics file beside them, and texts quote numbers of the tables."""
+"""The published results stay true: pages are those of the figures beside them, and prose quotes them."""
 
 import re
 from pathlib import Path
@@ -13,40 +13,40 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
 LARGEST_BYTES = 300_000
 NUMBER = re.compile(r"(?<![\w.])(?:\d+\.\d+|[+-]\d+%)(?![\w.])")
-"""A number that looks like a result: a decimal, or a signed change in percent."""
+"""What a reader would take for a result: a decimal, or a signed change in percent."""
 QUOTED = re.compile(r"<!-- results -->(.*?)<!-- /results -->", flags=re.DOTALL)
 
 
 def stale(folder: Path) -> list[str]:
-    """Return the pages that differ from those written from the folder's metrics."""
-    expected = pages(read_evidence(folder))
-    return [name for name, text in expected.items() if (folder / name).read_text() != text]
+    """Return the pages that are not what the folder's figures give."""
+    made = pages(read_metrics_data(folder))
+    return [name for name, text in made.items() if (folder / name).read_text() != text]
 
 
-def not_in_tables(text: str, folder: Path) -> list[str]:
-    """Return the numbers in a text that are in none of the folder's tables."""
-    numbers = set(NUMBER.findall((folder / "tables.md").read_text()))
-    return [number for number in NUMBER.findall(text) if number not in numbers]
+def unfounded(text: str, folder: Path) -> list[str]:
+    """Return the numbers in a text that stand in none of the folder's tables."""
+    known = set(NUMBER.findall((folder / "tables.md").read_text()))
+    return [number for number in NUMBER.findall(text) if number not in known]
 
 
 def prose(folder: Path) -> dict[str, str]:
-    """Return the texts that quote the tables: pages beside them and marked parts of README, by name."""
+    """Return the texts that quote the tables: pages beside them, and marked parts of README."""
     generated = ("tables.md", "figures.md")
     texts = {page.name: page.read_text() for page in folder.glob("*.md") if page.name not in generated}
     return texts | {"README.md (quoted)": "".join(QUOTED.findall((ROOT / "README.md").read_text()))}
 
 
 @pytest.mark.skipif(not RESULTS.is_dir(), reason="no results are published yet")
-def test_published_pages_match_metrics():
+def test_published_results_are_those_of_their_figures():
     assert (RESULTS / FILE).stat().st_size < LARGEST_BYTES
     assert stale(RESULTS) == []
     for name, text in prose(RESULTS).items():
-        assert not_in_tables(text, RESULTS) == [], name
+        assert unfounded(text, RESULTS) == [], name
 
 
 @pytest.fixture
 def published(tmp_path):
-    """A folder as `flexroad tables` writes it, of tiles with the values of the paper."""
+    """A folder as `flexroad tables` writes it, over tiles with the paper's own figures."""
     import pandas as pd
 
     from flexroad.pipeline.reproduce.metrics_data import MetricsData
@@ -67,26 +67,26 @@ def published(tmp_path):
     return tmp_path
 
 
-def test_stale_page_changed_is_listed(published):
+def test_a_page_out_of_date_is_noticed(published):
     assert stale(published) == []
     page = published / "tables.md"
     page.write_text(page.read_text().replace("15.550", "15.551", 1))
     assert stale(published) == ["tables.md"]
 
 
-def test_stale_metrics_changed_lists_pages(published):
-    evidence = read_evidence(published)
-    evidence.rows.loc[0, "l2_road_m"] += 0.01
-    write_evidence(evidence, published)
+def test_figures_out_of_date_are_noticed(published):
+    data = read_metrics_data(published)
+    data.rows.loc[0, "l2_road_m"] += 0.01
+    write_metrics_data(data, published)
     assert "tables.md" in stale(published)
 
 
-def test_not_in_tables_other_number_is_listed(published):
-    assert not_in_tables("FlexRoad 0.483 m, RGT 0.415 m, -76%, 0.55 of 24 tiles", published) == ["0.55"]
-    assert not_in_tables("road L2 is 0.999 m", published) == ["0.999"]
+def test_a_number_from_nowhere_is_noticed(published):
+    assert unfounded("FlexRoad 0.483 m, RGT 0.415 m, -76%, 0.55 of 24 tiles", published) == ["0.55"]
+    assert unfounded("road L2 is 0.999 m", published) == ["0.999"]
 
 
-def test_docs_causes_quotes_changes_by_quarter():
+def test_the_causes_quote_the_figures_by_quarter():
     import importlib.util
 
     import pandas as pd

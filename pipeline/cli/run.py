@@ -297,7 +297,7 @@ def _print_status(run: Run, as_json: bool) -> None:
     from flexroad.pipeline.run.status import progress, summary
 
     lock_owner = owner(run.path)
-    alive = lock_owner if lock_owner and not death_of(lock_owner) else None
+    alive = lock_owner if lock_owner and not exit_reason(lock_owner) else None
     if as_json:
         values = asdict(summary(run))
         values["failures"] = [
@@ -309,6 +309,6 @@ def _print_status(run: Run, as_json: bool) -> None:
     state, pace = progress(run, alive) if alive else (summary(run), "")
     typer.echo(format_summary(state))
     if lock_owner:
-        typer.echo(at_work(lock_owner) + pace)
+        typer.echo(describe_owner(lock_owner) + pace)
     for failure in state.failures:
         typer.echo(f"  {failure.notice}")
