@@ -18,13 +18,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 from uuid import uuid4
 
-from upath import UPath
+if TYPE_CHECKING:
+    from upath import UPath
 
-Location = Path | UPath
+Location: TypeAlias = "Path | UPath"
 
 TRIES = 5
 """Attempts per request before it fails, unless AWS_MAX_ATTEMPTS is set."""
@@ -59,13 +60,15 @@ def parse_location(where: str | Location) -> Location:
     OSError
         If it is in a bucket and s3fs is not installed; the message gives the install command.
     """
-    if isinstance(where, UPath):
+    if not isinstance(where, str | Path):
         return where
     text = str(where)
     bucket = _BUCKET.match(text)
     if bucket is None:
         return Path(where)
     try:
+        from upath import UPath
+
         remote: UPath = UPath("s3://" + text[bucket.end() :], **_s3_options())
         remote.fs.retries = ROUNDS
     except ImportError as error:

@@ -15,19 +15,21 @@ from functools import lru_cache
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import finalize
 
 import numpy as np
 import shapely
 from pyproj.exceptions import ProjError
-from upath import UPath
 
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.storage.paths import FileStat, Location, fetch, stat
 from flexroad.tasks.errors import TaskError
+
+if TYPE_CHECKING:
+    from upath import UPath
 
 SQUARE_M = 4000.0
 """Side of the squares in which indexed files are read (m)."""

@@ -18,7 +18,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.objective import NEIGHBOURS, Objective
-from flexroad.tasks.spline.space import start_heights
+from flexroad.tasks.spline.space import Space, start_heights
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
@@ -40,7 +40,7 @@ def case() -> tuple[TileData, RoadClusters]:
 class Dense:
     """The objective computed with products of full basis matrices."""
 
-    def __init__(self, objective: Objective, space: nurbs.Space) -> None:
+    def __init__(self, objective: Objective, space: Space) -> None:
         knots_u, knots_v, (p, q) = space
         self.objective = objective
         self.u, _ = basis_matrix(knots_u, p, np.linspace(0, 1, SIZE))
@@ -86,7 +86,7 @@ class Dense:
 class PointByPoint(Dense):
     """The objective in plain Python, with the basis computed at every cell."""
 
-    def __init__(self, objective: Objective, space: nurbs.Space) -> None:
+    def __init__(self, objective: Objective, space: Space) -> None:
         super().__init__(objective, space)
         (self.knots_u, self.knots_v), self.degree = (k.tolist() for k in space[:2]), space[2][0]
 

@@ -21,12 +21,12 @@ POINTS = 4_000_000
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 DOP_CELL = 0.5
 STEPS = {
-    "surface": ("tops.py", "highest"),
-    "spikes": ("tops.py", "spikes"),
-    "voids": ("voids.py", "fill"),
-    "ground filter": ("ground.py", "ground"),
-    "terrain": ("terrain.py", "triangulated"),
-    "photo": ("topcolour.py", "photo"),
+    "surface": ("max_height.py", "highest"),
+    "spikes": ("max_height.py", "spikes"),
+    "voids": ("fill_voids.py", "fill"),
+    "ground filter": ("ground_filter.py", "ground"),
+    "terrain": ("dtm.py", "triangulated"),
+    "photo": ("orthophoto.py", "photo"),
 }
 METHODS = {
     "classes": Options(despike_m=5),
