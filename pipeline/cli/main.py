@@ -30,7 +30,7 @@ app = typer.Typer(
 app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
-for command in (train, run, rerun, status, clean, report, tables, figures, query):
+for command in (run, rerun, status, clean, report, query, tables, figures, train):
     app.command(cls=Command)(command)
 
 
