@@ -268,7 +268,7 @@ def bad_inputs(folder: Path):
         "noise": ([write_cloud(folder / "noise.laz", xyz, 7, crs)], {}, "noise.laz has only noise points"),
         "far": ([write_cloud(folder / "far.laz", distant, 2, crs)], {}, "far.laz alone spans 9000.*--cell"),
         "cells": ([good], {"cell_m": 1.0, "dop_cell_m": 0.3}, "--dop-cell 0.3: one must be a multiple"),
-        "unit": ([good], {"height_unit": "yard"}, "--height-unit yard: there is metre, foot, us-foot"),
+        "unit": ([good], {"height_unit": "yard"}, "--height-unit yard: must be one of metre, foot, us-foot"),
         "target": ([good], {"to_crs": "EPSG:4326"}, "--to-crs EPSG:4326 is in degrees"),
     }  # fmt: skip
 
