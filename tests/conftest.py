@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,10 @@ import yaml
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from tests import command_line
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},
