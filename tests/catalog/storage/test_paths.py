@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-import fsspec.registry
 import pytest
+from fsspec.registry import _registry
 
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import StatCache, parse_location
@@ -67,7 +67,7 @@ def test_location_text_round_trip(tmp_path, bucket):
 
 def test_parse_location_without_s3fs_names_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    monkeypatch.delitem(fsspec.registry._registry, "s3", raising=False)
+    monkeypatch.delitem(_registry, "s3", raising=False)
     with pytest.raises(OSError, match=r"install it with pip install 'flexroad\[s3\]'.*s3://bucket/name"):
         parse_location("s3://bucket/name")
 
