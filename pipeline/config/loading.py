@@ -24,9 +24,6 @@ RENAMED = {
     "doubted_m2": "; it is called suspect_m2",
     "solver": SPLINE,
     "smoothness": SPLINE,
-    "huber_m": SPLINE,
-    "bending_m3": SPLINE,
-    "bending_terrain": SPLINE,
 }
 """Option names of earlier versions and the hint for each."""
 
@@ -185,6 +182,8 @@ def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
     path = [str(part) for part in details["loc"][bool(method) :]]
     key = ".".join([where, *path])
     if details["type"] == "extra_forbidden":
+        if len(path) > 1:
+            return f"{key}: unknown key{RENAMED.get(path[-1]) or _hint(path[-1], _nested_keys(model))}"
         return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
     if details["type"] == "union_tag_invalid":
         tag = details["ctx"]["tag"]
@@ -208,10 +207,13 @@ def _keys(model: TypeAdapter[Any]) -> dict[str, list[str]]:
     schema = model.json_schema()
     tags = schema.get("discriminator", {}).get("mapping", {"": ""})
     parts = {tag: schema["$defs"][ref.rpartition("/")[2]] if ref else schema for tag, ref in tags.items()}
-    options = {tag: list(part.get("properties", {})) for tag, part in parts.items()}
-    # Nested options, such as those of the mask cleanup.
-    nested = [key for part in schema.get("$defs", {}).values() for key in part.get("properties", {})]
-    return {tag: sorted({*own, *(nested if tags == {"": ""} else ())}) for tag, own in options.items()}
+    return {tag: sorted(part.get("properties", {})) for tag, part in parts.items()}
+
+
+def _nested_keys(model: TypeAdapter[Any]) -> list[str]:
+    """Return the names of all options within options, such as those of the mask cleanup."""
+    parts = model.json_schema().get("$defs", {}).values()
+    return sorted({key for part in parts for key in part.get("properties", {})})
 
 
 def _main_variant(chains: Mapping[str, Any]) -> tuple[str, ...]:

@@ -68,6 +68,21 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
         ({"ecsrc": {"method": "planar", "bend": 0}}, "x: ecsrc.bend: input should be greater than"),
         ({"fit": {"degree": "three"}}, "x: fit.degree: input should be a valid integer"),
         ({"fit": "nurb"}, "x: fit: "),
+        (
+            {"segment": {"method": "vector", "cleanup": {"drop_m": 3}}},
+            "x: segment.cleanup.drop_m: unknown key; did you mean drop_m2?",
+        ),
+        (
+            {"fit": {"huber_m": 0.1}},
+            "x: fit.huber_m: unknown key; it is an option of method smoothing_spline, not of nurbs",
+        ),
+        ({"ecsrc": {"variant": "off"}}, "x: ecsrc.variant: unknown key; it is called method"),
+        ({"ecsrc": "grounded"}, "x: ecsrc: there is no method 'grounded'; it is called planar"),
+        ({"fit": {"solver": "irls"}}, "x: fit.solver: unknown key; the solver is a method of its own"),
+        (
+            {"segment": {"method": "vector", "hygiene": {}}},
+            "x: segment.hygiene: unknown key; it is called cleanup",
+        ),
         ({"fit": [1]}, "x: fit: expected a mapping of options, not [1]"),
         ({"variants": {"a": {"fitt": {}}}}, "x: variants.a.fitt: unknown key; did you mean fit?"),
         ({"variants": {"a": {"sample": {"road": 1}}}}, "x: variants.a.sample.road: unknown key"),
