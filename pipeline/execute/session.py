@@ -190,11 +190,8 @@ class Session(Generic[J, R]):
             future.result()
         elif future.status == "finished":
             yield from self._fetch(future, flight)
-        elif self.client.status == "running":
-            # Cancelled, but the scheduler is connected: the worker died before its result was fetched.
-            self.quarantined.append(flight.job)
         else:
-            raise self._cluster_lost()
+            self._cancelled(flight)
 
     def _fetch(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
@@ -202,14 +199,19 @@ class Session(Generic[J, R]):
         except KilledWorker as error:
             # The worker died after the job, before its result was transferred.
             yield from self._worker_died(flight, error)
-        except (CancelledError, OSError) as error:
-            if self.client.status != "running":
-                raise self._cluster_lost() from error
-            self.quarantined.append(flight.job)
+        except (CancelledError, OSError):
+            self._cancelled(flight)
         else:
             if fault:
                 raise ConfigError(fault)
             yield result
+
+    def _cancelled(self, flight: InFlight[J]) -> None:
+        """Quarantine a job without a result; raise an error if the scheduler is not connected any more."""
+        if self.client.status != "running":
+            raise self._cluster_lost()
+        # The worker died before its result was fetched.
+        self.quarantined.append(flight.job)
 
     def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
         if flight.reserved_worker:
