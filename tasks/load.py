@@ -168,8 +168,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     ]
     notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
     if absurd_cells:
-        cells = "1 cell" if absurd_cells == 1 else f"{absurd_cells} cells"
-        notes.append(f"{layer.name}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata")
+        notes.append(absurd_note(layer.name, absurd_cells))
     return _Mosaic(values, tuple(patches), tuple(notes))
 
 
@@ -185,9 +184,20 @@ def _reached(patch: RasterWindow, grid: Grid) -> Bools:
 def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
     """Return the patch with heights in metres, and the number of cells outside the range of heights."""
     values = patch.values * _unit(patch)[1]
-    absurd = (values < LOWEST_M) | (values > HIGHEST_M)
-    values[absurd] = np.nan
-    return replace(patch, values=values), int(np.count_nonzero(absurd))
+    return replace(patch, values=values), remove_absurd(values)
+
+
+def remove_absurd(heights: Floats) -> int:
+    """Set heights (m) outside `LOWEST_M` to `HIGHEST_M` to NaN, in place; return their number."""
+    absurd = (heights < LOWEST_M) | (heights > HIGHEST_M)
+    heights[absurd] = np.nan
+    return int(np.count_nonzero(absurd))
+
+
+def absurd_note(layer: str, count: int) -> str:
+    """Return the note on heights that `remove_absurd` removed from a layer."""
+    cells = "1 cell" if count == 1 else f"{count} cells"
+    return f"{layer}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
 
 
 def _unit(patch: RasterWindow) -> Unit:

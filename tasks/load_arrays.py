@@ -12,7 +12,7 @@ from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_project
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.raster import RasterGrid, RasterWindow, misalignment, resample_to
-from flexroad.tasks.load import HIGHEST_M, LOWEST_M, UNITS, Options
+from flexroad.tasks.load import UNITS, Options, absurd_note, remove_absurd
 from flexroad.tasks.types import Floats, TileData
 
 if TYPE_CHECKING:
@@ -194,11 +194,8 @@ def _grid(dsm: RasterWindow) -> Grid:
 
 def _absurd(patch: RasterWindow) -> str:
     """Set heights outside the valid range to NaN, as `load` does; return a note, or "" if there are none."""
-    absurd = (patch.values < LOWEST_M) | (patch.values > HIGHEST_M)
-    patch.values[absurd] = np.nan
-    if not absurd.any():
-        return ""
-    return f"{patch.name}: {absurd.sum()} cells outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
+    count = remove_absurd(patch.values)
+    return absurd_note(patch.name, count) if count else ""
 
 
 def _misfit(patch: RasterWindow, core: Grid) -> str:
