@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds, Grid
+from flexroad.catalog.storage.paths import atomic_path
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import sample, types
 from flexroad.tasks.errors import TaskError
@@ -246,7 +247,8 @@ class Surface:
                 for name, values in _masks(self.road, self.clusters, self.sampling, self.config).items():
                     with archive.open(f"{name}.npy", "w") as member:
                         np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
-        Path(path).write_bytes(buffer.getvalue())
+        with atomic_path(Path(path)) as temporary:
+            temporary.write_bytes(buffer.getvalue())
 
     def _valid(self, easting: Floats, northing: Floats) -> Bools:
         """Return which points are inside the bounds and where the survey has data."""
