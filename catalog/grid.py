@@ -105,6 +105,11 @@ class Grid:
         west, north = self.west - n * self.cell, self.north + n * self.cell
         return Grid(self.crs, west, north, self.cell, self.width + 2 * n, self.height + 2 * n)
 
+    def part(self, rows: slice, cols: slice) -> Grid:
+        """Return the grid of a part of the cells; the slices have a start and a stop."""
+        west, north = self.west + cols.start * self.cell, self.north - rows.start * self.cell
+        return Grid(self.crs, west, north, self.cell, cols.stop - cols.start, rows.stop - rows.start)
+
     def window(self, inner: Grid) -> tuple[slice, slice]:
         """Return the (row, col) slices of this grid that hold the cells of ``inner``.
 

@@ -25,7 +25,7 @@ from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs as fit
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.spline import adam
-from flexroad.tasks.spline.space import start_heights
+from flexroad.tasks.spline.space import Space, start_heights, surface_on
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
 
@@ -85,7 +85,7 @@ def experiment(tile, store: ArtefactStore) -> list[dict[str, float | str]]:
 def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
     """Fit like the pipeline, but start from the tile's mean height."""
     space = fit.space_of(data, options)
-    heights, datum = start_heights(data, clusters.mask, space, options.terrain)
+    heights, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = fit.objective_of(data, clusters.mask, space, datum, options)
     limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]
     schedule = adam.Schedule(
@@ -98,21 +98,16 @@ def level_start(data: TileData, clusters: RoadClusters, options: fit.Options) ->
 def squared(data: TileData, clusters: RoadClusters, options: fit.Options) -> NurbsSurface:
     """Fit by separable least squares with unit weights and without regulariser."""
     space = fit.space_of(data, options)
-    rows, cols = data.grid.shape
-    along_u = basis_matrix(space[0], space[2][0], np.linspace(0, 1, cols))[0]
-    along_v = basis_matrix(space[1], space[2][1], np.linspace(1, 0, rows))[0]
+    along_u = basis_matrix(space.knots_u, space.degree[0], space.u)[0]
+    along_v = basis_matrix(space.knots_v, space.degree[1], space.v)[0]
     target = np.where(clusters.mask, data.dsm, data.dtm)
     datum = float(target.mean())
     z = np.linalg.pinv(along_v) @ (target - datum) @ np.linalg.pinv(along_u).T
     return surface_of(data, space, z, np.ones_like(z), datum)
 
 
-def surface_of(data: TileData, space: fit.Space, a, w, datum: float) -> NurbsSurface:
-    east, north = data.grid.origin
-    return NurbsSurface(
-        crs=data.grid.crs, bounds=data.grid.hull, degree=space[2], knots_u=space[0], knots_v=space[1],
-        A=a, W=w, datum=datum, origin=(float(east), float(north)),
-    )  # fmt: skip
+def surface_of(data: TileData, space: Space, a, w, datum: float) -> NurbsSurface:
+    return surface_on(space, data.grid, data.grid.hull, a, w, datum)
 
 
 def by_spoilage(metrics: pd.DataFrame) -> pd.DataFrame:

@@ -78,30 +78,29 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         height to start from, or if the device is not available.
     """
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-    from flexroad.tasks.spline.space import start_heights
-    from flexroad.tasks.spline.surface import NurbsSurface
+    from flexroad.tasks.spline.space import start_heights, surface_on
 
     data, space = without_invalid_dtm(data, clusters), space_of(data, options)
-    start, datum = start_heights(data, clusters.mask, space, options.terrain)
+    start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
     z, weights = _adam(loss, start - datum, options)
-    return NurbsSurface.over(data.grid, space, weights * z, weights, datum)
+    return surface_on(space, data.grid, data.grid.hull, weights * z, weights, datum)
 
 
 def space_of(data: TileData, options: Options) -> Space:
-    """Return knots and degrees of the surface over a tile.
+    """Return the splines over a tile.
 
     Raises
     ------
     TaskError
         If the grid has fewer cells than control points.
     """
-    from flexroad.tasks.spline.space import points_at_spacing, spline_space
+    from flexroad.tasks.spline.space import clamped_space, points_at_spacing
 
     points = options.control_points
     if options.spacing_m is not None:
         points = points_at_spacing(data.grid, options.degree, options.spacing_m)
-    return spline_space(data.grid, options.degree, points)
+    return clamped_space(data.grid, options.degree, points)
 
 
 def objective_of(data: TileData, road: Bools, space: Space, datum: float, options: Options) -> Objective:
@@ -113,11 +112,10 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
         If there are fewer cells with a height than control points.
     """
     from flexroad.tasks.spline.objective import objective
-    from flexroad.tasks.spline.space import cells_with_height
+    from flexroad.tasks.spline.space import check_cells
 
-    n, m = (len(knots) - options.degree - 1 for knots in space[:2])
-    cells_with_height(data, road, (n, m))
     heights = np.where(road, data.dsm, data.dtm) - datum
+    check_cells(heights, space.points)
     factor = np.where(road, 1.0, options.lambda_terrain if options.terrain else 0.0)
     return objective(heights, factor, space, options.lambda_reg, options.weights == "free")
 

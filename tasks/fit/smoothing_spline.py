@@ -3,6 +3,11 @@
 The surface is the NURBS graph of `tasks.spline.surface` with unit weights. It minimises Huber's function of
 the height differences plus the bending energy of a thin plate that is stiffer on roads than beside them. The
 problem is convex; `tasks.spline.irls` solves it. docs/fit.md compares it with the paper's fit.
+
+Control points lie on the lattice of `tasks.spline.lattice`, which all tiles share. Those that act on a corner
+of the tile are fitted first, then those on its edges, each to the ground around it and without regard to the
+tile (`corner` and `edge`). `fit` holds them and fits the points inside to the tile's own cells. So two
+neighbours have one surface, although no tile waits for another (docs/mosaic.md).
 """
 
 from __future__ import annotations
@@ -13,12 +18,21 @@ import numpy as np
 from pydantic import Field
 
 from flexroad.tasks.options import Options as BaseOptions
-from flexroad.tasks.types import RoadClusters, TileData
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 if TYPE_CHECKING:
+    from flexroad.catalog.borders import Border
+    from flexroad.tasks.spline.frame import Corner, Edge, Frame
+    from flexroad.tasks.spline.lattice import Lattice, Range
+    from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 1
+VERSION = 2
+
+REACHES_M = (25.0, 50.0, 100.0)
+"""Distances from a corner or edge up to which its control points are fitted (m): the first that is enough."""
+BEYOND_DATA_M = 15.0
+"""The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 
 
 class Options(BaseOptions):
@@ -26,7 +40,9 @@ class Options(BaseOptions):
 
     method: Literal["smoothing_spline"] = "smoothing_spline"
     degree: int = Field(3, ge=2, le=10, description="degree of the basis along easting and northing")
-    spacing_m: float = Field(3.6, gt=0, description="distance of control points (m)")
+    spacing_m: float = Field(
+        3.6, gt=0, description="largest distance of control points (m); a tile is a whole number of distances"
+    )
     lambda_terrain: float = Field(0.3, ge=0, description="weight of the terrain's height differences")
     huber_m: float = Field(
         0.1, ge=0, description="differences below this (m) are squared, larger ones count linearly; 0 is L1"
@@ -41,8 +57,13 @@ class Options(BaseOptions):
     )
 
 
-def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
-    """Fit the surface to the DSM on filtered road cells and to the valid DTM elsewhere.
+def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None) -> NurbsSurface:
+    """Fit the surface to the DSM on filtered road cells and to the valid DTM elsewhere, on the tile's core.
+
+    Parameters
+    ----------
+    frame : Frame, optional
+        Control points on the tile's border, which are held; None fits all points to the tile alone.
 
     Raises
     ------
@@ -50,25 +71,155 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
+    from flexroad.tasks.spline.space import check_cells, surface_on
+
+    core = data.grid.window(data.core)
+    lattice = _lattice((data.core.width, data.core.height), data.core.cell, options)
+    (n, m), start = lattice.intervals, (core[0].stop, core[1].start)
+    space, _ = lattice.part(data.grid.shape, start, (0, n), (0, m))
+    check_cells(_ground(data, clusters)[core], space.points)
+    shape = space.points[1], space.points[0]
+    held = frame.control(shape) if frame else np.full(shape, np.nan)
+    z = _control_heights(data, clusters, lattice, start, (0, n), (0, m), held, options)
+    # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
+    return surface_on(space, data.core, data.core.bounds, z, np.ones_like(z), datum=0.0)
+
+
+def corner(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> Corner:
+    """Fit the control points that act on a corner of tiles to the ground around it.
+
+    Parameters
+    ----------
+    data : TileData
+        The cells of ``border.grid``.
+    clusters : RoadClusters
+        The filtered road there.
+    """
+    from flexroad.tasks.spline.frame import Corner, rounded
+
+    lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
+    k, j = lattice.lines_within(_reach(data, clusters, border))
+    held = np.full((2 * j + p, 2 * k + p), np.nan)
+    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, options)
+    return Corner(rounded(z[j : j + p, k : k + p]))
+
+
+def edge(
+    data: TileData,
+    road: RoadMask,
+    clusters: RoadClusters,
+    border: Border,
+    ends: tuple[Corner, Corner],
+    options: Options,
+) -> Edge:
+    """Fit the control points that act on an edge, but on none of its corners, to the ground around it.
+
+    Parameters
+    ----------
+    data, road, clusters : TileData, RoadMask, RoadClusters
+        The cells of ``border.grid``, their road mask and the filtered road.
+    ends : tuple of Corner
+        The corners at the western and eastern, or the southern and northern end; their points are held.
+    """
+    from flexroad.tasks.spline.frame import Edge, rounded
+
+    lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
+    (n, m), eastward = lattice.intervals, border.kind == "east"
+    k, j = lattice.lines_within(_reach(data, clusters, border))
+    u, v = ((0, n), (-j, j)) if eastward else ((-k, k), (0, m))
+    held = np.full((v[1] - v[0] + p, u[1] - u[0] + p), np.nan)
+    # Views of the points that act on the edge, (p, length): of those held, the first and last p are set.
+    acting = held[j : j + p] if eastward else held[:, k : k + p].T
+    acting[:, :p], acting[:, -p:] = (end.control if eastward else end.control.T for end in ends)
+    z = rounded(_control_heights(data, clusters, lattice, border.cell, u, v, held, options))
+    control = z[j : j + p, p:-p] if eastward else z[p:-p, k : k + p]
+    first, second = border.sides
+    outside = road.outside[first].ravel() | road.outside[second].ravel()
+    order = slice(None) if eastward else slice(None, None, -1)
+    return Edge(
+        control,
+        road=road.mask[second].ravel()[order],
+        kept=clusters.mask[second].ravel()[order],
+        inside=~outside[order],
+    )
+
+
+def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:
+    from flexroad.tasks.spline.lattice import Lattice
+
+    return Lattice.of(cells, cell, options.degree, options.spacing_m)
+
+
+def _ground(data: TileData, clusters: RoadClusters) -> Floats:
+    """Return the heights to fit, ``(H, W)``, m: the DSM's on the road, the valid DTM's elsewhere."""
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-    from flexroad.tasks.spline import space
+
+    return np.where(clusters.mask, data.dsm, without_invalid_dtm(data, clusters).dtm)
+
+
+def _reach(data: TileData, clusters: RoadClusters, border: Border) -> float:
+    """Return the distance from a corner or edge up to which it is fitted (m)."""
+    import scipy
+
+    missing = np.isnan(_ground(data, clusters))
+    if missing.all():
+        return REACHES_M[-1]
+    away = scipy.ndimage.distance_transform_edt(missing) * data.grid.cell
+    needed = BEYOND_DATA_M + max(float(away[side].max()) for side in border.sides)
+    return next((reach for reach in REACHES_M if reach >= needed), REACHES_M[-1])
+
+
+def _control_heights(
+    data: TileData, clusters: RoadClusters, lattice: Lattice, start: tuple[int, int], u: Range, v: Range,
+    held: Floats, options: Options,
+) -> Floats:  # fmt: skip
+    """Return the control heights (m) of a part of the lattice, fitted to the cells in it.
+
+    Points with a finite height in ``held`` keep it. The others are NaN if no cell has a height.
+    """
+    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+    from flexroad.tasks.spline.space import start_heights
+
+    space, window = lattice.part(data.grid.shape, start, u, v)
+    dsm, road = data.dsm[window], clusters.mask[window]
+    dtm = without_invalid_dtm(data, clusters).dtm[window]
+    ground = np.where(road, dsm, dtm)
+    if np.isnan(ground).all():
+        return held
+    first, datum = start_heights(dsm, dtm, road, space)
+    is_held = np.isfinite(held)
+    z = _minimum(
+        space,
+        ground - datum,
+        np.where(road, 1.0, options.lambda_terrain),
+        options.bending_m3 * np.where(road, 1.0, options.bending_terrain),
+        np.where(is_held, held, first) - datum,
+        is_held,
+        options,
+    )
+    return np.where(is_held, held, z + datum)
+
+
+def _minimum(
+    space: Space, heights: Floats, weight: Floats, stiffness: Floats, first: Floats, held: Bools,
+    options: Options,
+) -> Floats:  # fmt: skip
+    """Return the control heights above the datum, ``(m, n)``, that minimise the loss over a raster."""
     from flexroad.tasks.spline.irls import HuberObjective, minimise
     from flexroad.tasks.spline.objective import objective
-    from flexroad.tasks.spline.surface import NurbsSurface
     from flexroad.tasks.spline.thin_plate import bending_energy
 
-    data, road = without_invalid_dtm(data, clusters), clusters.mask
-    points = space.points_at_spacing(data.grid, options.degree, options.spacing_m)
-    knots = space.spline_space(data.grid, options.degree, points)
-    start, datum = space.start_heights(data, road, knots)
-    cells = space.cells_with_height(data, road, points)
-    heights = np.where(road, data.dsm, data.dtm) - datum
-    loss = objective(heights, np.where(road, 1.0, options.lambda_terrain), knots)
-    west, south, east, north = data.grid.hull
+    n, m = space.points
+    if n > m:
+        # The shorter axis last: the band of the normal equations is then narrower.
+        turn = np.ascontiguousarray
+        return _minimum(
+            space.transposed, turn(heights.T), turn(weight.T), turn(stiffness.T), turn(first.T), turn(held.T),
+            options,
+        ).T  # fmt: skip
     # Divided by the number of cells with a height, like the differences, so that voids do not change the
     # balance.
-    stiffness = options.bending_m3 * (np.where(road, 1.0, options.bending_terrain) / cells)
-    bending = bending_energy(stiffness, knots, (east - west, north - south))
-    convex = HuberObjective(loss, start.shape, options.huber_m, bending)
-    z = minimise(convex, start - datum, options.iterations, options.stop_tolerance).z
-    return NurbsSurface.over(data.grid, knots, z, np.ones_like(z), datum)
+    bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)
+    loss = objective(heights, weight, space)
+    convex = HuberObjective(loss, first.shape, options.huber_m, bending, held)
+    return minimise(convex, first, options.iterations, options.stop_tolerance).z

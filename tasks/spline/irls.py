@@ -15,11 +15,11 @@ import numpy as np
 import scipy
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.normal_equations import band, factor, gram, pairs, solve
+from flexroad.tasks.spline.normal_equations import band, factor, gram, hold, pairs, solve
 from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.surface import dense
 from flexroad.tasks.spline.thin_plate import BendingEnergy
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 FINAL_M, INITIAL_M = 0.003, 0.03
 """Smaller differences get the weight of this value (m): in the last steps under L1, and in the first step."""
@@ -41,6 +41,8 @@ class HuberObjective:
     """Smaller differences d count as ``d^2 / (2 huber_m)``, others as ``|d| - huber_m / 2``; 0 is L1."""
     bending: BendingEnergy | None = None
     """Bending energy of the surface; None if the loss has the height differences only."""
+    held: Bools | None = None
+    """Control points that keep their height, ``(m, n)``; None if all are free."""
 
     @cached_property
     def along_v(self) -> Floats:
@@ -82,6 +84,9 @@ class HuberObjective:
         slope = self.along_v.T @ (weight * residuals) @ self.along_u
         if self.bending:
             slope += self.bending(z)[1]
+        if self.held is not None:
+            hold(lower, self.held, self.lags)
+            slope[self.held] = 0.0
         return factor(lower), slope
 
     def line_loss(

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 RIDGE = 1e-9
 """Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
@@ -60,6 +60,27 @@ def band(products: Floats) -> Floats:
             if k and l:
                 out[:, l:, k * n - l] += products[:, k, : n - l, l]
     return out.reshape(m * n, -1)
+
+
+def hold(lower: Floats, held: Bools, lags: int) -> None:
+    """Remove the equations of held control points from a lower band, in place: their step is then 0.
+
+    Parameters
+    ----------
+    lower : ndarray, (m * n, width)
+        As by `band`.
+    held : ndarray, (m, n)
+        Control points that keep their height.
+    lags : int
+        As in `gram`.
+    """
+    free = ~held.ravel()
+    mean = lower[:, 0].mean()
+    lower[~free] = 0.0
+    n = held.shape[1]
+    for d in {abs(down * n + across) for down in range(lags) for across in range(1 - lags, lags)} - {0}:
+        lower[: len(free) - d, d] *= free[d:]
+    lower[~free, 0] = mean
 
 
 def factor(lower: Floats) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.spline.space import Space
 from flexroad.tasks.spline.surface import Starts, basis
 from flexroad.tasks.types import Floats
 
@@ -62,11 +63,11 @@ class Objective:
 def objective(
     heights: Floats,
     factor: Floats,
-    space: tuple[Floats, Floats, tuple[int, int]],
+    space: Space,
     lambda_reg: float = 0.0,
     free_weights: bool = False,
 ) -> Objective:
-    """Prepare the objective for a raster whose outermost cell centres span the domain.
+    """Prepare the objective for a raster.
 
     Parameters
     ----------
@@ -74,18 +75,16 @@ def objective(
         Heights above the datum (m); NaN cells are ignored.
     factor : ndarray, (H, W)
         Loss per metre of difference in each cell, before the division by the number of cells.
-    space : tuple
-        Knots along easting and northing, and the degrees (p, q).
+    space : Space
+        The splines, with the parameters of the raster's columns and rows.
     lambda_reg : float
         Weight of the regulariser (1/m).
     free_weights : bool
         Whether the weights are variables.
     """
     valid = np.isfinite(heights)
-    rows, cols = heights.shape
-    knots_u, knots_v, (p, q) = space
-    start_u, along_u, _ = basis(knots_u, p, np.linspace(0, 1, cols))
-    start_v, along_v, _ = basis(knots_v, q, np.linspace(1, 0, rows))
+    start_u, along_u, _ = basis(space.knots_u, space.degree[0], space.u)
+    start_v, along_v, _ = basis(space.knots_v, space.degree[1], space.v)
     return Objective(
         target=np.where(valid, heights, 0.0),
         factor=np.where(valid, factor, 0.0) / np.count_nonzero(valid),

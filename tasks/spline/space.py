@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy
 
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
-from flexroad.tasks.spline.surface import clamped_knots, greville
-from flexroad.tasks.types import Bools, Floats, TileData
+from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, greville
+from flexroad.tasks.types import Bools, Floats
 
-Space = tuple[Floats, Floats, tuple[int, int]]
-"""Knots along easting and northing, degrees along both."""
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Tensor-product splines over a raster: their knots, and the parameters of the cell centres."""
+
+    knots_u: Floats
+    """Knots along easting, ``(n + p + 1,)``."""
+    knots_v: Floats
+    """Knots along northing, ``(m + q + 1,)``."""
+    degree: tuple[int, int]
+    """Degree along easting (the paper's p) and along northing (q)."""
+    u: Floats
+    """Parameters of the columns, ``(W,)``, ascending."""
+    v: Floats
+    """Parameters of the rows, ``(H,)``, descending: row 0 is in the north."""
+    unit_m: tuple[float, float]
+    """Length of one unit of u and of v (m)."""
+
+    @property
+    def points(self) -> tuple[int, int]:
+        """Number of control points along easting and along northing."""
+        p, q = self.degree
+        return len(self.knots_u) - p - 1, len(self.knots_v) - q - 1
+
+    @property
+    def transposed(self) -> Space:
+        """The same splines with the axes exchanged, for arrays ``(W, H)``."""
+        (p, q), (u_m, v_m) = self.degree, self.unit_m
+        return Space(self.knots_v, self.knots_u, (q, p), self.v, self.u, (v_m, u_m))
 
 
 def points_at_spacing(grid: Grid, degree: int, spacing_m: float) -> tuple[int, int]:
@@ -22,8 +51,8 @@ def points_at_spacing(grid: Grid, degree: int, spacing_m: float) -> tuple[int, i
     return n, m
 
 
-def spline_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
-    """Return knots and degrees of the surface over a grid's hull.
+def clamped_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
+    """Return the splines over a grid's hull, with clamped uniform knots and parameters from 0 to 1.
 
     Raises
     ------
@@ -35,20 +64,43 @@ def spline_space(grid: Grid, degree: int, points: tuple[int, int]) -> Space:
     # Checked before arrays are allocated: a spacing in the wrong unit would need more memory than there is.
     _check_enough(grid.width * grid.height, f"{grid.width} x {grid.height} cells", points)
     n, m = points
-    return clamped_knots(n, degree), clamped_knots(m, degree), (degree, degree)
+    west, south, east, north = grid.hull
+    return Space(
+        clamped_knots(n, degree),
+        clamped_knots(m, degree),
+        (degree, degree),
+        u=np.linspace(0, 1, grid.width),
+        v=np.linspace(1, 0, grid.height),
+        unit_m=(east - west, north - south),
+    )
 
 
-def cells_with_height(data: TileData, road: Bools, points: tuple[int, int]) -> int:
-    """Return the number of cells with a height to fit: the DSM's on the road, the DTM's elsewhere.
+def surface_on(space: Space, grid: Grid, bounds: Bounds, A: Floats, W: Floats, datum: float) -> NurbsSurface:
+    """Return the surface with these coefficients whose domain has the given bounds on a grid (m)."""
+    east, north = grid.origin
+    return NurbsSurface(
+        crs=grid.crs,
+        bounds=bounds,
+        degree=space.degree,
+        knots_u=space.knots_u,
+        knots_v=space.knots_v,
+        A=A,
+        W=W,
+        datum=datum,
+        origin=(float(east), float(north)),
+    )
+
+
+def check_cells(heights: Floats, points: tuple[int, int]) -> None:
+    """Raise an error if fewer cells have a height than there are control points.
 
     Raises
     ------
     TaskError
-        If there are fewer of them than control points.
+        With both numbers.
     """
-    cells = int(np.count_nonzero(np.isfinite(np.where(road, data.dsm, data.dtm))))
+    cells = int(np.count_nonzero(np.isfinite(heights)))
     _check_enough(cells, f"{cells} cells with a height", points)
-    return cells
 
 
 def _check_enough(cells: int, name: str, points: tuple[int, int]) -> None:
@@ -59,7 +111,9 @@ def _check_enough(cells: int, name: str, points: tuple[int, int]) -> None:
         )
 
 
-def start_heights(data: TileData, road: Bools, space: Space, terrain: bool = True) -> tuple[Floats, float]:
+def start_heights(
+    dsm: Floats, dtm: Floats, road: Bools, space: Space, terrain: bool = True
+) -> tuple[Floats, float]:
     """Return the control heights to start from, ``(m, n)`` with row 0 in the south, and their mean (m).
 
     With DTM support they are the DTM at the Greville abscissae, else the least-squares plane through the
@@ -70,18 +124,19 @@ def start_heights(data: TileData, road: Bools, space: Space, terrain: bool = Tru
     TaskError
         If neither the DTM nor the road has a height to start from.
     """
-    u, v = (greville(knots, degree) for knots, degree in zip(space[:2], space[2], strict=True))
-    cols, rows = u * (data.grid.width - 1), (1 - v) * (data.grid.height - 1)
-    if terrain and np.isfinite(data.dtm).any():
+    u, v = greville(space.knots_u, space.degree[0]), greville(space.knots_v, space.degree[1])
+    cols = (u - space.u[0]) * ((len(space.u) - 1) / (space.u[-1] - space.u[0]))
+    rows = (space.v[0] - v) * ((len(space.v) - 1) / (space.v[0] - space.v[-1]))
+    if terrain and np.isfinite(dtm).any():
         heights = scipy.ndimage.map_coordinates(
-            _nearest_filled(data.dtm), np.meshgrid(rows, cols, indexing="ij"), order=1
+            _nearest_filled(dtm), np.meshgrid(rows, cols, indexing="ij"), order=1, mode="nearest"
         )
     else:
-        r, c = np.nonzero(road & np.isfinite(data.dsm))
+        r, c = np.nonzero(road & np.isfinite(dsm))
         if not len(r):
-            dtm = "empty too" if terrain else "not to be used (fit.terrain)"
-            raise TaskError(f"no filtered road cell has a DSM height to start from, and the DTM is {dtm}")
-        level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), data.dsm[r, c])
+            reason = "empty too" if terrain else "not to be used (fit.terrain)"
+            raise TaskError(f"no filtered road cell has a DSM height to start from, and the DTM is {reason}")
+        level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), dsm[r, c])
         heights = level + by_col * cols[None, :] + by_row * rows[:, None]
     return heights, float(heights.mean())
 

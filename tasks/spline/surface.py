@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.grid import Bounds
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
@@ -40,6 +40,20 @@ def clamped_knots(points: int, degree: int) -> Floats:
     return np.concatenate([np.zeros(degree), inner, np.ones(degree)])
 
 
+def uniform_knots(first: int, last: int, degree: int) -> Floats:
+    """Return the whole numbers from ``first - degree`` to ``last + degree``: uniform knots of [first, last].
+
+    At each whole number of the domain ``degree`` basis functions are not zero. Their values do not depend on
+    the domain, to the last bit: differences of whole numbers are exact.
+    """
+    return np.arange(first - degree, last + degree + 1, dtype=np.float64)
+
+
+def domain(knots: Floats, degree: int) -> tuple[float, float]:
+    """Return the first and the last parameter at which all basis functions add up to 1."""
+    return float(knots[degree]), float(knots[-degree - 1])
+
+
 def greville(knots: Floats, degree: int) -> Floats:
     """Return the Greville abscissae, ``(points,)``: control heights there reproduce any linear function."""
     windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
@@ -54,7 +68,7 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     knots : ndarray, (points + degree + 1,)
     degree : int
     u : ndarray, (N,)
-        Parameters in [0, 1]. A knot belongs to the span on its right, the last knot to the span on its left.
+        Parameters in the domain. A knot belongs to the span on its right, the last to the span on its left.
 
     Returns
     -------
@@ -112,9 +126,9 @@ class NurbsSurface:
     degree: tuple[int, int]
     """Degree along easting (the paper's p) and along northing (q)."""
     knots_u: Floats
-    """Knots along easting on [0, 1], ``(n + p + 1,)``."""
+    """Knots along easting, ``(n + p + 1,)``; the domain is from the p-th to the n-th."""
     knots_v: Floats
-    """Knots along northing on [0, 1], ``(m + q + 1,)``."""
+    """Knots along northing, ``(m + q + 1,)``; the domain is from the q-th to the m-th."""
     A: Floats
     """Weight times height above the datum, ``(m, n)``, m; row 0 in the south."""
     W: Floats
@@ -124,41 +138,19 @@ class NurbsSurface:
     origin: tuple[float, float]
     """Whole-metre (easting, northing) near the south-west that exported coordinates are relative to."""
 
-    @classmethod
-    def over(
-        cls,
-        grid: Grid,
-        space: tuple[Floats, Floats, tuple[int, int]],
-        A: Floats,
-        W: Floats,
-        datum: float,
-    ) -> NurbsSurface:
-        """Return the surface with these knots, degrees and coefficients over the hull of a grid's centres."""
-        east, north = grid.origin
-        return cls(
-            crs=grid.crs,
-            bounds=grid.hull,
-            degree=space[2],
-            knots_u=space[0],
-            knots_v=space[1],
-            A=A,
-            W=W,
-            datum=datum,
-            origin=(float(east), float(north)),
-        )
-
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
         shape, (u, v) = self._scattered(easting, northing)
-        return self._height(self._at_points(u, v), u - np.clip(u, 0, 1), v - np.clip(v, 0, 1)).reshape(shape)
+        inside_u, inside_v = self._clipped(u, v)
+        return self._height(self._at_points(inside_u, inside_v), u - inside_u, v - inside_v).reshape(shape)
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
         u, v = self._parameters(eastings, northings)
-        along_u = basis_matrix(self.knots_u, self.degree[0], np.clip(u, 0, 1))
-        along_v = basis_matrix(self.knots_v, self.degree[1], np.clip(v, 0, 1))
-        at = _LatticeBasis(along_u, along_v)
-        return self._height(at, (u - np.clip(u, 0, 1))[None, :], (v - np.clip(v, 0, 1))[:, None])
+        inside_u, inside_v = self._clipped(u, v)
+        along_u = basis_matrix(self.knots_u, self.degree[0], inside_u)
+        along_v = basis_matrix(self.knots_v, self.degree[1], inside_v)
+        return self._height(_LatticeBasis(along_u, along_v), (u - inside_u)[None, :], (v - inside_v)[:, None])
 
     def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives of the height by easting and by northing (m/m) at scattered points.
@@ -166,9 +158,11 @@ class NurbsSurface:
         Beyond the domain, those of the nearest domain point.
         """
         shape, (u, v) = self._scattered(easting, northing)
-        _, by_u, by_v = self._taylor(self._at_points(u, v))
+        _, by_u, by_v = self._taylor(self._at_points(*self._clipped(u, v)))
         west, south, east, north = self.bounds
-        return (by_u / (east - west)).reshape(shape), (by_v / (north - south)).reshape(shape)
+        (low_u, high_u), (low_v, high_v) = self._domain
+        by_easting = by_u * (high_u - low_u) / (east - west)
+        return by_easting.reshape(shape), (by_v * (high_v - low_v) / (north - south)).reshape(shape)
 
     def normal(self, easting: Floats, northing: Floats) -> Floats:
         """Return upward unit normals at scattered points, ``(..., 3)``; see `slope` beyond the domain."""
@@ -184,21 +178,36 @@ class NurbsSurface:
         because the position of a point in plan depends on the weights: use `exact` to export the surface.
         """
         west, south, east, north = self.bounds
-        x = west + greville(self.knots_u, self.degree[0]) * (east - west)
-        y = south + greville(self.knots_v, self.degree[1]) * (north - south)
+        (low_u, high_u), (low_v, high_v) = self._domain
+        u, v = greville(self.knots_u, self.degree[0]), greville(self.knots_v, self.degree[1])
+        x = west + (u - low_u) * (east - west) / (high_u - low_u)
+        y = south + (v - low_v) * (north - south) / (high_v - low_v)
         return np.stack([*np.meshgrid(x, y), self.A / self.W + self.datum, self.W], axis=-1)
+
+    @property
+    def _domain(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """First and last parameter along u, and along v."""
+        return domain(self.knots_u, self.degree[0]), domain(self.knots_v, self.degree[1])
 
     def _parameters(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         west, south, east, north = self.bounds
-        return (np.asarray(easting) - west) / (east - west), (np.asarray(northing) - south) / (north - south)
+        (low_u, high_u), (low_v, high_v) = self._domain
+        # Multiplied before the division: the edges of a tile are then exactly on their knots.
+        u = low_u + (np.asarray(easting) - west) * (high_u - low_u) / (east - west)
+        return u, low_v + (np.asarray(northing) - south) * (high_v - low_v) / (north - south)
+
+    def _clipped(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Return the parameters of the nearest points of the domain."""
+        domain_u, domain_v = self._domain
+        return np.clip(u, *domain_u), np.clip(v, *domain_v)
 
     def _scattered(self, easting: Floats, northing: Floats) -> tuple[tuple[int, ...], tuple[Floats, Floats]]:
         u, v = np.broadcast_arrays(*self._parameters(easting, northing))
         return u.shape, (u.ravel(), v.ravel())
 
     def _at_points(self, u: Floats, v: Floats) -> _PointBasis:
-        start_u, *along_u = basis(self.knots_u, self.degree[0], np.clip(u, 0, 1))
-        start_v, *along_v = basis(self.knots_v, self.degree[1], np.clip(v, 0, 1))
+        start_u, *along_u = basis(self.knots_u, self.degree[0], u)
+        start_v, *along_v = basis(self.knots_v, self.degree[1], v)
         return _PointBasis(start_u, along_u, start_v, along_v)
 
     def _height(self, at: _PointBasis | _LatticeBasis, beyond_u: Floats, beyond_v: Floats) -> Floats:
@@ -292,15 +301,20 @@ def exact(surface: NurbsSurface) -> ExactNurbs:
 
 
 def _raised(knots: Floats, degree: int) -> tuple[Floats, Floats, Floats]:
-    """Return knots of the space one degree up, and the maps of f and of u * f into it, ``(points', points)``.
+    """Return knots of the space one degree up, and the maps of f and of t * f into it, ``(points', points)``.
 
-    Both products lie in that space, so interpolating them at its Greville abscissae is exact.
+    t runs from 0 to 1 over the domain. Both products lie in that space, so interpolating them at its Greville
+    abscissae is exact. The knots are clamped, as other programs expect them, on [0, 1].
     """
-    raised = np.sort(np.concatenate([knots, np.unique(knots)]))
+    low, high = domain(knots, degree)
+    inner = knots[(knots > low) & (knots < high)]
+    ends = [np.full(degree + 2, low), np.full(degree + 2, high)]
+    raised = np.sort(np.concatenate([inner, np.unique(inner), *ends]))
     u = greville(raised, degree + 1)
     collocation, _ = basis_matrix(raised, degree + 1, u)
     f, _ = basis_matrix(knots, degree, u)
-    return raised, _solve(collocation, f), _solve(collocation, u[:, None] * f)
+    t = (u - low) / (high - low)
+    return (raised - low) / (high - low), _solve(collocation, f), _solve(collocation, t[:, None] * f)
 
 
 def _solve(matrix: Floats, values: Floats) -> Floats:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexroad.tasks.spline.normal_equations import gram, pairs
+from flexroad.tasks.spline.space import Space
 from flexroad.tasks.spline.surface import basis, dense
 from flexroad.tasks.types import Floats
 
@@ -55,28 +56,22 @@ class BendingEnergy:
         yield 1.0, self.along_v[2], self.along_u[0]
 
 
-def bending_energy(
-    stiffness: Floats, space: tuple[Floats, Floats, tuple[int, int]], spans_m: tuple[float, float]
-) -> BendingEnergy:
-    """Return the bending energy over a raster whose outermost cell centres span the domain.
+def bending_energy(stiffness: Floats, space: Space) -> BendingEnergy:
+    """Return the bending energy over a raster.
 
     Parameters
     ----------
     stiffness : ndarray, (H, W)
         Weight of the squared curvature in each cell (m3).
-    space : tuple
-        Knots along easting and northing, and the degrees, each at least 2.
-    spans_m : tuple
-        Extent of the domain along easting and northing (m).
+    space : Space
+        The splines, of degree 2 at least, with the parameters of the raster's columns and rows.
     """
-    rows, cols = stiffness.shape
-    knots_u, knots_v, (p, q) = space
-    along_u = _derivatives(knots_u, p, np.linspace(0, 1, cols), spans_m[0])
-    along_v = _derivatives(knots_v, q, np.linspace(1, 0, rows), spans_m[1])
+    along_u = _derivatives(space.knots_u, space.degree[0], space.u, space.unit_m[0])
+    along_v = _derivatives(space.knots_v, space.degree[1], space.v, space.unit_m[1])
     return BendingEnergy(stiffness, along_u, along_v)
 
 
-def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Derivatives:
+def _derivatives(knots: Floats, degree: int, u: Floats, unit_m: float) -> Derivatives:
     """Return the basis functions at ``u`` and their first and second derivatives per metre.
 
     A derivative is a spline of one degree less over the knots without the outermost (de Boor, "A practical
@@ -87,7 +82,7 @@ def _derivatives(knots: Floats, degree: int, u: Floats, span_m: float) -> Deriva
     for order in range(3):
         inner, lower = knots[order : len(knots) - order], degree - order
         start, values, _ = basis(inner, lower, u)
-        derivatives.append(dense(start, values, points - order) @ coefficients / span_m**order)
+        derivatives.append(dense(start, values, points - order) @ coefficients / unit_m**order)
         if lower:
             rate = lower / (inner[lower + 1 : -1] - inner[1 : points - order])
             coefficients = rate[:, None] * np.diff(coefficients, axis=0)

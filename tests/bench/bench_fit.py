@@ -88,7 +88,11 @@ class PointByPoint(Dense):
 
     def __init__(self, objective: Objective, space: Space) -> None:
         super().__init__(objective, space)
-        (self.knots_u, self.knots_v), self.degree = (k.tolist() for k in space[:2]), space[2][0]
+        self.knots_u, self.knots_v, self.degree = (
+            space.knots_u.tolist(),
+            space.knots_v.tolist(),
+            space.degree[0],
+        )
 
     def __call__(self, variables: np.ndarray) -> tuple[float, np.ndarray]:
         z, w = variables[0].tolist(), np.exp(variables[1]).tolist()
@@ -150,7 +154,7 @@ def main() -> None:
     """Print the table; exit with an error if the three results differ or the fit is too slow."""
     data, clusters = case()
     space = nurbs.space_of(data, OPTIONS)
-    heights, datum = start_heights(data, clusters.mask, space, True)
+    heights, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, True)
     objective = nurbs.objective_of(data, clusters.mask, space, datum, OPTIONS)
     start = np.stack([heights - datum, np.zeros_like(heights)])
     limit = np.array([np.inf, MAX_LOG_WEIGHT])[:, None, None]

@@ -65,14 +65,11 @@ def compare(points: int, smoothness: str) -> float:
     data, clusters = case()
     options = nurbs.Options(weights="unit", control_points=(points, points), lambda_reg=0)
     space = nurbs.space_of(data, options)
-    heights, datum = start_heights(data, clusters.mask, space, True)
+    heights, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, True)
     objective = nurbs.objective_of(data, clusters.mask, space, datum, options)
     start, shape = heights - datum, (points, points)
-    west, south, east, north = data.grid.hull
     stiffness = STIFFNESS_M3 * np.where(clusters.mask, 1.0, TERRAIN) / clusters.mask.size
-    bending = (
-        bending_energy(stiffness, space, (east - west, north - south)) if smoothness == "bending" else None
-    )
+    bending = bending_energy(stiffness, space) if smoothness == "bending" else None
     loss = with_bending(objective, bending) if bending else objective
     variables, limit = np.stack([start, np.zeros_like(start)]), np.full((2, 1, 1), np.inf)
     schedule = adam.Schedule(options.learning_rate, ITERATIONS, 0, 20)

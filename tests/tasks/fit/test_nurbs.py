@@ -14,7 +14,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import nurbs
 from flexroad.tasks.spline import adam, torch_engine
 from flexroad.tasks.spline.objective import objective
-from flexroad.tasks.spline.surface import clamped_knots
+from flexroad.tasks.spline.space import clamped_space
 from flexroad.tasks.types import RoadClusters, TileData
 
 WEST, NORTH = 295500.0, 5629500.0
@@ -52,7 +52,7 @@ def random_objective(degree=3, free=True, rows=40, cols=33):
     heights = rng.normal(0, 2, (rows, cols))
     heights[5:9, 3:20] = np.nan
     factor = np.where(rng.random(heights.shape) < 0.3, 1.0, 0.7)
-    space = clamped_knots(degree + 5, degree), clamped_knots(degree + 7, degree), (degree, degree)
+    space = clamped_space(Grid("", 0, 0, 1, cols, rows), degree, (degree + 5, degree + 7))
     start = rng.normal(0, 1, (2, degree + 7, degree + 5))
     return objective(heights, factor, space, 0.3, free), start
 

@@ -1,0 +1,92 @@
+"""The border of a tile in parts that belong to no tile: four corners and four edges.
+
+Up to four tiles meet at a corner and two share an edge. A part is described by its position and by the size
+of the tiles alone, so that all tiles around it describe it in the same way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from flexroad.catalog.grid import Grid
+
+DECIMALS = 6
+"""Decimals (of a metre) to which positions are rounded: neighbours compute them from different edges."""
+
+Kind = Literal["corner", "east", "north"]
+
+
+@dataclass(frozen=True)
+class Border:
+    """A corner of tiles, or an edge between two tiles, with the ground around it."""
+
+    kind: Kind
+    """``corner``, or the direction in which the edge runs: ``east`` or ``north``."""
+    start: tuple[float, float]
+    """Easting and northing of the corner, or of the edge's western or southern end (m)."""
+    tile: tuple[int, int]
+    """Width and height of the tiles (cells)."""
+    grid: Grid
+    """The cells around it."""
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Rows of `grid` to the north of the start, and columns to the west of it."""
+        east, north = self.start
+        return round((self.grid.north - north) / self.grid.cell), round(
+            (east - self.grid.west) / self.grid.cell
+        )
+
+    @property
+    def sides(self) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """(row, col) slices of the cells along the edge: in its north and south, or in its west and east.
+
+        Of a corner, these are the two cells in the north and the two in the south.
+        """
+        (row, col), (width, height) = self.cell, self.tile
+        if self.kind == "north":
+            rows = slice(row - height, row)
+            return (rows, slice(col - 1, col)), (rows, slice(col, col + 1))
+        cols = slice(col, col + width) if self.kind == "east" else slice(col - 1, col + 1)
+        return (slice(row - 1, row), cols), (slice(row, row + 1), cols)
+
+
+def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
+    """Return the border of a tile.
+
+    Parameters
+    ----------
+    tile : Grid
+        The tile, without halo.
+    reach_m : float
+        Distance from the corner or edge up to which its grid reaches (m).
+
+    Returns
+    -------
+    tuple of Border
+        The corners in the south-west, south-east, north-west and north-east, then the edges in the south,
+        north, west and east.
+    """
+    west, south, east, north = (round(value, DECIMALS) for value in tile.bounds)
+    corners = [(west, south), (east, south), (west, north), (east, north)]
+    edges: list[tuple[Kind, tuple[float, float]]] = [
+        ("east", (west, south)),
+        ("east", (west, north)),
+        ("north", (west, south)),
+        ("north", (east, south)),
+    ]
+    return tuple(
+        _border(tile, kind, start, reach_m) for kind, start in [*(("corner", c) for c in corners), *edges]
+    )
+
+
+def _border(tile: Grid, kind: Kind, start: tuple[float, float], reach_m: float) -> Border:
+    reach = math.ceil(round(reach_m / tile.cell, 6))
+    width = tile.width if kind == "east" else 0
+    height = tile.height if kind == "north" else 0
+    west = round(start[0] - reach * tile.cell, DECIMALS)
+    north = round(start[1] + (height + reach) * tile.cell, DECIMALS)
+    grid = Grid(tile.crs, west, north, tile.cell, width + 2 * reach, height + 2 * reach)
+    return Border(kind, start, (tile.width, tile.height), grid)

@@ -1,0 +1,69 @@
+"""What tiles share along their borders: control points, and where the border is road.
+
+Every part is computed from the ground around it alone, so that neighbouring tiles hold equal parts. Together
+the parts of one tile are its frame: it fixes the surface and the mesh along the tile's edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexroad.tasks.types import Bools, Floats
+
+GRAIN_M = 2.0**-20
+"""Control heights of a frame are multiples of this (m), so that rounding errors of a CPU do not remain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """The control points that act on a corner of tiles."""
+
+    control: Floats
+    """Control heights, ``(q, p)``, m; row 0 in the south. NaN if there is no ground to fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """The control points that act on an edge but on none of its corners, and the classes along it."""
+
+    control: Floats
+    """Control heights, ``(q, n - p)`` of an edge to the east and ``(m - q, p)`` of one to the north, m; row 0
+    in the south. NaN if there is no ground to fit."""
+    road: Bools
+    """Whether the cells along the edge are road by the raw mask, from west to east or south to north: the
+    cells to the south or east of it."""
+    kept: Bools
+    """The same by the filtered mask."""
+    inside: Bools
+    """Whether the cells on both sides lie within the survey."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The corners and edges of one tile."""
+
+    south_west: Corner
+    south_east: Corner
+    north_west: Corner
+    north_east: Corner
+    south: Edge
+    north: Edge
+    west: Edge
+    east: Edge
+
+    def control(self, shape: tuple[int, int]) -> Floats:
+        """Return the control heights of a tile's surface, ``shape``; NaN where the frame leaves them free."""
+        q, p = self.south_west.control.shape
+        heights = np.full(shape, np.nan)
+        heights[:q, :p], heights[:q, -p:] = self.south_west.control, self.south_east.control
+        heights[-q:, :p], heights[-q:, -p:] = self.north_west.control, self.north_east.control
+        heights[:q, p:-p], heights[-q:, p:-p] = self.south.control, self.north.control
+        heights[q:-q, :p], heights[q:-q, -p:] = self.west.control, self.east.control
+        return heights
+
+
+def rounded(heights: np.ndarray) -> Floats:
+    """Return control heights as multiples of `GRAIN_M`."""
+    return np.asarray(np.round(heights / GRAIN_M) * GRAIN_M)
