@@ -19,6 +19,11 @@ LATTICE_TOLERANCE = 0.01
 """Two lattices coincide when they are off by less than this part of a cell."""
 
 
+def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
+    """Return whether two areas overlap by more than a tolerance (m) from west to east and south to north."""
+    return min(a[2], b[2]) - max(a[0], b[0]) > tolerance and min(a[3], b[3]) - max(a[1], b[1]) > tolerance
+
+
 @dataclass(frozen=True)
 class Grid:
     """A north-up lattice of square cells.

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import compress
 
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
 from flexroad.catalog.storage.paths import Location, join, parse_location
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true heights of road
 and terrain including bridges (m), true road mask, heights of bridge decks only (m), roads as lines or areas
 (vectors)."""
+LOADED = ("dsm", "dtm", "reference", "bridges", "road_mask", "reference_road")
+"""Rasters that `load` reads; it passes on only the names of the other layers' files."""
+BORDER_LAYERS = ("dsm", "dtm", "dop", "road_mask", "roads")
+"""Layers of ground along the borders of tiles (`Tile.around`)."""
 
-
-REACH_M = 100.0
-"""A tile's layers list the files within this distance of it (m), so that `load` can read a halo."""
+REACH_M = 200.0
+"""A tile's layers list the files within this distance of it (m): for halos and for ground along borders."""
+TOUCH_M = 0.001
+"""Files that overlap ground by no more than this (m) only touch it."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +32,54 @@ class Layer:
     name: str
     """One of `LAYERS`."""
     files: tuple[str, ...]
-    """Files that cover the tile, relative to the tile's root where they lie below it; where files overlap,
-    the first one with a value is used."""
+    """Files within `REACH_M` of the tile, relative to the tile's root where they lie below it; where files
+    overlap, the first one with a value is used."""
     values: tuple[int, ...] = ()
     """Cell values that mean road, for the masks; empty: every value but 0 and nodata."""
     crs: str | None = None
     """CRS of files without one."""
+    extents: tuple[Bounds, ...] = ()
+    """West, south, east and north of each file (m, in the tile's CRS), in the order of ``files``; empty where
+    they are unknown (published datasets, older catalogs): each file may then lie anywhere."""
+
+    def reaching(self, bounds: Bounds) -> Layer | None:
+        """Return the layer with only the files that overlap an area, or None if there are none.
+
+        A layer of unknown extents is returned unchanged.
+
+        Parameters
+        ----------
+        bounds : Bounds
+            West, south, east, north (m, in the tile's CRS).
+        """
+        if not self.extents:
+            return self
+        kept = [overlap(extent, bounds, TOUCH_M) for extent in self.extents]
+        if all(kept):
+            return self
+        return self._of(list(compress(range(len(kept)), kept))) if any(kept) else None
+
+    def in_common_order(self) -> Layer:
+        """Return the layer with its files in an order that all tiles that list them agree on.
+
+        The files are sorted by name, but of two that overlap the first one stays first, because its values
+        are used. Files of unknown extents stay as they are.
+        """
+        left = sorted(range(len(self.extents)), key=self.files.__getitem__)
+        order = []
+        while left:
+            first = next(k for k in left if not any(j < k and self._touch(j, k) for j in left))
+            left.remove(first)
+            order.append(first)
+        return self._of(order) if order else self
+
+    def _touch(self, one: int, other: int) -> bool:
+        return overlap(self.extents[one], self.extents[other], TOUCH_M)
+
+    def _of(self, chosen: Sequence[int]) -> Layer:
+        """Return the layer with the chosen files, in that order."""
+        files = tuple(self.files[number] for number in chosen)
+        return replace(self, files=files, extents=tuple(self.extents[number] for number in chosen))
 
 
 @dataclass(frozen=True)
@@ -42,7 +91,7 @@ class Tile:
     grid: Grid
     """The tile's core, without halo."""
     layers: tuple[Layer, ...]
-    """In the order of `LAYERS`."""
+    """Layers that cover the tile, at least in part, in the order of `LAYERS`."""
     root: str
     """Folder that relative file names start from (the catalog's folder)."""
     datetime: datetime
@@ -53,11 +102,79 @@ class Tile:
     """Class of area for reports (urban, suburban, rural), or empty."""
     dataset: str = ""
     """Name of the source dataset in reports ("GeRoD"), or empty if unknown."""
+    nearby: tuple[Layer, ...] = ()
+    """Layers of which files lie within `REACH_M`, but none on the tile itself, in the order of `LAYERS`."""
+
+    @property
+    def all_layers(self) -> tuple[Layer, ...]:
+        """The layers that cover the tile and those nearby, in the order of `LAYERS`."""
+        return tuple(sorted((*self.layers, *self.nearby), key=lambda layer: LAYERS.index(layer.name)))
 
     def layer(self, name: str) -> Layer | None:
-        """Return the named layer, or None if the tile has none."""
+        """Return the named layer, or None if none covers the tile."""
         return next((layer for layer in self.layers if layer.name == name), None)
 
     def paths(self, layer: Layer) -> tuple[Location, ...]:
         """Return the locations of the layer's files."""
         return tuple(parse_location(join(self.root, file)) for file in layer.files)
+
+    def renamed(self, rename: Callable[[str], str]) -> Tile:
+        """Return the tile with other names of its files."""
+        layers, nearby = (
+            tuple(replace(layer, files=tuple(map(rename, layer.files))) for layer in group)
+            for group in (self.layers, self.nearby)
+        )
+        return replace(self, layers=layers, nearby=nearby)
+
+    def within(self, bounds: Bounds) -> Tile:
+        """Return the tile with only those files of the rasters in `LOADED` that reach an area.
+
+        A layer none of whose files reaches it stays as it is, and `load` reports that. Of the photo and the
+        roads all files stay, because segmenters read them beyond the grid.
+
+        Parameters
+        ----------
+        bounds : Bounds
+            The ground to read: west, south, east, north (m).
+        """
+        layers = tuple(
+            (layer.reaching(bounds) or layer) if layer.name in LOADED else layer for layer in self.layers
+        )
+        return replace(self, layers=layers)
+
+    def around(self, grid: Grid, reach: Bounds) -> Tile:
+        """Return a tile of other ground within `REACH_M`, made of this tile's files, with this tile's id.
+
+        Its layers are the same whichever tile of the catalog they are taken from, if their extents are known
+        and the ground is within `REACH_M` of both.
+
+        Parameters
+        ----------
+        grid : Grid
+            The grid of the new tile: rasters keep the files that reach it.
+        reach : Bounds
+            West, south, east, north (m): photo and roads keep the files that reach this area.
+        """
+        limited = (
+            layer.reaching(grid.bounds if layer.name in LOADED else reach)
+            for layer in self.all_layers
+            if layer.name in BORDER_LAYERS
+        )
+        layers = tuple(layer.in_common_order() for layer in limited if layer)
+        return replace(self, grid=grid, layers=layers, nearby=())
+
+
+def by_cover(layers: Sequence[Layer], grid: Grid) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
+    """Return the layers that cover a tile, at least in part, and those that are only nearby.
+
+    Layers of unknown extents count as covering. So do roads, which are wider than the lines in their files.
+    """
+    bounds, tolerance = grid.bounds, LATTICE_TOLERANCE * grid.cell
+    nearby = tuple(
+        layer
+        for layer in layers
+        if layer.extents
+        and layer.name != "roads"
+        and not any(overlap(extent, bounds, tolerance) for extent in layer.extents)
+    )
+    return tuple(layer for layer in layers if layer not in nearby) if nearby else tuple(layers), nearby

@@ -39,11 +39,11 @@ def test_index_file_of_a_kilometre_gives_sixteen_tiles(tmp_path):
 
 
 def test_tile_lists_every_file_in_reach(tmp_path):
-    """Four files meet in the middle of a tile; a file 90 m away is in reach, one 110 m away is not."""
+    """Four files meet in the middle of a tile; a file 190 m away is in reach, one 210 m away is not."""
     for name, west, north in [("d", 0, 300), ("c", 125, 300), ("b", 0, 125), ("a", 125, 125)]:
         write(tmp_path / f"{name}.tif", np.ones((175, 125), np.float32), west, north)
-    write(tmp_path / "near.tif", np.ones((5, 5), np.float32), 340, 100)
-    write(tmp_path / "off.tif", np.ones((5, 5), np.float32), 360, 100)
+    write(tmp_path / "near.tif", np.ones((5, 5), np.float32), 440, 100)
+    write(tmp_path / "off.tif", np.ones((5, 5), np.float32), 460, 100)
     result = index(tmp_path, {"dsm": "*.tif"}, min_cover=0.5)
     assert dict(zip(ids(result), files(result), strict=True)) == {
         "0_0": ("a.tif", "b.tif", "c.tif", "d.tif", "near.tif")
