@@ -9,23 +9,26 @@ from __future__ import annotations
 
 import difflib
 import json
+import struct
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
+from sys import intern
 from typing import Any
 
+import numpy as np
 import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
-from flexroad.catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.tile import LAYERS, Layer, Tile, by_cover
 
 Item = dict[str, Any]
 
@@ -123,14 +126,10 @@ class Catalog:
                 raise CatalogError(f"no tile {tile_id!r} in the catalog; did you mean {', '.join(near)}?")
         tiles = [tile for tile in self.tiles if not ids or tile.id in set(ids)]
         if bbox is not None:
-            tiles = [tile for tile in tiles if _overlap(tile.grid.bounds, bbox)]
+            tiles = [tile for tile in tiles if overlap(tile.grid.bounds, bbox)]
             if not tiles:
                 raise CatalogError(f"no tile touches --bbox {' '.join(f'{v:g}' for v in bbox)}")
         return Catalog(tuple(tiles))
-
-
-def _overlap(a: Bounds, b: Bounds) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def _location(path: Location | str) -> Location:
@@ -143,14 +142,9 @@ def _location(path: Location | str) -> Location:
 def _rooted(tile: Tile, root: Location) -> Tile:
     """Return the tile with file names relative to ``root`` where they lie below it, else absolute."""
     prefix = str(root).rstrip("/") + "/"
-    layers = tuple(
-        # Links are not resolved: a folder of links stays one.
-        replace(
-            layer, files=tuple(normalise(join(tile.root, file)).removeprefix(prefix) for file in layer.files)
-        )
-        for layer in tile.layers
-    )
-    return replace(tile, layers=layers, root=str(root))
+    # Links are not resolved: a folder of links stays one.
+    renamed = tile.renamed(lambda file: normalise(join(tile.root, file)).removeprefix(prefix))
+    return replace(renamed, root=str(root))
 
 
 @lru_cache(maxsize=16)
@@ -197,7 +191,7 @@ def item(tile: Tile, root: str = "") -> Item:
             "flexroad:datetime_assumed": tile.datetime_assumed,
             "flexroad:root": root,
         },
-        "assets": {layer.name: _asset(layer, root) for layer in tile.layers},
+        "assets": {layer.name: _asset(layer, root) for layer in tile.all_layers},
         "links": [],
     }
 
@@ -209,6 +203,8 @@ def _asset(layer: Layer, root: str) -> Item:
         "flexroad:files": list(layer.files),
         "flexroad:values": list(layer.values),
         "flexroad:crs": layer.crs,
+        # One flat list, because nested lists take twice as long to read.
+        "flexroad:extents": [edge for extent in layer.extents for edge in extent] or None,
     }
 
 
@@ -218,26 +214,39 @@ def _tile(item: Item, folder: str) -> Tile:
     height, width = properties["proj:shape"]
     crs = properties.get("proj:code") or properties["proj:wkt2"]
     assets = item["assets"]
+    grid = Grid(crs, west, north, cell, int(width), int(height))
+    layers, nearby = by_cover([_layer(name, assets[name]) for name in LAYERS if assets.get(name)], grid)
     return Tile(
         id=item["id"],
-        grid=Grid(crs, west, north, cell, int(width), int(height)),
-        layers=tuple(_layer(name, assets[name]) for name in LAYERS if assets.get(name)),
+        grid=grid,
+        layers=layers,
         root=properties["flexroad:root"] or folder,
         datetime=_datetime(properties["datetime"]),
         datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
         stratum=properties["flexroad:stratum"],
         # Older catalogs do not have this field.
         dataset=properties.get("flexroad:dataset") or "",
+        nearby=nearby,
     )
 
 
 def _layer(name: str, asset: Item) -> Layer:
+    # Older catalogs do not have this field.
+    edges = asset.get("flexroad:extents")
     return Layer(
         name=name,
-        files=tuple(asset["flexroad:files"]),
+        # Neighbouring tiles list the same files.
+        files=tuple(map(intern, asset["flexroad:files"])),
         values=tuple(asset["flexroad:values"]),
         crs=asset.get("flexroad:crs"),
+        extents=() if edges is None else _extents(np.asarray(edges, np.float64).tobytes()),
     )
+
+
+@lru_cache(maxsize=16)
+def _extents(edges: bytes) -> tuple[Bounds, ...]:
+    """Return the extents of a layer's files; cached, because a tile's layers often have the same ones."""
+    return tuple(struct.iter_unpack("=4d", edges))
 
 
 def _datetime(value: str | datetime) -> datetime:
@@ -258,11 +267,29 @@ def _from_parquet(data: bytes) -> Iterable[Item]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
+    columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
+    plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
+    plain += [
+        name for name in columns if name.endswith((".flexroad:files", ".flexroad:values", ".flexroad:crs"))
+    ]
     # Reader threads may still be alive when a short process ends, and would abort it.
-    table = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False).read(use_threads=False)
-    plain = [name for name in table.column_names if name.startswith(("proj:", "flexroad:", "datetime"))]
-    rows = table.select(["id", "assets", *plain]).to_pylist()
+    rows = file.read(plain, use_threads=False).to_pylist()
+    extents = [name for name in columns if name.endswith(".flexroad:extents")]
+    if extents:
+        _add_extents(rows, file.read(extents, use_threads=False)["assets"].combine_chunks())
     return ({"id": row["id"], "assets": row["assets"], "properties": row} for row in rows)
+
+
+def _add_extents(rows: list[Item], assets: Any) -> None:
+    """Add the extents to the rows' assets as arrays; as lists of numbers they take several times as long."""
+    for field in assets.type:
+        column = assets.field(field.name).field("flexroad:extents")
+        ends, edges = column.offsets.to_numpy().tolist(), column.values.to_numpy()
+        for row, begin, end in zip(rows, ends[:-1], ends[1:], strict=True):
+            if begin < end:
+                row["assets"][field.name]["flexroad:extents"] = edges[begin:end]
 
 
 def _to_parquet(items: list[Item]) -> bytes:
@@ -294,7 +321,7 @@ def _row(item: Item) -> Item:
 
 def _full_item() -> Item:
     """Return an item with all layers and fields."""
-    layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832") for name in LAYERS)
+    layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832", ((0.0, 0.0, 1.0, 1.0),)) for name in LAYERS)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
     whole["properties"]["proj:wkt2"] = ""

@@ -4,6 +4,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import geopandas
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pystac
 import pytest
@@ -35,6 +36,67 @@ def test_catalog_round_trip_keeps_tiles(tmp_path, name):
     tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS))
     Catalog(tiles).write(tmp_path / name)
     assert Catalog.read(tmp_path / name).tiles == tiles
+
+
+def with_extents(made: Tile) -> Tile:
+    """Return the tile with the extents of its files: the first one on the tile, the second one east of it."""
+    west, south, east, north = made.grid.bounds
+    extents = ((west - 0.1, south, east, north), (east, south, east + 1 / 3, north))
+    return replace(made, layers=tuple(replace(layer, extents=extents) for layer in made.layers))
+
+
+@pytest.mark.parametrize("name", ["catalog.parquet", "catalog.json"])
+def test_catalog_round_trip_keeps_extents_and_nearby_layers(tmp_path, name):
+    first = with_extents(tile(295500, tmp_path / "data", layers=LAYERS))
+    *layers, photo = sorted(first.layers, key=lambda layer: layer.name == "dop")
+    (_, beyond) = photo.extents
+    photo = replace(photo, files=photo.files[1:], extents=(beyond,))
+    first = replace(first, layers=tuple(layers), nearby=(photo,))
+    # Layers of known and of unknown extents, and no layers.
+    tiles = (first, tile(295750, tmp_path / "data"), with_extents(tile(296000, tmp_path / "data", layers=())))
+    Catalog(tiles).write(tmp_path / "run" / name, movable=False)
+    assert Catalog.read(tmp_path / "run" / name).tiles == tiles
+    Catalog(tiles).write(tmp_path / name)
+    moved = Catalog.read(tmp_path / name).select(ids=["295500_5629250"]).tiles[0]
+    assert moved.nearby == (replace(photo, files=("data/dop/b.tif",)),)
+    assert moved.layers[0].extents == first.layers[0].extents
+
+
+def test_roads_beyond_the_tile_cover_it(tmp_path):
+    """A road is wider than the line in its file."""
+    made = with_extents(tile(295500, tmp_path, layers=("dsm", "roads")))
+    dsm, roads = made.layers
+    made = replace(made, layers=(dsm, replace(roads, files=roads.files[1:], extents=roads.extents[1:])))
+    Catalog((made,)).write(tmp_path / "c.json")
+    assert Catalog.read(tmp_path / "c.json").tiles == (made,)
+
+
+def test_read_catalog_without_extents_gives_unknown_ones(tmp_path):
+    tiles = (tile(295500, tmp_path, layers=LAYERS), tile(295750, tmp_path))
+    Catalog(tiles).write(tmp_path / "c.parquet")
+    table = pq.read_table(tmp_path / "c.parquet").to_pylist()
+    kinds = pq.read_schema(tmp_path / "c.parquet")
+    for asset in (asset for row in table for asset in row["assets"].values() if asset):
+        del asset["flexroad:extents"]
+    assets = pa.struct(
+        (kind.name, pa.struct([field for field in kind.type if field.name != "flexroad:extents"]))
+        for kind in kinds.field("assets").type
+    )
+    older = kinds.set(kinds.get_field_index("assets"), pa.field("assets", assets))
+    pq.write_table(pa.Table.from_pylist(table, older), tmp_path / "c.parquet")
+    assert "flexroad:extents" not in str(pq.read_schema(tmp_path / "c.parquet").field("assets").type)
+    assert Catalog.read(tmp_path / "c.parquet").tiles == tiles
+    Catalog(tiles).write(tmp_path / "c.json")
+    items = json.loads((tmp_path / "c.json").read_text())
+    for asset in (asset for item in items["features"] for asset in item["assets"].values()):
+        del asset["flexroad:extents"]
+    (tmp_path / "c.json").write_text(json.dumps(items))
+    assert Catalog.read(tmp_path / "c.json").tiles == tiles
+
+
+def test_catalog_without_tiles_round_trip(tmp_path):
+    Catalog(()).write(tmp_path / "c.parquet")
+    assert Catalog.read(tmp_path / "c.parquet").tiles == ()
 
 
 def test_read_catalog_without_dataset_gives_empty_dataset(tmp_path):
@@ -132,7 +194,8 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
 
     from flexroad.catalog.index import _full_item, _tile, item
 
-    tiles = (tile(295500, tmp_path), tile(295750, tmp_path, layers=LAYERS), tile(296000, tmp_path, layers=()))
+    whole = with_extents(tile(295750, tmp_path, layers=LAYERS))
+    tiles = (tile(295500, tmp_path), whole, tile(296000, tmp_path, layers=()))
     Catalog(tiles).write(tmp_path / "c.parquet")
     table = pq.read_table(tmp_path / "c.parquet")
     items = [_full_item(), *(item(tile) for tile in tiles)]
