@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 
 DECIMALS = 6
 """Decimals (of a metre) to which positions are rounded: neighbours compute them from different edges."""
@@ -20,7 +20,7 @@ Kind = Literal["corner", "east", "north"]
 
 @dataclass(frozen=True)
 class Border:
-    """A corner of tiles, or an edge between two tiles, with the ground around it."""
+    """A corner of tiles, or an edge between two tiles, with the cells around it."""
 
     kind: Kind
     """``corner``, or the direction in which the edge runs: ``east`` or ``north``."""
@@ -38,6 +38,13 @@ class Border:
         return round((self.grid.north - north) / self.grid.cell), round(
             (east - self.grid.west) / self.grid.cell
         )
+
+    def within(self, distance_m: float) -> Bounds:
+        """Return west, south, east and north of the ground within a distance of the corner or edge (m)."""
+        (east, north), cell = self.start, self.grid.cell
+        width = self.tile[0] * cell if self.kind == "east" else 0.0
+        height = self.tile[1] * cell if self.kind == "north" else 0.0
+        return east - distance_m, north - distance_m, east + width + distance_m, north + height + distance_m
 
     @property
     def sides(self) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

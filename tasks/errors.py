@@ -20,3 +20,7 @@ class TaskError(Exception):
         super().__init__(message)
         self.file = file
         self.layer = layer
+
+
+class LayerMissing(TaskError):
+    """A tile lacks a layer that a stage needs; around a border of tiles it may end before the heights do."""

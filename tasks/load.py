@@ -21,7 +21,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 if TYPE_CHECKING:
-    from flexroad.tasks.io.raster import RasterWindow
+    from flexroad.tasks.io.raster import RasterWindow, Unreadable
 
 VERSION = 1
 
@@ -68,6 +68,10 @@ class _Mosaic:
     patches: tuple[RasterWindow, ...]
     """The parts read, in the order of the files."""
     notes: tuple[str, ...]
+    broken: tuple[Unreadable, ...]
+    """The errors of missing and broken files."""
+    reached: Bools
+    """Cells within the bounds of a file that was read, ``(H, W)``."""
 
 
 def load(tile: Tile, options: Options) -> TileData:
@@ -88,10 +92,15 @@ def load(tile: Tile, options: Options) -> TileData:
     from flexroad.catalog.headers.rasters import quiet
 
     grid = tile.grid.buffered(options.halo_m)
-    with quiet():
-        mosaics = {layer.name: _mosaic(tile, layer, grid) for layer in tile.layers if layer.name in READS}
-    _check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
     core = grid.window(tile.grid)
+    with quiet():
+        mosaics = {
+            layer.name: _mosaic(tile, layer, grid, tile.grid) for layer in tile.layers if layer.name in READS
+        }
+    for layer in tile.layers:
+        if layer.name in mosaics:
+            _check_read(tile, layer, mosaics[layer.name], core, grid)
+    _check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
     _check_valid(mosaics["dsm"], core, options.min_valid)
     _check_valid(mosaics["dtm"], core, 0.0)
     return TileData(
@@ -106,6 +115,45 @@ def load(tile: Tile, options: Options) -> TileData:
         notes=tuple(note for mosaic in mosaics.values() for note in mosaic.notes),
         dop=_source(tile, "dop"),
         roads=_source(tile, "roads"),
+    )
+
+
+def load_border(ground: Tile, core: Grid) -> TileData:
+    """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
+
+    Parameters
+    ----------
+    ground : Tile
+        The ground, with the files that reach it (`Tile.around`).
+    core : Grid
+        The tile that the files are of: the position of a file without georeference.
+
+    Raises
+    ------
+    TaskError
+        If a file is in another CRS, or the layers differ in their unit of height.
+    """
+    from flexroad.catalog.headers.rasters import quiet
+
+    grid = ground.grid
+    with quiet():
+        mosaics = {
+            layer.name: _mosaic(ground, layer, grid, core) for layer in ground.layers if layer.name in READS
+        }
+    patches = [patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches]
+    if patches:
+        _check_units(patches)
+    unknown = np.full(grid.shape, np.nan)
+    return TileData(
+        tile_id=ground.id,
+        grid=grid,
+        core=grid,
+        dsm=mosaics["dsm"].values if "dsm" in mosaics else unknown,
+        dtm=mosaics["dtm"].values if "dtm" in mosaics else unknown,
+        road_mask=_road(ground, "road_mask", mosaics),
+        dop=_source(ground, "dop"),
+        roads=_source(ground, "roads"),
+        border=True,
     )
 
 
@@ -124,7 +172,8 @@ def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:
     return np.where(np.isfinite(decks), decks, mosaics["dtm"].values)
 
 
-def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
+def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid) -> _Mosaic:
+    """Return a layer on a grid; files that are missing or broken are left out."""
     from rasterio.enums import Resampling
 
     from flexroad.tasks.io.raster import Unreadable, misalignment, read_window, resample_to
@@ -137,7 +186,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            patch = read_window(path, f"{layer.name} {name}", grid, tile.grid, layer.crs)
+            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs)
         except Unreadable as error:
             broken.append(error)
             continue
@@ -151,16 +200,6 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
         np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
         if not np.isnan(values).any():
             break
-    # A tile also lists files around it: a broken file fails only the tiles that need it.
-    if broken and not reached[grid.window(tile.grid)].all():
-        raise TaskError(str(broken[0]), broken[0].file)
-    if not patches:
-        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
-        raise TaskError(
-            f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
-            "build the catalog again",
-            str(tile.paths(layer)[0]),
-        )
     notes = [
         f"{layer.name} resampled: {reason}"
         for reason in dict.fromkeys(misalignment(p.lattice, grid) for p in patches)
@@ -169,7 +208,21 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid) -> _Mosaic:
     notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
     if absurd_cells:
         notes.append(absurd_note(layer.name, absurd_cells))
-    return _Mosaic(values, tuple(patches), tuple(notes))
+    return _Mosaic(values, tuple(patches), tuple(notes), tuple(broken), reached)
+
+
+def _check_read(tile: Tile, layer: Layer, mosaic: _Mosaic, core: tuple[slice, slice], grid: Grid) -> None:
+    """Raise an error if a layer is missing on the tile itself, or a file that it needs is broken."""
+    # A tile also lists files around it: a broken file fails only the tiles that need it.
+    if mosaic.broken and not mosaic.reached[core].all():
+        raise TaskError(str(mosaic.broken[0]), mosaic.broken[0].file)
+    if not mosaic.patches:
+        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
+        raise TaskError(
+            f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
+            "build the catalog again",
+            str(tile.paths(layer)[0]),
+        )
 
 
 def _reached(patch: RasterWindow, grid: Grid) -> Bools:

@@ -4,7 +4,8 @@ dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined
 uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
 
 The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
-the tile has no halo, else the core's bounds, so that neighbouring tiles meet.
+the tile has neither frame nor halo, else the core's bounds, so that neighbouring tiles meet. With a frame,
+the points on the border and their heights are those of the neighbours too: the meshes join without a gap.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import startinpy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.spline.mesh_border import NUDGE, border_heights, border_points, joined, on_border
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
 
 VERSION = 1
@@ -27,9 +30,6 @@ DECIMALS = 6
 """Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
 SNAP_M = 1e-3
 """The last line of a lattice is moved onto the border if it is closer to it than this (m)."""
-
-NUDGE = 1e-6
-"""Share of a cell, larger than the rounding error of its edge's coordinates."""
 
 
 class Options(base.Options):
@@ -47,7 +47,13 @@ class Options(base.Options):
     )
 
 
-def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Options) -> Mesh:
+def sample(
+    surface: Surface,
+    road: RoadMask,
+    clusters: RoadClusters,
+    options: Options,
+    frame: Frame | None = None,
+) -> Mesh:
     """Sample the surface over the tile's core and join the samples to triangles.
 
     Parameters
@@ -60,6 +66,8 @@ def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Op
         Gives the filtered mask.
     options : Options
         Spacings in metres.
+    frame : Frame, optional
+        What the tile shares with its neighbours; None if its surface was fitted without.
 
     Returns
     -------
@@ -74,20 +82,26 @@ def sample(surface: Surface, road: RoadMask, clusters: RoadClusters, options: Op
     """
     mask = road.mask if options.mask == "raw" else clusters.mask
     origin = road.core.origin
-    west, south, east, north = _domain(road)
+    west, south, east, north = _domain(road, frame)
     local = west - origin[0], south - origin[1], east - origin[0], north - origin[1]
     if options.method == "dynamic":
-        points = _dynamic(surface, road, mask, local, options)
+        points = _dynamic(surface, road, mask, local, options, frame)
         faces = _delaunay(points)
     else:
         step = options.road_m if options.method == "uniform" else np.inf
-        points, faces = _regular(surface, origin, local, step)
-    return _mesh(points, faces, road, mask, keep_outside=options.method == "corners")
+        points, faces = _regular(surface, origin, local, step, frame)
+    inside = np.ones(len(faces), np.bool_)
+    if options.method != "corners":
+        x, y, _ = points[faces].mean(axis=1).T
+        inside = ~road.outside[road.grid.cells(x + origin[0], y + origin[1])]
+        if frame:
+            inside |= joined(points, faces, frame, local, road.core.cell)
+    return _mesh(points, faces[inside], road, mask)
 
 
-def _domain(road: RoadMask) -> Bounds:
+def _domain(road: RoadMask, frame: Frame | None) -> Bounds:
     """Return west, south, east and north of the area to be meshed (m)."""
-    if road.core != road.grid:
+    if frame or road.core != road.grid:
         return road.core.bounds
     if min(road.core.shape) < 2:
         raise TaskError(
@@ -110,25 +124,35 @@ def _axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
 
 
 def _regular(
-    surface: Surface, origin: tuple[float, float], local: Bounds, step: float
+    surface: Surface, origin: tuple[float, float], local: Bounds, step: float, frame: Frame | None
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Return points of a full lattice and two faces per quad, cut from south-west to north-east."""
     west, south, east, north = local
     x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
     z = surface.lattice(x + origin[0], y + origin[1])
     points = np.stack([*np.broadcast_arrays(x, y[:, None]), z], axis=-1).reshape(-1, 3)
+    if frame:
+        border = on_border(points, local)
+        easting, northing = (points[border, :2] + origin).T
+        points[border, 2] = border_heights(surface, easting, northing)
     index = np.arange(len(points), dtype=np.int32).reshape(len(y), len(x))
     sw, se, nw, ne = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     return points, np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
 
 
-def _dynamic(surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options) -> Floats:
+def _dynamic(
+    surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
+) -> Floats:
     """Return road, terrain and border points without duplicates, by northing, then easting, ``(V, 3)``."""
     parts = [
         _lattice(surface, road, mask, local, options.road_m),
         _lattice(surface, road, ~mask, local, options.terrain_m),
-        _border(surface, road.core.origin, local, options.terrain_m),
     ]
+    if frame:
+        parts = [part[~on_border(part, local)] for part in parts]
+        parts.append(_shared_border(surface, road.core, local, options, frame))
+    else:
+        parts.append(_border(surface, road.core.origin, local, options.terrain_m))
     points = np.concatenate(parts)
     points = points[np.lexsort((points[:, 0], points[:, 1]))]
     first = np.ones(len(points), bool)
@@ -160,6 +184,18 @@ def _border(surface: Surface, origin: tuple[float, float], local: Bounds, step: 
     return np.column_stack([plan, z])
 
 
+def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options, frame: Frame) -> Floats:
+    """Return the border points of a tile that joins its neighbours, ``(n, 3)``."""
+    lengths = local[2] - local[0], local[3] - local[1]
+    fine, coarse = (
+        [_axis(0.0, length, step, to_end=True) for length in lengths]
+        for step in (options.road_m, options.terrain_m)
+    )
+    plan = border_points(frame, local, core.cell, fine, coarse, raw=options.mask == "raw")
+    z = border_heights(surface, *(plan + core.origin).T)
+    return np.column_stack([plan, z])
+
+
 def _delaunay(points: Floats) -> NDArray[np.int32]:
     """Return the faces of the Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
 
@@ -179,20 +215,18 @@ def _delaunay(points: Floats) -> NDArray[np.int32]:
     return faces
 
 
-def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools, keep_outside: bool) -> Mesh:
-    """Return the mesh of the faces that have heights and lie inside the survey, without unused vertices."""
+def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools) -> Mesh:
+    """Return the mesh of the faces that have heights, without unused vertices."""
     east, north = road.core.origin
     x, y, z = points.T
-    cells = road.grid.cells(x[faces].mean(axis=1) + east, y[faces].mean(axis=1) + north)
-    kept = np.isfinite(z)[faces].all(axis=1)
-    if not keep_outside:
-        kept &= ~road.outside[cells]
-    if not kept.any():
+    faces = faces[np.isfinite(z)[faces].all(axis=1)]
+    if not len(faces):
         raise TaskError("the surface has no height where the tile has data; check the layers of the tile")
+    cells = road.grid.cells(x[faces].mean(axis=1) + east, y[faces].mean(axis=1) + north)
     used = np.zeros(len(points), bool)
-    used[faces[kept]] = True
+    used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     vertices = points[used]
     datum = float(np.floor(vertices[:, 2].min()))
     vertices[:, 2] -= datum
-    return Mesh(road.core.crs, (east, north, datum), vertices, number[faces[kept]], mask[cells][kept])
+    return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], mask[cells])

@@ -52,6 +52,12 @@ class TileData:
     """The orthophoto, or None if the tile has none."""
     roads: Source | None = None
     """Roads as vectors, or None if the tile has none."""
+    border: bool = False
+    """Whether this is not a tile but the ground around a corner or edge, which may be without roads."""
+
+    def lacks_road(self, mask: Bools) -> bool:
+        """Return whether no cell of the tile's core is road in a mask, ``(H, W)``, although one should be."""
+        return not (self.border or mask[self.grid.window(self.core)].any())
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
@@ -110,7 +110,7 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
         If the tile has no such layer, or a file cannot be used.
     """
     if source is None:
-        raise TaskError(
+        raise LayerMissing(
             "no roads layer in the catalog: give a vector file with --roads to `flexroad catalog` "
             "or `flexroad prepare`"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from flexroad.tasks import options
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
@@ -27,11 +27,11 @@ def segment(data: TileData, options: Options) -> RoadMask:
         If the tile has no road mask, or no cell of its core is road.
     """
     if data.road_mask is None:
-        raise TaskError(
+        raise LayerMissing(
             "no road mask layer in the catalog and none configured: "
             "give --road-mask to `flexroad catalog rasters`"
         )
-    if not data.road_mask[data.grid.window(data.core)].any():
+    if data.lacks_road(data.road_mask):
         raise TaskError(
             "the road mask has no road cell on this tile: leave the tile out, or give the values that mean "
             "road with --road-value of `flexroad catalog rasters`",

@@ -33,7 +33,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     """
     roads = rasterise.roads(data.roads, data.grid, options)
     mask = clean(rasterise.cells(roads.areas, data.grid), data, options.cleanup)
-    if not mask[data.grid.window(data.core)].any():
+    if data.lacks_road(mask):
         files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
         raise TaskError(
             f"no road of {files} lies on this tile: leave the tile out, or check segment.layer, "

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
@@ -80,7 +80,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         or do not fit each other.
     """
     if data.dop is None:
-        raise TaskError(
+        raise LayerMissing(
             "no orthophoto (layer dop), which segment: dinov2 needs; give --dop to "
             "`flexroad catalog rasters`, or use another segmentation method",
             layer="dop",
@@ -92,7 +92,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     row, col = photo.grid.cells(*_centres(data.grid))
     threshold = options.threshold or head.about.threshold
     mask = clean(probability[row, col] >= threshold, data, options.cleanup)
-    if not mask[data.grid.window(data.core)].any():
+    if data.lacks_road(mask):
         raise TaskError(
             f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
             f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",

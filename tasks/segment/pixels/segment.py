@@ -8,17 +8,19 @@ from typing import Literal
 from pydantic import Field
 
 from flexroad.tasks import options
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
-from flexroad.tasks.segment.pixels.features import features, read_tile_photo
+from flexroad.tasks.segment.pixels.features import REACH_M, features, read_tile_photo
 from flexroad.tasks.segment.pixels.model import About, read_model
 from flexroad.tasks.types import Orthophoto, RoadMask, TileData
 
 VERSION = 1
 READS = ("dop", "roads")
 """``roads`` is read only if the cleanup uses it."""
+CONTEXT_M = REACH_M
+"""A cell's class depends on the ground up to this distance (m)."""
 FULL_COVERAGE = 0.99
 """Fraction of the tile covered by the photo, below which a note gives the fraction."""
 
@@ -54,10 +56,10 @@ def segment(data: TileData, options: Options) -> RoadMask:
     probability = model.probability(features(data, photo), ~beyond)
     threshold = options.threshold or model.about.threshold
     mask = clean(probability >= threshold, data, options.cleanup)
-    core = data.grid.window(data.core)
-    if not mask[core].any():
+    if data.lacks_road(mask):
+        highest = probability[data.grid.window(data.core)].max()
         raise TaskError(
-            f"no road on this tile: probabilities reach {probability[core].max():.2f}, the threshold is "
+            f"no road on this tile: probabilities reach {highest:.2f}, the threshold is "
             f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",
             layer="dop" if photo else "dsm",
         )
@@ -71,7 +73,7 @@ def _photo(data: TileData, about: About, path: Path) -> Orthophoto | None:
         return None
     photo = read_tile_photo(data)
     if photo is None:
-        raise TaskError(
+        raise LayerMissing(
             f"the tile has no orthophoto (layer dop), and {path.name} was trained with colours: give --dop "
             "to `flexroad catalog rasters`, or train a model on heights alone (--set photo=false)",
             layer="dop",

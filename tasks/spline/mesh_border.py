@@ -1,0 +1,103 @@
+"""The border of a tile's mesh: vertices and faces that fit those of the neighbouring tiles exactly.
+
+Vertices lie at whole multiples of the spacing from the western or southern end of an edge, and are fine where
+the edge is road. Both tiles read that from the same `Edge`, evaluate the same control points, and round the
+heights to the same multiple of `GRAIN_M`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.spline.frame import Edge, Frame
+from flexroad.tasks.types import Bools, Floats, Surface
+
+GRAIN_M = 2.0**-12
+"""Heights on the border are multiples of this (m): relative to a whole-metre datum they are exact in the
+float32 of GLB files."""
+NUDGE = 1e-6
+"""Share of a cell, larger than the rounding error of its edge's coordinates."""
+
+
+def border_heights(surface: Surface, easting: Floats, northing: Floats) -> Floats:
+    """Return the heights of vertices on the border (m).
+
+    They are evaluated point by point: the last digits of a matrix product depend on the other points.
+    """
+    return np.asarray(np.round(surface.height(easting, northing) / GRAIN_M) * GRAIN_M)
+
+
+def border_points(
+    frame: Frame, local: Bounds, cell: float, fine: Sequence[Floats], coarse: Sequence[Floats], raw: bool
+) -> Floats:
+    """Return the vertices on the border of a tile, ``(n, 2)``; corners are in it twice.
+
+    Parameters
+    ----------
+    frame : Frame
+        Tells where the border is road.
+    local : Bounds
+        West, south, east and north of the tile (m).
+    cell : float
+        Cell size (m).
+    fine, coarse : sequence of ndarray
+        Distances of possible vertices from the start of an edge, along easting and along northing (m): on the
+        road and elsewhere. Both have the edge's two ends.
+    raw : bool
+        Whether the raw road mask counts, instead of the filtered one.
+    """
+    sides = []
+    for edge, axis, at in _edges(frame, local):
+        road = edge.road if raw else edge.kept
+        # As everywhere, a vertex between two cells belongs to the eastern or southern one.
+        nudge = NUDGE * cell * (1 if axis == 0 else -1)
+        on_road, elsewhere = (_at(road, (t[axis] + nudge) / cell) for t in (fine, coarse))
+        chosen = [fine[axis][on_road], coarse[axis][~elsewhere]]
+        start, stop = local[axis], local[axis + 2]
+        along = np.unique(np.concatenate([*chosen, coarse[axis][[0, -1]]]))
+        along = np.where(along == coarse[axis][-1], stop, start + along)
+        across = np.full_like(along, at)
+        sides.append(np.stack([along, across] if axis == 0 else [across, along], axis=1))
+    return np.concatenate(sides)
+
+
+def on_border(points: Floats, local: Bounds) -> Bools:
+    """Return which points, ``(n, 2 or more)``, lie on the border of a tile."""
+    west, south, east, north = local
+    x, y = points[:, 0], points[:, 1]
+    border: Bools = (x == west) | (x == east) | (y == south) | (y == north)
+    return border
+
+
+def joined(points: Floats, faces: NDArray[np.int32], frame: Frame, local: Bounds, cell: float) -> Bools:
+    """Return the faces along those parts of the border that lie within the survey, ``(F,)``.
+
+    They are part of the mesh although the tile alone may count the ground there as outside: the neighbour's
+    face on the other side is there as well.
+    """
+    result = np.zeros(len(faces), np.bool_)
+    for edge, axis, at in _edges(frame, local):
+        on_edge = (points[:, 1 - axis] == at)[faces]
+        middle = np.where(on_edge, points[:, axis][faces] - local[axis], 0.0).sum(axis=1) / 2
+        result |= (on_edge.sum(axis=1) == 2) & _at(edge.inside, middle / cell)
+    return result
+
+
+def _edges(frame: Frame, local: Bounds) -> Iterator[tuple[Edge, int, float]]:
+    """Yield each edge, the axis along which it runs (0 is easting), and its position on the other axis."""
+    west, south, east, north = local
+    yield from (
+        (frame.south, 0, south),
+        (frame.north, 0, north),
+        (frame.west, 1, west),
+        (frame.east, 1, east),
+    )
+
+
+def _at(cells: Bools, position: Floats) -> Bools:
+    """Return the values of the cells along an edge at positions counted in cells."""
+    return np.asarray(cells[np.clip(np.floor(position).astype(np.intp), 0, len(cells) - 1)])
