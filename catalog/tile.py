@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import compress
 
+from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
 from flexroad.catalog.storage.paths import Location, join, parse_location
 
@@ -41,6 +42,13 @@ class Layer:
     extents: tuple[Bounds, ...] = ()
     """West, south, east and north of each file (m, in the tile's CRS), in the order of ``files``; empty where
     they are unknown (published datasets, older catalogs): each file may then lie anywhere."""
+
+    def __post_init__(self) -> None:
+        if self.extents and len(self.extents) != len(self.files):
+            raise CatalogError(
+                f"layer {self.name} has {len(self.files)} files and {len(self.extents)} extents; "
+                "give none if they are unknown"
+            )
 
     def reaching(self, bounds: Bounds) -> Layer | None:
         """Return the layer with only the files that overlap an area, or None if there are none.

@@ -22,7 +22,7 @@ from flexroad.catalog.crs import same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
-from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile
+from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
 
@@ -46,7 +46,7 @@ class _PlacedFile(NamedTuple):
 class _NearFiles(NamedTuple):
     """The files of one layer near one tile, in the order given."""
 
-    files: list[RasterFile]
+    files: list[_PlacedFile]
     """Files within `REACH_M`."""
     in_core: list[RasterFile]
     """Files that overlap the tile itself by more than `LATTICE_TOLERANCE`."""
@@ -101,16 +101,21 @@ def cut(
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
     grids, left_out = _covered(grids, _near(grids, placed["dsm"]), min_cover)
     near = {name: _near(grids, files) for name, files in placed.items()}
+    # Of the whole layer, so that all tiles describe it in the same way.
+    bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
     values = dict.fromkeys(MASKS, road_values)
     tiles = []
     for tile_id, grid in grids.items():
-        layers = tuple(
-            _layer(name, by_tile[tile_id], values.get(name, ()), crs)
-            for name, by_tile in near.items()
-            if by_tile[tile_id].in_core
+        layers, nearby = by_cover(
+            [
+                _layer(name, by_tile[tile_id].files, values.get(name, ()), bare[name])
+                for name, by_tile in near.items()
+                if by_tile[tile_id].files
+            ],
+            grid,
         )
         survey_date = taken(near["dsm"][tile_id].in_core, date)
-        tiles.append(Tile(tile_id, grid, layers, str(root), *survey_date, dataset=dataset))
+        tiles.append(Tile(tile_id, grid, layers, str(root), *survey_date, dataset=dataset, nearby=nearby))
     return TilingResult(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
 
 
@@ -167,8 +172,9 @@ def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, 
     ends = np.searchsorted(tile, np.arange(len(grids) + 1))
     near = {}
     for tile_id, begin, end in zip(grids, ends[:-1], ends[1:], strict=True):
-        nearby, core = [files[k].file for k in file[begin:end]], in_core[begin:end]
-        near[tile_id] = _NearFiles(nearby, list(compress(nearby, core)), shared[begin:end][core])
+        nearby, core = [files[k] for k in file[begin:end]], in_core[begin:end]
+        on_tile = [placed.file for placed in compress(nearby, core)]
+        near[tile_id] = _NearFiles(nearby, on_tile, shared[begin:end][core])
     return near
 
 
@@ -196,9 +202,9 @@ def _area(boxes: NDArray[np.float64]) -> float:
     return float(shapely.union_all(shapely.box(*boxes.T)).area)
 
 
-def _layer(name: str, near: _NearFiles, values: tuple[int, ...], crs: str | None) -> Layer:
-    bare = any(not file.has_crs for file in near.files)
-    return Layer(name, tuple(file.name for file in near.files), values, crs if bare else None)
+def _layer(name: str, files: Sequence[_PlacedFile], values: tuple[int, ...], crs: str | None) -> Layer:
+    names, extents = tuple(placed.file.name for placed in files), tuple(placed.bounds for placed in files)
+    return Layer(name, names, values, crs, extents)
 
 
 def taken(dsm: Sequence[RasterFile], date: datetime | None) -> tuple[datetime, bool]:

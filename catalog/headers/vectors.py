@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
-import shapely
+from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog.crs import transformer
@@ -15,6 +16,11 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.tile import REACH_M, Layer, Tile
+
+MARGIN_M = 1.0
+"""Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
+EVERYWHERE: Bounds = (-1e9, -1e9, 1e9, 1e9)
+"""Extent of a file that may have features anywhere (m)."""
 
 
 @dataclass(frozen=True)
@@ -93,40 +99,51 @@ def with_roads(tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | No
     CatalogError
         If a file reaches no tile.
     """
-    reached = [_reached(file, tiles) for file in files]
-    for file, reaches in zip(files, reached, strict=True):
-        if not reaches.any():
+    if not files:
+        return tuple(tiles)
+    systems = {tile.grid.crs for tile in tiles}
+    extents = {target: np.array([_extent(file, target) for file in files]) for target in systems}
+    near = np.array([_near(tile, extents[tile.grid.crs]) for tile in tiles])
+    for number, file in enumerate(files):
+        if not near[:, number].any():
             raise CatalogError(f"--roads {file.path} reaches no tile; check its CRS and its extent")
+    # A CRS is that of the whole layer, so that all tiles describe the layer in the same way.
+    bare = None if all(file.has_crs for file in files) else crs
     return tuple(
-        _with_layer(tile, [file for file, reaches in zip(files, reached, strict=True) if reaches[i]], crs)
-        for i, tile in enumerate(tiles)
+        _with_layer(tile, list(compress(files, chosen)), extents[tile.grid.crs][chosen], bare)
+        for tile, chosen in zip(tiles, near, strict=True)
     )
 
 
-def _reached(file: VectorFile, tiles: Sequence[Tile]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which tiles are near the file, ``(n,)``; all of them if the file has no bounds."""
+def _extent(file: VectorFile, target: str) -> Bounds:
+    """Return the extent of a file in a CRS (m): all of the ground if its bounds are unknown there."""
     if file.extents is None:
-        return np.ones(len(tiles), bool)
-    near = np.zeros(len(tiles), bool)
-    for target in {tile.grid.crs for tile in tiles}:
-        in_target = np.array([tile.grid.crs == target for tile in tiles])
-        grown = shapely.box(*np.array([tile.grid.buffered(REACH_M).bounds for tile in tiles]).T)
-        for crs, bounds in file.extents:
-            box = _box(crs, target, bounds)
-            # Bounds that cannot be transformed may still hold features near the tiles.
-            near |= in_target & (shapely.intersects(grown, box) if box else True)
+        return EVERYWHERE
+    placed = [_placed(crs, target, bounds) for crs, bounds in file.extents]
+    # The empty extent of a file without features reaches nothing.
+    wests, souths, easts, norths = zip(*placed, strict=True) if placed else ([np.inf], [np.inf], [0.0], [0.0])
+    return min(wests) - MARGIN_M, min(souths) - MARGIN_M, max(easts) + MARGIN_M, max(norths) + MARGIN_M
+
+
+def _placed(crs: str, target: str, bounds: Bounds) -> Bounds:
+    try:
+        west, south, east, north = transformer(crs, target).transform_bounds(*bounds, densify_pts=21)
+    except ProjError:
+        return EVERYWHERE
+    return (west, south, east, north) if np.isfinite((west, south, east, north)).all() else EVERYWHERE
+
+
+def _near(tile: Tile, extents: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which extents, ``(n, 4)``, are within `REACH_M` of a tile, ``(n,)``."""
+    west, south, east, north = tile.grid.buffered(REACH_M).bounds
+    on_columns = (extents[:, 0] <= east) & (extents[:, 2] >= west)
+    near: NDArray[np.bool_] = on_columns & (extents[:, 1] <= north) & (extents[:, 3] >= south)
     return near
 
 
-def _box(crs: str, target: str, bounds: Bounds) -> shapely.Polygon | None:
-    try:
-        placed = transformer(crs, target).transform_bounds(*bounds, densify_pts=21)
-    except ProjError:
-        return None
-    return shapely.box(*placed) if np.isfinite(placed).all() else None
-
-
-def _with_layer(tile: Tile, files: Sequence[VectorFile], crs: str | None) -> Tile:
+def _with_layer(
+    tile: Tile, files: Sequence[VectorFile], extents: NDArray[np.float64], crs: str | None
+) -> Tile:
     if not files:
         return tile
     root = Path(tile.root)
@@ -134,5 +151,5 @@ def _with_layer(tile: Tile, files: Sequence[VectorFile], crs: str | None) -> Til
         file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
         for file in files
     )
-    bare = any(not file.has_crs for file in files)
-    return replace(tile, layers=(*tile.layers, Layer("roads", names, crs=crs if bare else None)))
+    roads = Layer("roads", names, crs=crs, extents=tuple(map(tuple, extents.tolist())))
+    return replace(tile, layers=(*tile.layers, roads))

@@ -107,12 +107,8 @@ def _tile(folder: Path, place: Place) -> Tile:
     """Return the tile of a scene with paths relative to the folder above."""
     name = place.site.name
     (tile,) = Catalog.read(folder / name / "catalog.parquet").tiles
-    layers = tuple(
-        replace(layer, files=tuple(f"{name}/{Path(file).name}" for file in layer.files))
-        for layer in tile.layers
-    )
-    root = str(folder.resolve())
-    return replace(tile, id=name, layers=layers, root=root, stratum=place.site.stratum)
+    tile = tile.renamed(lambda file: f"{name}/{Path(file).name}")
+    return replace(tile, id=name, root=str(folder.resolve()), stratum=place.site.stratum)
 
 
 def _with_truth(tile: Tile, seed: int) -> Tile:

@@ -227,7 +227,7 @@ class RasterWriter:
         return Tile(
             id=f"{self.grid.west:.0f}_{self.grid.south:.0f}",
             grid=self.grid,
-            layers=tuple(Layer(name, (f"{name}.tif",)) for name in names),
+            layers=tuple(Layer(name, (f"{name}.tif",), extents=(self.grid.bounds,)) for name in names),
             root=str(self.out.resolve()),
             datetime=zoned(date) if date else datetime.now(UTC),
             datetime_assumed=date is None,

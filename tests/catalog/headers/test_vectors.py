@@ -59,7 +59,32 @@ def test_roads_file_outside_folder_in_other_crs_is_used(survey, tmp_path):
 
 def test_osm_file_without_bounds_is_used_by_all_tiles(survey):
     write_osm(survey / "map.osm", {"highway=service": [(6.1, 50.7), (6.2, 50.8)]})
-    assert named(indexed(survey, "map.osm")) == [["map.osm"]] * 3
+    tiles = indexed(survey, "map.osm")
+    assert named(tiles) == [["map.osm"]] * 3
+    roads = tiles[0].layer("roads")
+    assert roads.reaching((0.0, 0.0, 1.0, 1.0)) == roads
+
+
+def test_straight_road_has_an_extent_in_the_tiles_crs(survey, tmp_path):
+    import geopandas
+
+    line = geopandas.GeoSeries([LineString([(295_400, 5_629_300), (295_901, 5_629_300)])], crs="EPSG:25832")
+    write_roads(survey / "a.geojson", list(line.to_crs("EPSG:4326")), "EPSG:4326")
+    roads = indexed(survey, "a.geojson")[0].layer("roads")
+    # Bounds in degrees are those of a slightly turned rectangle.
+    assert roads.extents[0] == pytest.approx((295_399, 5_629_299, 295_902, 5_629_301), abs=25)
+    assert roads.reaching((295_500.0, 5_629_250.0, 295_600.0, 5_629_350.0)) == roads
+    assert roads.reaching((295_500.0, 5_629_350.0, 295_600.0, 5_629_400.0)) is None
+
+
+def test_roads_of_all_tiles_have_the_crs_of_files_without_one(survey):
+    """Only the first file, near the first tile, has no CRS; the last tile lists the other one."""
+    with pytest.warns(UserWarning, match="'crs' was not provided"):
+        write_roads(survey / "a.gpkg", [LineString([(295_500, 5_629_300), (295_510, 5_629_300)])], None)
+    write_roads(survey / "b.gpkg", [LineString([(296_020, 5_629_300), (296_200, 5_629_300)])])
+    tiles = indexed(survey, "?.gpkg", "EPSG:25832")
+    assert named(tiles) == [["a.gpkg"], ["b.gpkg"], ["b.gpkg"]]
+    assert [tile.layer("roads").crs for tile in tiles] == ["EPSG:25832"] * 3
 
 
 def test_nrw_index_accepts_roads(tmp_path):

@@ -1,5 +1,6 @@
 import os
 from datetime import UTC, datetime
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog import Catalog, CatalogError, Grid
+from flexroad.catalog.sources import nrw
 from flexroad.catalog.sources.rasters import index
 from tests.make_rasters import UTM, write, write_xyz
 
@@ -50,11 +52,44 @@ def test_tile_lists_every_file_in_reach(tmp_path):
     }
 
 
-def test_file_only_in_halo_is_not_a_layer(tmp_path):
+def test_file_only_in_halo_is_a_layer_nearby(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     write(tmp_path / "dtm.tif", FLAT, west=295750)
     (tile,) = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}).tiles
     assert tile.layer("dtm") is None
+    (dtm,) = tile.nearby
+    assert (dtm.name, dtm.files, dtm.extents) == ("dtm", ("dtm.tif",), ((295750, 5629250, 296000, 5629500),))
+
+
+def test_ground_along_a_border_has_the_same_files_from_both_sides(tmp_path):
+    """Four tiles; of the photo only the east is there, and only the mask of the west lacks a CRS."""
+    write(tmp_path / "dsm" / "west.tif", np.ones((500, 300), np.float32))
+    write(tmp_path / "dsm" / "east.tif", np.ones((500, 200), np.float32), west=295800)
+    write(tmp_path / "dop.tif", np.ones((500, 300), np.uint8), west=295800)
+    write(tmp_path / "mask" / "west.tif", np.ones((500, 10), np.uint8), crs=None)
+    write(tmp_path / "mask" / "east.tif", np.ones((500, 390), np.uint8), west=295610)
+    layers = {"dsm": "dsm/*.tif", "dop": "dop.tif", "road_mask": "mask/*.tif"}
+    result = index(tmp_path, layers, road_values=(3,), crs=UTM)
+    tiles = result.tiles
+    assert ids(result) == ["295500_5629000", "295500_5629250", "295750_5629000", "295750_5629250"]
+    for first, second in combinations(tiles, 2):
+        for column, row in ((295740, 5629250), (295760, 5629260), (295700, 5629300)):
+            strip = Grid(UTM, column, row, 1.0, 20, 20)
+            reach = strip.buffered(56).bounds
+            assert first.around(strip, reach).layers == second.around(strip, reach).layers
+    (dsm, dop, mask) = (
+        tiles[0].around(Grid(UTM, 295740.0, 5629260.0, 1.0, 20, 20), (295700, 0, 295810, 1e7)).layers
+    )
+    assert (dsm.files, dop.files) == (("dsm/west.tif",), ("dop.tif",))
+    assert (mask.files, mask.values, mask.crs) == (("mask/east.tif",), (3,), UTM)
+
+
+def test_newest_file_stays_first_on_ground_along_a_border(tmp_path):
+    for name in ("dom1_32_295_5629_1_nw_2018", "dom1_32_295_5629_1_nw_2020"):
+        write(tmp_path / f"{name}.tif", np.ones((500, 500), np.float32))
+    tiles = nrw.index(tmp_path, min_cover=0).tiles
+    (dsm,) = tiles[0].around(Grid(UTM, 295740.0, 5629260.0, 1.0, 20, 20), (0, 0, 1, 1)).layers
+    assert dsm.files == ("dom1_32_295_5629_1_nw_2020.tif", "dom1_32_295_5629_1_nw_2018.tif")
 
 
 def test_tiles_below_min_cover_are_left_out_with_note(tmp_path):
