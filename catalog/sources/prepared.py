@@ -10,21 +10,23 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
+import shapely
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, RasterioIOError
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Grid
-from flexroad.catalog.tile import LAYERS, Layer, Tile
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
+from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "reference")
 MASKS = ("road_mask", "reference_road")
@@ -83,8 +85,19 @@ def write_tile(
         _write(folder / name / f"{tile_id}.tif", grid, name, array, {**tags, LAYER_TAG: name})
 
 
-def index(folder: Path) -> list[Tile]:
+def index(folder: Path, only: Container[str] | None = None) -> list[Tile]:
     """Return the tiles of a folder written by `write_tile`, in the order of their ids.
+
+    A tile's layers list its own file first, then those of the tiles of the same dataset, CRS and cell size
+    that lie within `REACH_M` of it. Tiles that overlap are other surveys of the same ground, and do not list
+    each other's files.
+
+    Parameters
+    ----------
+    folder : Path
+        Parent of the layers' folders.
+    only : container of str, optional
+        Ids of the tiles to return; other tiles in the folder are left out, as neighbours as well.
 
     Raises
     ------
@@ -99,8 +112,9 @@ def index(folder: Path) -> list[Tile]:
     by_id: dict[str, list[_File]] = {}
     for path in files:
         file = _read(path)
-        by_id.setdefault(file.tile_id, []).append(file)
-    return [_tile(by_id[tile_id], root) for tile_id in sorted(by_id)]
+        if only is None or file.tile_id in only:
+            by_id.setdefault(file.tile_id, []).append(file)
+    return _with_neighbours([_tile(by_id[tile_id], root) for tile_id in sorted(by_id)])
 
 
 @dataclass(frozen=True)
@@ -229,7 +243,7 @@ def _tile(files: Iterable[_File], root: Path) -> Tile:
         id=first.tile_id,
         grid=first.grid,
         layers=tuple(
-            Layer(name, (by_layer[name].path.relative_to(root).as_posix(),))
+            Layer(name, (by_layer[name].path.relative_to(root).as_posix(),), extents=(first.grid.bounds,))
             for name in LAYERS
             if name in by_layer
         ),
@@ -256,3 +270,31 @@ def _check_same_tile(first: _File, file: _File) -> None:
 
 def _same_bounds(a: Grid, b: Grid) -> bool:
     return a.crs == b.crs and np.allclose(a.bounds, b.bounds, rtol=0, atol=1e-3)
+
+
+def _with_neighbours(tiles: Sequence[Tile]) -> list[Tile]:
+    """Return the tiles, given with their own files, with the files of their neighbours."""
+    groups: dict[tuple[str, float, str], list[Tile]] = {}
+    for tile in tiles:
+        groups.setdefault((tile.grid.crs, tile.grid.cell, tile.dataset), []).append(tile)
+    near = {tile.id: [tile] for tile in tiles}
+    for (_, cell, _), group in groups.items():
+        bounds = [tile.grid.bounds for tile in group]
+        reached = np.array([tile.grid.buffered(REACH_M).bounds for tile in group])
+        tree = shapely.STRtree(shapely.box(*np.array(bounds).T))
+        for one, other in sorted(tree.query(shapely.box(*reached.T)).T.tolist()):
+            if not overlap(bounds[one], bounds[other], LATTICE_TOLERANCE * cell):
+                near[group[one].id].append(group[other])
+    return [_joined(near[tile.id]) for tile in tiles]
+
+
+def _joined(tiles: Sequence[Tile]) -> Tile:
+    """Return the first tile with the files of all of them."""
+    layers = []
+    for name in LAYERS:
+        parts = [layer for layer in (tile.layer(name) for tile in tiles) if layer]
+        if parts:
+            files = tuple(chain.from_iterable(part.files for part in parts))
+            layers.append(replace(parts[0], files=files, extents=tuple(part.extents[0] for part in parts)))
+    covering, nearby = by_cover(layers, tiles[0].grid)
+    return replace(tiles[0], layers=covering, nearby=nearby)

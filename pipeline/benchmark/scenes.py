@@ -85,9 +85,8 @@ def write_scenes(
             if error:
                 raise ConfigError(error)
         path = folder / "catalog.parquet"
-        written = {job.tile_id for job in jobs}
         # The folder may also contain tiles of an earlier call.
-        tiles_written = [tile for tile in prepared.index(folder) if tile.id in written]
+        tiles_written = prepared.index(folder, only={job.tile_id for job in jobs})
         Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written)).write(path)
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error

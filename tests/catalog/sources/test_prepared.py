@@ -1,3 +1,4 @@
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import Catalog, CatalogError, Grid
 from flexroad.catalog.sources.prepared import index, write_tile
+from flexroad.tasks.load import Options, load
 
 GRID = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 25, 20)
 TAKEN = datetime(2024, 5, 1, 12, 30, tzinfo=timezone(timedelta(hours=2)))
@@ -209,3 +211,86 @@ def test_index_photo_alone_or_misplaced_raises_error(tmp_path):
     write_tile(tmp_path, "a", moved, {"dsm": heights()})
     with pytest.raises(CatalogError, match=r"dsm/a.tif and .*dop/a.tif of tile a differ in grid"):
         index(tmp_path)
+
+
+def block(folder, names, size=60, gap=0.0, **options):
+    """Write tiles side by side, three to a row, all with the heights of the same ground, and index them."""
+    for number, name in enumerate(names):
+        west, north = 500_000.0 + (size + gap) * (number % 3), 5_600_000.0 - (size + gap) * (number // 3)
+        grid = Grid("EPSG:25832", west, north, 1.0, size, size)
+        z = np.add.outer(np.sin(grid.northings), grid.eastings / 1e4)
+        write_tile(folder, name, grid, {"dsm": z, "dtm": z - 1}, **options)
+    return {tile.id: tile for tile in index(folder)}
+
+
+def test_tile_lists_files_of_neighbours_after_its_own(tmp_path):
+    tiles = block(tmp_path, "abcdefghi")
+    dsm = tiles["e"].layer("dsm")
+    assert dsm.files == tuple(f"dsm/{name}.tif" for name in "eabcdfghi")
+    assert dsm.extents == tuple(tiles[name].grid.bounds for name in "eabcdfghi")
+    assert tiles["e"].nearby == ()
+    Catalog(tuple(tiles.values())).write(tmp_path / "catalog.parquet")
+    assert Catalog.read(tmp_path / "catalog.parquet").tiles == tuple(tiles.values())
+
+
+def test_tiles_out_of_reach_or_of_other_data_are_not_neighbours(tmp_path):
+    assert {len(t.layers[0].files) for t in block(tmp_path / "far", "abcd", gap=201.0).values()} == {1}
+    assert {len(t.layers[0].files) for t in block(tmp_path / "near", "ab", gap=200.0).values()} == {2}
+    block(tmp_path / "mixed", "abc")
+    beside = Grid("EPSG:25832", 500_000.0, 5_600_030.0, 1.0, 30, 30)
+    for name, grid, dataset in (
+        ("dataset", beside, "other"),
+        ("cell", replace(beside, cell=0.5), ""),
+        ("crs", replace(beside, crs="EPSG:25833"), ""),
+        # Over the southern half of tile a.
+        ("overlap", replace(beside, north=5_599_970.0, width=60), ""),
+    ):
+        write_tile(tmp_path / "mixed", name, grid, {"dsm": heights(grid)}, dataset=dataset)
+    tiles = {tile.id: tile.layers[0].files for tile in index(tmp_path / "mixed")}
+    assert tiles["a"] == ("dsm/a.tif", "dsm/b.tif", "dsm/c.tif")
+    assert tiles["b"] == ("dsm/b.tif", "dsm/a.tif", "dsm/c.tif", "dsm/overlap.tif")
+    assert [tiles[name] for name in ("dataset", "cell", "crs")] == [
+        (f"dsm/{name}.tif",) for name in ("dataset", "cell", "crs")
+    ]
+    left_out = index(tmp_path / "mixed", only={"a", "c"})
+    assert [tile.layers[0].files for tile in left_out] == [
+        ("dsm/a.tif", "dsm/c.tif"),
+        ("dsm/c.tif", "dsm/a.tif"),
+    ]
+
+
+def test_layer_of_a_neighbour_alone_is_nearby(tmp_path):
+    block(tmp_path, "ab")
+    mask = Grid("EPSG:25832", 500_060.0, 5_600_000.0, 1.0, 60, 60)
+    write_tile(tmp_path, "b", mask, {"road_mask": road(mask)})
+    first, second = index(tmp_path)
+    assert [layer.name for layer in first.layers] == ["dsm", "dtm"]
+    assert first.nearby == (second.layer("road_mask"),)
+    strip = Grid("EPSG:25832", 500_050.0, 5_600_000.0, 1.0, 20, 60)
+    assert first.around(strip, strip.bounds).layers == second.around(strip, strip.bounds).layers
+    assert len(first.around(strip, strip.bounds).layers) == 3
+
+
+def test_halo_has_the_heights_of_the_neighbours(tmp_path):
+    tiles = block(tmp_path, "abcdefghi")
+    own = {name: load(tile, Options()) for name, tile in tiles.items()}
+    data = load(tiles["e"], Options(halo_m=50))
+    assert data.grid.shape == (160, 160)
+    assert not np.isnan(data.dsm).any()
+    assert not np.isnan(data.dtm).any()
+    assert data.notes == ()
+    for row, names in enumerate(("abc", "def", "ghi")):
+        for column, name in enumerate(names):
+            part = (
+                slice(max(0, 60 * row - 10), 60 * row + 50),
+                slice(max(0, 60 * column - 10), 60 * column + 50),
+            )
+            seen = data.dsm[part]
+            size = slice(-seen.shape[0], None) if row == 0 else slice(seen.shape[0])
+            width = slice(-seen.shape[1], None) if column == 0 else slice(seen.shape[1])
+            assert np.array_equal(seen, own[name].dsm[size, width]), name
+    # The corner tile has no neighbours in the north and west.
+    corner = load(tiles["a"], Options(halo_m=50)).dsm
+    assert np.isnan(corner[:50]).all()
+    assert np.isnan(corner[:, :50]).all()
+    assert not np.isnan(corner[50:, 50:]).any()
