@@ -74,7 +74,7 @@ def _outside(
     }
     prefixes = tuple(root.rstrip("/") + "/" for root in roots)
     for tile in catalog.tiles:
-        for layer in (layer for layer in tile.layers if layer.name in layers):
+        for layer in (layer for layer in tile.all_layers if layer.name in layers):
             for file in layer.files:
                 address = next((text for text in (file, tile.root) if ADDRESS.match(text)), None)
                 name = address or normalise(join(tile.root, file))

@@ -46,9 +46,13 @@ def check(catalog: Catalog) -> Iterator[Finding]:
 
 
 def _missing(tiles: Sequence[Tile]) -> Iterator[Finding]:
-    files: Counter[Location] = Counter(
-        path for tile in tiles for layer in tile.layers for path in tile.paths(layer)
-    )
+    """Name the missing files, each with the number of tiles that it lies on."""
+    files: Counter[Location] = Counter()
+    for tile in tiles:
+        for layer in tile.all_layers:
+            files.update(dict.fromkeys(tile.paths(layer), 0))
+            on_tile = layer.reaching(tile.grid.bounds)
+            files.update(tile.paths(on_tile) if on_tile else ())
     stat = StatCache()
     missing = [(path, count) for path, count in files.items() if stat(path) is None]
     for path, count in missing[:MAX_MISSING_SHOWN]:
