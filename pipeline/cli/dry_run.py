@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from flexroad.catalog.storage.paths import Location
+from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -27,21 +28,24 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
         for node in graph.nodes.values():
             state = "stored" if node.stored and artefacts.has(node) else "to do"
             totals[node.stage, "done" if done else state] += 1
-            inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in node.inputs) or "files"
+            needed = (*node.inputs, *node.frame)
+            inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in needed) or "files"
             yield (
                 f"  {node.stage:9}{node.fingerprint[:8]}  {'done' if done else state:7} "
                 f"<- {inputs}  ({', '.join(users[node.fingerprint])})"
             )
     yield f"{tiles} tiles"
-    for stage in STAGE_NAMES:
+    for stage in (*STAGE_NAMES, BORDER):
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
-        yield f"  {stage:9}{counts}"
+        if counts:
+            yield f"  {stage:9}{counts}"
 
 
 def _users(graph: TileGraph) -> dict[str, list[str]]:
     """Return the variants that use each node, by the node's fingerprint."""
     users: dict[str, list[str]] = {}
     for variant, nodes in graph.variants.items():
-        for fingerprint in nodes.values():
+        shared = graph.nodes[nodes["fit"]].frame
+        for fingerprint in (*nodes.values(), *shared):
             users.setdefault(fingerprint, []).append(variant)
     return users

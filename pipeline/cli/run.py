@@ -138,6 +138,7 @@ def rerun(
     """Bring tiles of a run up to date after changes of source files or of RUN/config.yaml."""
     from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import parse_location
+    from flexroad.pipeline.graph.borders import STAGE as BORDER
     from flexroad.pipeline.graph.graph import layers_read
     from flexroad.pipeline.graph.stages import STAGE_NAMES
     from flexroad.pipeline.run.record import Run
@@ -148,6 +149,8 @@ def rerun(
         if from_stage is not None and from_stage not in STAGE_NAMES:
             raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
         force = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
+        # The control points of a border are part of the fit.
+        force |= {BORDER} if "fit" in force else frozenset()
         with _locked(location):
             opened = Run.open(location)
             if opened.allowed:

@@ -16,17 +16,18 @@ node whose artefact is in the store is not computed.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Catalog, Layer, Tile
-from flexroad.catalog.storage.paths import FileStat, Location, read, stat
-from flexroad.pipeline.config.models import Config, Export
+from flexroad.catalog import Catalog, Tile
+from flexroad.catalog.borders import border_of
+from flexroad.catalog.storage.paths import FileStat, Location, stat
+from flexroad.pipeline.config.models import Chain, Config, Export
+from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, BorderTask, has_borders
+from flexroad.pipeline.graph.sources import Recorded, SourceFiles, Stat, hashed, to_json
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
     STAGES,
@@ -35,14 +36,8 @@ from flexroad.pipeline.graph.stages import (
     stage_function,
     stage_module,
 )
+from flexroad.tasks import load
 from flexroad.tasks.options import Options
-
-Stat = Callable[[Location], FileStat | None]
-"""Returns size and version of a file, None if it does not exist."""
-
-
-Recorded = Sequence[Any]
-"""`TileGraph.sources` of an earlier graph."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +51,10 @@ class Node:
     """Fingerprints of the nodes whose results it takes."""
     stored: bool
     """Whether its result is stored; false for `load`, for rasters and for meshes that are not exported."""
+    frame: tuple[str, ...] = ()
+    """Fingerprints of the corners and edges that it takes as well, in the order of `Frame`'s fields."""
+    border: BorderTask | None = None
+    """Its computation if it is a corner or edge; ``options`` are then those of the fit."""
 
     @property
     def function(self) -> Callable[..., Any]:
@@ -68,6 +67,9 @@ class TileGraph:
     """The graph of one tile: the union of its variants' chains."""
 
     tile: Tile
+    """The tile, with only those files that its own stages read."""
+    around: Tile
+    """The tile with all its files, for the ground along its border."""
     nodes: dict[str, Node]
     """Nodes by fingerprint; each node comes after its inputs."""
     variants: dict[str, dict[str, str]]
@@ -85,14 +87,6 @@ class TileGraph:
         return [self.nodes[self.variants[variant][stage]] for stage in STAGE_NAMES]
 
 
-_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
-
-
-def _hash(text: str) -> str:
-    """Return the first 32 hexadecimal digits of the SHA-256 of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
 @dataclass(frozen=True)
 class Step:
     """The part of a node that is the same for all tiles."""
@@ -108,6 +102,10 @@ class Step:
     files: tuple[Path, ...]
     """Files named by its options, such as a model."""
     stored: bool
+    borders: BorderStages | None = None
+    """The stages of the border that it takes, None if it takes none."""
+    framed: int | None = None
+    """Index of the step whose frame it takes, None if it takes none."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +129,19 @@ class Pattern:
             by_stage: dict[str, int] = {}
             for stage in STAGES:
                 inputs = tuple(by_stage[name] for name in stage.inputs)
-                step = _step(stage, chain[stage.name], inputs, variant in config.export.variants)
+                step = _step(stage, chain, inputs, variant in config.export.variants)
                 key = step.head, inputs
                 by_stage[stage.name] = numbers.setdefault(key, len(numbers))
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
-        exported = _json(config.export.model_dump(mode="json"))
+        exported = to_json(config.export.model_dump(mode="json"))
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported)
+
+    @cached_property
+    def halo_m(self) -> float:
+        """The largest halo of a step (m)."""
+        return max(float(getattr(step.options, "halo_m", 0.0)) for step in self.steps)
 
     def graph(
         self, tile: Tile, checksum: bool = False, stat_file: Stat = stat, recorded: Recorded = ()
@@ -154,29 +157,32 @@ class Pattern:
         recorded : sequence
             `TileGraph.sources` of an earlier graph, used for files that no longer exist.
         """
-        stats = {str(path): stat_file(path) for layer in tile.layers for path in tile.paths(layer)}
-        sources = [_layer(tile, layer, stats, checksum) for layer in tile.layers]
-        if recorded:
-            sources = _with_recorded(sources, recorded)
+        own = tile.within(tile.grid.buffered(self.halo_m).bounds)
+        sources = SourceFiles(tile, stat_file, checksum, recorded)
+        texts = [(layer.name, to_json(sources.entry(layer))) for layer in own.layers]
         names: list[str] = []
         nodes: dict[str, Node] = {}
-        texts = [(source[0], _json(source)) for source in sources]
         for step in self.steps:
             inputs = tuple(names[number] for number in step.inputs)
+            frame: tuple[str, ...] = ()
+            if step.borders:
+                shared = _border_nodes(tile, step, sources)
+                nodes |= {node.fingerprint: node for node in shared}
+                frame = tuple(node.fingerprint for node in shared)
+            elif step.framed is not None:
+                frame = nodes[names[step.framed]].frame
             # The input of the first stage is the tile, hashed by its grid.
-            hashed_inputs = _json(inputs) if inputs else _json(asdict(tile.grid))
+            hashed_inputs = to_json((*inputs, *frame)) if inputs else to_json(asdict(tile.grid))
             layers = ",".join(text for layer, text in texts if layer in step.reads)
-            stats |= {str(path): stat(path) for path in step.files}
-            files = _json([_checksum(path, stats[str(path)]) for path in step.files])
-            name = _hash(f"[{step.head},{hashed_inputs},[{layers}],{files}]")
+            name = hashed(f"[{step.head},{hashed_inputs},[{layers}],{sources.models(step.files)}]")
             names.append(name)
-            nodes[name] = Node(name, step.stage, step.options, inputs, step.stored)
+            nodes[name] = Node(name, step.stage, step.options, inputs, step.stored, frame)
         variants = {
             variant: {stage: names[number] for stage, number in numbers.items()}
             for variant, numbers in self.variants.items()
         }
         fingerprint = self._fingerprint(tile, variants)
-        return TileGraph(tile, nodes, variants, self.export, sources, stats, fingerprint)
+        return TileGraph(own, tile, nodes, variants, self.export, sources.entries, sources.stats, fingerprint)
 
     def _fingerprint(self, tile: Tile, variants: Mapping[str, Mapping[str, str]]) -> str:
         requested = [
@@ -185,15 +191,44 @@ class Pattern:
             [[variant, names["evaluate"], names["assess"]] for variant, names in variants.items()],
             [variants[variant]["sample"] for variant in self.export.variants],
         ]
-        return _hash(f"{_json(requested)[:-1]},{self.exported}]")
+        return hashed(f"{to_json(requested)[:-1]},{self.exported}]")
 
 
-def _step(stage: Stage, options: Options, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
+def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
+    options = chain[stage.name]
     module = stage_module(options)
-    head = [stage.name, module.VERSION, options.model_dump(mode="json")]
     stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
     reads = getattr(module, "READS", ())
-    return Step(stage.name, options, _json(head)[1:-1], inputs, reads, model_files(options), stored)
+    head = to_json(_head(stage.name, options))[1:-1]
+    shared = has_borders(chain["fit"])
+    borders = BorderStages.of(chain) if shared and stage.name == "fit" else None
+    # The mesh of a tile takes the frame of its surface, the first of its inputs.
+    framed = inputs[0] if shared and stage.name == "sample" else None
+    return Step(stage.name, options, head, inputs, reads, model_files(options), stored, borders, framed)
+
+
+def _head(stage: str, options: Options) -> list[Any]:
+    return [stage, stage_module(options).VERSION, options.model_dump(mode="json")]
+
+
+def _border_nodes(tile: Tile, step: Step, sources: SourceFiles) -> list[Node]:
+    """Return the nodes of a tile's corners and edges, in the order of `Frame`'s fields."""
+    assert step.borders
+    chain = step.borders.by_name
+    head = to_json([STAGE, load.VERSION, [_head(stage, options) for stage, options in chain.items()]])[1:-1]
+    models = sources.models([file for options in chain.values() for file in model_files(options)])
+    nodes: list[Node] = []
+    for number, border in enumerate(border_of(tile.grid, step.borders.reach_m)):
+        task = BorderTask(border, step.borders)
+        layers = task.ground(tile).layers
+        ends = tuple(nodes[end].fingerprint for end in ENDS[number - 4]) if number >= 4 else ()
+        # Files of unknown position may have none of their own: it is then that of the tile.
+        core = None if all(layer.extents for layer in layers) else asdict(tile.grid)
+        place = to_json([border.kind, border.start, border.tile, asdict(border.grid), core])
+        text = to_json([sources.entry(layer) for layer in layers])
+        name = hashed(f"[{head},{place},{to_json(ends)},{text},{models}]")
+        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=task))
+    return nodes
 
 
 def tile_graphs(catalog: Catalog, config: Config, checksum: bool = False) -> Iterator[TileGraph]:
@@ -210,6 +245,11 @@ def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:
 
 def files_read(graph: TileGraph, node: Node) -> list[Location]:
     """Return the files that a stage reads: those of its source layers and those named by its options."""
+    if node.border:
+        ground = node.border.ground(graph.around)
+        options = node.border.stages.by_name.values()
+        paths = [path for layer in ground.layers for path in ground.paths(layer)]
+        return [*paths, *(file for chosen in options for file in model_files(chosen))]
     reads = getattr(stage_module(node.options), "READS", ())
     paths = [path for layer in graph.tile.layers if layer.name in reads for path in graph.tile.paths(layer)]
     return [*paths, *model_files(node.options)]
@@ -224,44 +264,3 @@ def layers_read(config: Config) -> frozenset[str]:
 def any_file_missing(graph: TileGraph) -> bool:
     """Return whether a source or model file of the tile did not exist when its graph was made."""
     return None in graph.file_stats.values()
-
-
-def _layer(tile: Tile, layer: Layer, stats: Mapping[str, FileStat | None], checksum: bool) -> list[Any]:
-    """Return name, files, values and CRS of a layer; a file is (name, size, version) or (name, checksum)."""
-    files: list[list[str | int | None]] = []
-    for name, path in zip(layer.files, tile.paths(layer), strict=True):
-        file = stats[str(path)]
-        if checksum or file is None:
-            # `load` reports a missing file; the fingerprint changes when the file is restored.
-            files.append([name, _checksum(path, file)])
-        else:
-            files.append([name, file.size, file.version])
-    return [layer.name, files, list(layer.values), layer.crs]
-
-
-def _with_recorded(sources: list[Any], recorded: Recorded) -> list[Any]:
-    """Return the sources with the recorded entries for files that no longer exist."""
-    entries = {(name, file[0]): file for name, files, *_ in recorded for file in files}
-    return [
-        [name, [file if file[1] is not None else entries.get((name, file[0]), file) for file in files], *rest]
-        for name, files, *rest in sources
-    ]
-
-
-def _checksum(path: Location, file: FileStat | None) -> str | None:
-    """Return the SHA-256 of a file, None if it does not exist or cannot be read."""
-    if file is None:
-        return None
-    try:
-        return _sha256(path, file.size, file.version)
-    except OSError:
-        return None
-
-
-@lru_cache(maxsize=65536)
-def _sha256(path: Location, size: int, version: int | str) -> str:
-    """Return the SHA-256 of a file; cached by path, size and version."""
-    if not isinstance(path, Path):
-        return hashlib.sha256(read(path)).hexdigest()
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -17,6 +17,7 @@ from typing import Literal
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute, exists, listing, remove
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
@@ -145,7 +146,7 @@ def _needed(runs: Iterable[Run]) -> set[bytes]:
 
 
 def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
-    for stage in STAGE_NAMES:
+    for stage in (*STAGE_NAMES, BORDER):
         for folder, files in _folders(store / stage):
             yield from _temporary(folder, files)
             for name, size in files.items():

@@ -39,7 +39,8 @@ from flexroad.catalog.storage.paths import (
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.graph import Pattern, Recorded, Stat, TileGraph
+from flexroad.pipeline.graph.graph import Pattern, TileGraph
+from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary

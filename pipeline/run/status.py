@@ -16,7 +16,8 @@ from functools import cached_property
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import FileStat, Location, is_remote, listing, read
-from flexroad.pipeline.graph.graph import Stat, TileGraph, any_file_missing
+from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
+from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise

@@ -17,6 +17,7 @@ import numpy as np
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.config.methods import methods
+from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
@@ -68,7 +69,7 @@ def _plain(item: Any) -> Any:
 
 
 def _types() -> dict[str, type]:
-    shared = (Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
+    shared = (Corner, Edge, Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
     types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():
         types |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}

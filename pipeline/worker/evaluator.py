@@ -14,11 +14,13 @@ from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import stat
+from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.worker.profiling import StageCost
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.spline.frame import Frame
 
 
 class StageError(Exception):
@@ -76,27 +78,39 @@ class Evaluator:
         return self.results[fingerprint]
 
     def _compute(self, node: Node) -> None:
-        inputs = [self(fingerprint) for fingerprint in node.inputs] or [self.graph.tile]
+        inputs = [self(fingerprint) for fingerprint in node.inputs]
+        frame = [self(fingerprint) for fingerprint in node.frame]
         span = self.spans[node.stage]
         before = span.seconds
         try:
             with span.measure():
-                result = self._run_stage(node, inputs)
+                result = self._run_stage(node, inputs, frame)
         except Exception as error:
             failed = StageError(failure_of(self.graph.tile, node.stage, error))
             self.errors[node.fingerprint] = failed
             raise failed from error
         span.computed += 1
-        of_inputs = [self.chain_seconds[fingerprint] for fingerprint in node.inputs]
-        seconds = {stage: value for by_stage in of_inputs for stage, value in by_stage.items()}
+        seconds = self._seconds_before(node)
         seconds[node.stage] = span.seconds - before
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
         if node.stored and self.keep:
             self._store(node, result, seconds)
 
-    def _run_stage(self, node: Node, inputs: list[Any]) -> Any:
+    def _seconds_before(self, node: Node) -> dict[str, float]:
+        """Return the computing time of each stage before a node (s); that of a border is its own alone."""
+        if node.border:
+            return {}
+        seconds = {stage: value for name in node.inputs for stage, value in self.chain_seconds[name].items()}
+        if node.frame:
+            seconds[STAGE] = sum(self.chain_seconds[name][STAGE] for name in node.frame)
+        return seconds
+
+    def _run_stage(self, node: Node, inputs: list[Any], frame: list[Any]) -> Any:
         try:
-            return node.function(*inputs, node.options)
+            if node.border:
+                return node.border(self.graph.around, inputs)
+            framed = {"frame": Frame(*frame)} if frame else {}
+            return node.function(*(inputs or [self.graph.tile]), node.options, **framed)
         finally:
             # Also after an error: a file that is being replaced may be unreadable.
             for file in files_read(self.graph, node):

@@ -1,0 +1,116 @@
+"""Corners and edges of tiles: small tiles of their own, which all tiles around them share.
+
+A fit whose module has the functions `corner` and `edge` holds the control points that they return. Each part
+of a border is one node of the graph::
+
+    Border -> load_border -> segment -> ecsrc -> corner | edge -> the tile's fit
+
+Its fingerprint follows from its position, the options of these stages and the files that reach the ground
+around it, and not from a tile: neighbouring tiles have the same node, and the first one stores its result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog import Tile
+from flexroad.catalog.borders import Border
+from flexroad.catalog.tile import REACH_M
+from flexroad.pipeline.config.models import Chain
+from flexroad.pipeline.graph.stages import stage_function, stage_module
+from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.load import READS, load_border
+from flexroad.tasks.options import Options
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.spline.frame import Corner, Edge
+from flexroad.tasks.types import RoadMask, TileData
+
+STAGE = "border"
+"""Name of the nodes in the store, the log and the table of failures."""
+AROUND_M = 100.0
+"""Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
+its cluster, and a short piece of a viaduct would look like an object."""
+ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
+"""Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
+
+
+def has_borders(fit: Options) -> bool:
+    """Return whether a method of the fit shares the border of a tile with its neighbours."""
+    return hasattr(stage_module(fit), "edge")
+
+
+@dataclass(frozen=True)
+class BorderStages:
+    """The stages that a corner or edge goes through, with their options."""
+
+    segment: Options
+    ecsrc: Options
+    fit: Options
+
+    @classmethod
+    def of(cls, chain: Chain) -> BorderStages:
+        """Return those of a variant."""
+        return cls(chain["segment"], chain["ecsrc"], chain["fit"])
+
+    @property
+    def by_name(self) -> dict[str, Options]:
+        """The options by stage."""
+        return {"segment": self.segment, "ecsrc": self.ecsrc, "fit": self.fit}
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the layers that they read."""
+        return frozenset((*READS, *getattr(stage_module(self.segment), "READS", ())))
+
+    @property
+    def reach_m(self) -> float:
+        """Distance from a corner or edge up to which ground is read (m)."""
+        context_m: float = getattr(stage_module(self.segment), "CONTEXT_M", 0.0)
+        return AROUND_M + context_m
+
+    def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
+        """Return the control points of a corner, or of an edge between its two ends.
+
+        Parameters
+        ----------
+        data : TileData
+            The rasters around it, from `load_border`.
+        """
+        road = self._segmented(data)
+        clusters = stage_function("ecsrc", self.ecsrc)(data, road, self.ecsrc)
+        module: Any = stage_module(self.fit)
+        if border.kind == "corner":
+            corner: Corner = module.corner(data, clusters, border, self.fit)
+            return corner
+        edge: Edge = module.edge(data, road, clusters, border, ends, self.fit)
+        return edge
+
+    def _segmented(self, data: TileData) -> RoadMask:
+        try:
+            road: RoadMask = stage_function("segment", self.segment)(data, self.segment)
+        except LayerMissing:
+            nowhere = np.zeros(data.grid.shape, np.bool_)
+            road = RoadMask(data.grid, data.core, nowhere, beyond_extent(data))
+        return road
+
+
+@dataclass(frozen=True)
+class BorderTask:
+    """The computation of one corner or edge."""
+
+    border: Border
+    stages: BorderStages
+
+    def ground(self, tile: Tile) -> Tile:
+        """Return the ground around it, with the files of a tile that reach it and that the stages read."""
+        ground = tile.around(self.border.grid, self.border.within(REACH_M))
+        layers = tuple(layer for layer in ground.layers if layer.name in self.stages.reads)
+        return replace(ground, layers=layers)
+
+    def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:
+        """Return the control points of the corner, or of the edge between its two ends."""
+        return self.stages.part(self.border, load_border(self.ground(tile), tile.grid), ends)

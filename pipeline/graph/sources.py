@@ -1,0 +1,108 @@
+"""The source files of a tile as they enter its fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from flexroad.catalog import Layer, Tile
+from flexroad.catalog.storage.paths import FileStat, Location, read, stat
+
+Stat = Callable[[Location], FileStat | None]
+"""Returns size and version of a file, None if it does not exist."""
+
+Recorded = Sequence[Any]
+"""`SourceFiles.entries` of an earlier graph."""
+
+File = list[Any]
+"""Name, size and version of a file, or name and checksum; None if it does not exist."""
+Entry = list[Any]
+"""Name of a layer, its files (`File`), values and CRS."""
+
+to_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
+
+
+def hashed(text: str) -> str:
+    """Return the first 32 hexadecimal digits of the SHA-256 of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@dataclass
+class SourceFiles:
+    """The files of a tile that its stages read: each is looked up once, when it is first needed."""
+
+    tile: Tile
+    """The tile with all its files."""
+    stat_file: Stat
+    checksum: bool
+    """Whether bytes are hashed instead of size and time."""
+    recorded: Recorded = ()
+    """Entries of an earlier graph, used for files that no longer exist."""
+    stats: dict[str, FileStat | None] = field(default_factory=dict)
+    """Size and version of each file, by path; None if it was missing."""
+    files: dict[tuple[str, str], File] = field(default_factory=dict)
+    """Hashed description of each file, by layer and name."""
+    layers: dict[str, Layer] = field(default_factory=dict)
+    """The layers of these files, by name."""
+
+    def entry(self, layer: Layer) -> Entry:
+        """Return the hashed description of a layer and its files."""
+        self.layers.setdefault(layer.name, layer)
+        for name, path in zip(layer.files, self.tile.paths(layer), strict=True):
+            if (layer.name, name) not in self.files:
+                self.files[layer.name, name] = self._file(layer.name, name, path)
+        return _entry(layer, [self.files[layer.name, name] for name in layer.files])
+
+    def models(self, files: Iterable[Path]) -> str:
+        """Return the checksums of files that options name, such as a model, as JSON."""
+        files = list(files)
+        self.stats |= {str(path): stat(path) for path in files}
+        return to_json([_checksum(path, self.stats[str(path)]) for path in files])
+
+    @property
+    def entries(self) -> list[Entry]:
+        """The description of each layer with all its files that were looked up."""
+        by_layer: dict[str, list[File]] = {}
+        for (layer, _), file in self.files.items():
+            by_layer.setdefault(layer, []).append(file)
+        return [_entry(layer, by_layer.get(name, [])) for name, layer in self.layers.items()]
+
+    def _file(self, layer: str, name: str, path: Location) -> File:
+        found = self.stats[str(path)] = self.stat_file(path)
+        if found is not None and not self.checksum:
+            return [name, found.size, found.version]
+        # `load` reports a missing file; the fingerprint changes when the file is restored.
+        file = [name, _checksum(path, found)]
+        return file if file[1] is not None else self._recorded.get((layer, name), file)
+
+    @property
+    def _recorded(self) -> dict[tuple[str, str], File]:
+        return {(name, file[0]): file for name, files, *_ in self.recorded for file in files}
+
+
+def _entry(layer: Layer, files: list[File]) -> Entry:
+    return [layer.name, files, list(layer.values), layer.crs]
+
+
+def _checksum(path: Location, file: FileStat | None) -> str | None:
+    """Return the SHA-256 of a file, None if it does not exist or cannot be read."""
+    if file is None:
+        return None
+    try:
+        return _sha256(path, file.size, file.version)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=65536)
+def _sha256(path: Location, size: int, version: int | str) -> str:
+    """Return the SHA-256 of a file; cached by path, size and version."""
+    if not isinstance(path, Path):
+        return hashlib.sha256(read(path)).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
