@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from flexroad.catalog import Tile
-from flexroad.catalog.borders import Border
+from flexroad.catalog import Grid, Tile
+from flexroad.catalog.borders import Border, border_of
 from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.config.models import Chain
 from flexroad.pipeline.graph.stages import stage_function, stage_module
@@ -26,7 +26,7 @@ from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.load import READS, load_border
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.spline.frame import Corner, Edge
+from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.types import RoadMask, TileData
 
 STAGE = "border"
@@ -89,6 +89,14 @@ class BorderStages:
         edge: Edge = module.edge(data, road, clusters, border, ends, self.fit)
         return edge
 
+    def frame(self, data: TileData, tile: Grid) -> Frame:
+        """Return the frame of a tile from rasters that reach `reach_m` beyond it."""
+        parts: list[Any] = []
+        for number, border in enumerate(border_of(tile, self.reach_m)):
+            ends = [parts[end] for end in ENDS[number - 4]] if number >= 4 else []
+            parts.append(self.part(border, _cut(data, border.grid), ends))
+        return Frame(*parts)
+
     def _segmented(self, data: TileData) -> RoadMask:
         try:
             road: RoadMask = stage_function("segment", self.segment)(data, self.segment)
@@ -96,6 +104,20 @@ class BorderStages:
             nowhere = np.zeros(data.grid.shape, np.bool_)
             road = RoadMask(data.grid, data.core, nowhere, beyond_extent(data))
         return road
+
+
+def _cut(data: TileData, grid: Grid) -> TileData:
+    """Return the data of a corner or edge, a part of larger rasters."""
+    part = data.grid.window(grid)
+    return TileData(
+        tile_id=data.tile_id,
+        grid=grid,
+        core=grid,
+        dsm=data.dsm[part],
+        dtm=data.dtm[part],
+        road_mask=None if data.road_mask is None else data.road_mask[part],
+        border=True,
+    )
 
 
 @dataclass(frozen=True)

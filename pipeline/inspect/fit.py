@@ -10,10 +10,12 @@ from threadpoolctl import threadpool_limits
 
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import BorderStages, has_borders
 from flexroad.pipeline.graph.stages import stage_function
 from flexroad.pipeline.inspect.surface import Surface
 from flexroad.tasks.load_arrays import load_arrays
 from flexroad.tasks.segment import mask
+from flexroad.tasks.spline.frame import Frame
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -83,5 +85,11 @@ def fit(
     with threadpool_limits(1):
         road = mask.segment(data, mask.Options())
         clusters = stage_function("ecsrc", chain["ecsrc"])(data, road, chain["ecsrc"])
-        fitted = stage_function("fit", chain["fit"])(data, clusters, chain["fit"])
+        framed: dict[str, Frame] = {}
+        # As in a run, the control points on the border are fitted first.
+        if has_borders(chain["fit"]):
+            stages = BorderStages(mask.Options(), chain["ecsrc"], chain["fit"])
+            wide = chain["load"].model_copy(update={"halo_m": stages.reach_m})
+            framed["frame"] = stages.frame(load_arrays(dsm, dtm, road_mask, wide), data.core)
+        fitted = stage_function("fit", chain["fit"])(data, clusters, chain["fit"], **framed)
     return Surface(fitted, data.core.crs, data.core.bounds, road, clusters, chain["sample"], str(config))

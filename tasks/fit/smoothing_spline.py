@@ -33,6 +33,8 @@ REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough."""
 BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
+BORDER_TOLERANCE = 1e-6
+"""Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
 
 
 class Options(BaseOptions):
@@ -100,7 +102,7 @@ def corner(data: TileData, clusters: RoadClusters, border: Border, options: Opti
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = lattice.lines_within(_reach(data, clusters, border))
     held = np.full((2 * j + p, 2 * k + p), np.nan)
-    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, options)
+    z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, _precise(options))
     return Corner(rounded(z[j : j + p, k : k + p]))
 
 
@@ -124,15 +126,18 @@ def edge(
     from flexroad.tasks.spline.frame import Edge, rounded
 
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
-    (n, m), eastward = lattice.intervals, border.kind == "east"
+    eastward = border.kind == "east"
+    n, m = (lattice.intervals[0], 0) if eastward else (0, lattice.intervals[1])
     k, j = lattice.lines_within(_reach(data, clusters, border))
-    u, v = ((0, n), (-j, j)) if eastward else ((-k, k), (0, m))
-    held = np.full((v[1] - v[0] + p, u[1] - u[0] + p), np.nan)
-    # Views of the points that act on the edge, (p, length): of those held, the first and last p are set.
-    acting = held[j : j + p] if eastward else held[:, k : k + p].T
-    acting[:, :p], acting[:, -p:] = (end.control if eastward else end.control.T for end in ends)
-    z = rounded(_control_heights(data, clusters, lattice, border.cell, u, v, held, options))
-    control = z[j : j + p, p:-p] if eastward else z[p:-p, k : k + p]
+    held = np.full((m + 2 * j + p, n + 2 * k + p), np.nan)
+    acting = slice(j, j + m + p), slice(k, k + n + p)
+    held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
+    z = rounded(
+        _control_heights(
+            data, clusters, lattice, border.cell, (-k, n + k), (-j, m + j), held, _precise(options)
+        )[acting]
+    )
+    control = z[:, p:-p] if eastward else z[p:-p]
     first, second = border.sides
     outside = road.outside[first].ravel() | road.outside[second].ravel()
     order = slice(None) if eastward else slice(None, None, -1)
@@ -148,6 +153,12 @@ def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:
     from flexroad.tasks.spline.lattice import Lattice
 
     return Lattice.of(cells, cell, options.degree, options.spacing_m)
+
+
+def _precise(options: Options) -> Options:
+    """Return the options of the fit of a corner or edge."""
+    tolerance = min(options.stop_tolerance, BORDER_TOLERANCE)
+    return options.model_copy(update={"stop_tolerance": tolerance})
 
 
 def _ground(data: TileData, clusters: RoadClusters) -> Floats:
