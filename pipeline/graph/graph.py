@@ -10,7 +10,8 @@ A node's fingerprint is ``hash(stage, VERSION, options, fingerprints of its inpu
 the options. Module names are not part of it, so stores stay valid when files move. A stage that lists a
 source layer in its module's `READS` also hashes the layer's files as (path relative to the catalog, size,
 mtime), or by their bytes; files that only the options name, such as a model (the module's `files`), are
-hashed by their bytes. Variants with equal options up to a stage share its node, so it is computed once; a
+hashed by their bytes. Of the rasters that `load` reads, only the files that reach the tile or its halo count.
+Variants with equal options up to a stage share its node, so it is computed once; a
 node whose artefact is in the store is not computed.
 """
 
@@ -118,6 +119,8 @@ class Pattern:
     export: Export
     exported: str
     """The export options as the JSON that is hashed."""
+    halo_m: float
+    """The largest halo of the variants (m)."""
 
     @classmethod
     def of(cls, config: Config) -> Pattern:
@@ -264,3 +267,18 @@ def layers_read(config: Config) -> frozenset[str]:
 def any_file_missing(graph: TileGraph) -> bool:
     """Return whether a source or model file of the tile did not exist when its graph was made."""
     return None in graph.file_stats.values()
+
+
+def own_files_missing(graph: TileGraph) -> list[str]:
+    """Return the files that did not exist when the graph was made: source files on the tile, and models.
+
+    Source files that lie only around the tile are left out.
+    """
+    missing = [path for path, file in graph.file_stats.items() if file is None]
+    if not missing:
+        return []
+    tile = graph.around
+    listed = {str(path) for layer in tile.all_layers for path in tile.paths(layer)}
+    on_tile = (layer.reaching(tile.grid.bounds) for layer in tile.layers)
+    own = {str(path) for layer in on_tile if layer for path in tile.paths(layer)}
+    return [path for path in missing if path in own or path not in listed]

@@ -12,7 +12,7 @@ from functools import partial
 from flexroad.catalog import Tile
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
+from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import tile_statuses
@@ -101,7 +101,7 @@ def plan_run(
     """
     todo, states, new, changed, incomplete = array("L"), list[TileState](), 0, 0, 0
     for position, status in enumerate(tile_statuses(run, database)):
-        incomplete += any_file_missing(status.graph)
+        incomplete += bool(own_files_missing(status.graph))
         selected = only(status.graph.tile)
         if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
             status = replace(status, up_to_date=False)
@@ -127,7 +127,7 @@ def plan_run(
 
 def _all_incomplete(run: Run, graph: TileGraph) -> str:
     """Return the error message of a run in which each tile lacks a file."""
-    path = next(path for path, stat in graph.file_stats.items() if stat is None)
+    path = own_files_missing(graph)[0]
     return (
         f"each of the {len(run.catalog.tiles)} tiles lacks a file, for example tile {graph.tile.id}: {path}; "
         "is the disk with the survey mounted?"

@@ -275,4 +275,4 @@ def test_config_commands_print_options():
 def test_catalog_show_lists_layers_and_count(made_survey):
     said = flexroad("catalog", "show", made_survey / "catalog.parquet")
     assert said.splitlines()[-1] == "4 tiles, EPSG:25832"
-    assert "dsm(1) dtm(1) road_mask(1) reference(1) reference_road(1)" in said
+    assert "dsm(4) dtm(4) road_mask(4) reference(4) reference_road(4)" in said

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run.lock import run_lock
 from tests.command_line import same_signals
@@ -142,8 +142,8 @@ def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey
     tile = Catalog.read(survey).tiles[0]
     (tmp_path / "dtm").mkdir()
     shutil.move(tile.paths(tile.layer("dtm"))[0], tmp_path / "dtm" / "a.tif")
-    files = {"dtm": (str(tmp_path / "dtm" / "a.tif"),)}
-    layers = tuple(replace(layer, files=files.get(layer.name, layer.files)) for layer in tile.layers)
+    moved = Layer("dtm", (str(tmp_path / "dtm" / "a.tif"),))
+    layers = tuple(moved if layer.name == "dtm" else layer for layer in tile.layers)
     Catalog((replace(tile, layers=layers),)).write(survey)
     said = flexroad(*nightly, expect=2)
     option = f"--allow {tmp_path / 'dtm'}"

@@ -7,14 +7,17 @@ import shutil
 import sys
 from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog, Layer
+from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
-from flexroad.pipeline.graph.graph import Pattern, tile_graph
+from flexroad.pipeline.graph.graph import Pattern, any_file_missing, own_files_missing, tile_graph
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_module, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.segment import mask
+from tests.make_rasters import write
 
 PAPER = {
     "variants": {
@@ -176,3 +179,69 @@ def test_changed_model_file_changes_fingerprints_by_checksum(survey, tmp_path, m
     assert names(survey) == first
     model.write_bytes(b"two")
     assert changed(first, names(survey)) == list(STAGE_NAMES[1:])
+
+
+HALO = {**PAPER, "load": {"halo_m": 50}}
+
+
+def own_and_neighbours(tile, name="dsm"):
+    """Return the paths of a layer: the tile's own file, and those of its neighbours."""
+    own, *others = tile.paths(tile.layer(name))
+    assert own.stem == tile.id
+    assert others
+    return own, others
+
+
+def test_neighbours_files_count_only_with_a_halo(survey):
+    alone, halo = names(survey), names(survey, HALO)
+    _, (beside, *_) = own_and_neighbours(Catalog.read(survey).tiles[0])
+    os.utime(beside, (1, 1))
+    assert names(survey) == alone
+    assert changed(halo, names(survey, HALO)) == list(STAGE_NAMES)
+
+
+def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
+    tile = Catalog.read(survey).tiles[0]
+    graph = tile_graph(tile, compose(PAPER, "x"))
+    own = {str(tile.paths(layer)[0]) for layer in tile.layers}
+    assert set(graph.file_stats) == own
+    assert [[name, *(file for file, *_ in files)] for name, files, *_ in graph.sources] == [
+        [layer.name, layer.files[0]] for layer in tile.layers
+    ]
+    assert graph.tile == tile.within(tile.grid.bounds)
+    wide = tile_graph(tile, compose(HALO, "x"))
+    assert wide.tile == tile
+    assert len(wide.file_stats) > len(own)
+
+
+def test_largest_halo_of_the_variants_counts(survey):
+    tile = Catalog.read(survey).tiles[0]
+    raw = {"variants": {"flexroad": {}, "wide": {"load": {"halo_m": 50}}}}
+    assert tile_graph(tile, compose(raw, "x")).tile == tile
+
+
+def test_tile_of_a_raster_catalog_depends_on_files_that_reach_it(tmp_path):
+    for number, west in enumerate((295500, 295700, 296000)):
+        for name in ("dsm", "dtm"):
+            width = (200, 300, 250)[number]
+            write(tmp_path / name / f"{number}.tif", np.ones((250, width), np.float32), west)
+    tiles = rasters.index(tmp_path, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}).tiles
+    read = [[file for file, *_ in tile_graph(tile, compose(PAPER, "x")).sources[0][1]] for tile in tiles]
+    assert read == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif"], ["dsm/2.tif"]]
+    wide = [[file for file, *_ in tile_graph(tile, compose(HALO, "x")).sources[0][1]] for tile in tiles]
+    # The halo of the second tile ends where the first file does.
+    assert wide == [["dsm/0.tif", "dsm/1.tif"], ["dsm/1.tif", "dsm/2.tif"], ["dsm/1.tif", "dsm/2.tif"]]
+
+
+def test_missing_files_around_the_tile_are_not_its_own(survey):
+    tile = Catalog.read(survey).tiles[0]
+    own, (beside, *_) = own_and_neighbours(tile)
+    config = compose(HALO, "x")
+    beside.unlink()
+    graph = tile_graph(tile, config)
+    assert any_file_missing(graph)
+    assert own_files_missing(graph) == []
+    own.unlink()
+    assert own_files_missing(tile_graph(tile, config)) == [str(own)]
+    unknown = replace(tile, layers=tuple(replace(layer, extents=()) for layer in tile.layers))
+    assert set(own_files_missing(tile_graph(unknown, config))) == {str(own), str(beside)}

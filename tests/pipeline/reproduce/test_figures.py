@@ -259,7 +259,7 @@ def test_statistics_match_rasters_and_metrics_table(run, rows, made_survey):
     table = dataset.statistics(run, "flexroad", rows).set_index("tile_id")
     assert list(table.index) == [tile.id for tile in run.catalog.tiles]
     for tile in run.catalog.tiles:
-        (path,) = tile.paths(tile.layer("dsm"))
+        path, *_ = tile.paths(tile.layer("dsm"))
         with rasterio.open(path) as file:
             heights = file.read(1, masked=True)
         assert table.height_range_m[tile.id] == pytest.approx(float(heights.max() - heights.min()), abs=1e-4)

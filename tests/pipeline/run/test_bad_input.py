@@ -577,6 +577,18 @@ def test_catalog_with_moved_files_is_refused(run, flexroad, survey, tmp_path):
     assert "4 tiles: 4 done" in repaired.out
 
 
+def test_missing_file_that_all_tiles_list_fails_only_its_tile(run, survey, tmp_path):
+    """With a halo each of the four tiles lists the file, but it lies on one of them."""
+    first, *others = Catalog.read(survey).tiles
+    layer(first, "dsm").unlink()
+    halo = tmp_path / "halo.yaml"
+    halo.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
+    result = run(config=halo)
+    assert [line.split(":")[0] for line in result.errors] == [f"failed {first.id}"]
+    item = json.loads((tmp_path / "run" / "tiles" / others[0].id / "item.json").read_text())
+    assert any("a file that the tile does not need" in note for note in item["properties"]["flexroad:notes"])
+
+
 # --- changed and damaged runs -------------------------------------------------------------------------
 
 

@@ -26,9 +26,10 @@ from tests.make_backbone import save_backbone
 def place(tmp_path):
     """A folder with a catalog of two tiles (the first without photo), a backbone and a trained head."""
     write_scenes(tmp_path / "scenes", 2, seed=3, size_m=60, dop=True)
-    first, second = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
+    first, _ = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
     first.paths(first.layer("dop"))[0].unlink()
-    Catalog(tuple(prepared.index(tmp_path / "scenes"))).write(tmp_path / "scenes" / "catalog.parquet")
+    first, second = prepared.index(tmp_path / "scenes")
+    Catalog((first, second)).write(tmp_path / "scenes" / "catalog.parquet")
     folder = save_backbone(tmp_path / "backbone", registers=2)
     data = load.load(second, load.Options())
     sample = Sample(data, data.reference_road, np.isfinite(data.dsm))

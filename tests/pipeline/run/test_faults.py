@@ -25,7 +25,7 @@ import pytest
 import rasterio
 import yaml
 
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
@@ -392,7 +392,7 @@ def test_run_log_not_writable_completes(night, undisturbed, out):
 def test_run_output_not_writable_completes(stream, survey, config, night, out, undisturbed):
     """The disk of cron's log is full, and one tile fails, which is printed at once."""
     tile = Catalog.read(survey).tiles[0]
-    (file,) = tile.paths(tile.layer("dsm"))
+    file, *_ = tile.paths(tile.layer("dsm"))
     whole = file.with_suffix(".whole")
     shutil.copy2(file, whole)
     file.write_bytes(b"")
@@ -482,7 +482,7 @@ def test_run_clock_set_back_between_runs_detects_change(survey, night, undisturb
         os.utime(path, (time.time() + 10 * DAY_S,) * 2)
     assert "4 done (4 cached)" in night(catalog=survey).out
     tile = Catalog.read(survey).tiles[1]
-    (file,) = tile.paths(tile.layer("dsm"))
+    file, *_ = tile.paths(tile.layer("dsm"))
     whole = file.read_bytes()
     with rasterio.open(file, "r+") as raster:
         raster.write(raster.read(1) + np.float32(0.5), 1)
@@ -531,9 +531,7 @@ def test_run_catalog_with_files_outside_needs_allow(night, flexroad, made_survey
     assert "4 cached" in flexroad("rerun", out, "--executor", "serial").out
     # The run's own catalog was changed.
     tile = original.tiles[0]
-    layers = tuple(
-        replace(layer, files=("/etc/passwd",)) if layer.name == "dsm" else layer for layer in tile.layers
-    )
+    layers = tuple(Layer("dsm", ("/etc/passwd",)) if layer.name == "dsm" else layer for layer in tile.layers)
     Catalog((replace(tile, layers=layers), *original.tiles[1:])).write(out / "catalog.parquet", movable=False)
     said = flexroad("rerun", out, "--executor", "serial")
     assert said.code == 2
@@ -542,7 +540,7 @@ def test_run_catalog_with_files_outside_needs_allow(night, flexroad, made_survey
 
 def test_run_catalog_with_url_exits(night, made_survey, out, tmp_path):
     tile, url = Catalog.read(made_survey / "catalog.parquet").tiles[0], "https://example.org/dsm.tif"
-    layers = tuple(replace(layer, files=(url,)) if layer.name == "dsm" else layer for layer in tile.layers)
+    layers = tuple(Layer("dsm", (url,)) if layer.name == "dsm" else layer for layer in tile.layers)
     Catalog((replace(tile, layers=layers),)).write(tmp_path / "catalog.json", movable=False)
     said = night("--allow", made_survey, "--allow", "https://example.org", catalog=tmp_path / "catalog.json")
     assert said.code == 2

@@ -34,7 +34,8 @@ def catalog(made_survey) -> Catalog:
     """A catalog of three tiles; the third fails because its DTM is missing."""
     one, two, three, _ = Catalog.read(made_survey / "catalog.parquet").tiles
     broken = tuple(
-        replace(layer, files=("gone.tif",)) if layer.name == "dtm" else layer for layer in three.layers
+        replace(layer, files=("gone.tif",), extents=()) if layer.name == "dtm" else layer
+        for layer in three.layers
     )
     return Catalog((one, two, replace(three, layers=broken)))
 
