@@ -1,6 +1,6 @@
 """Cut the area that rasters cover into tiles on an absolute grid.
 
-The files of a survey rarely match the tiles, so each tile lists every file that reaches into it.
+The files of a survey rarely match the tiles, so each tile lists every file within `REACH_M` of it.
 """
 
 from __future__ import annotations

@@ -92,6 +92,7 @@ def load(tile: Tile, options: Options) -> TileData:
     from flexroad.catalog.headers.rasters import quiet
 
     grid = tile.grid.buffered(options.halo_m)
+    tile = tile.within(grid.bounds)
     core = grid.window(tile.grid)
     with quiet():
         mosaics = {

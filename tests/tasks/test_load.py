@@ -123,6 +123,21 @@ def test_load_halo_reads_neighbouring_files(tmp_path):
     assert np.isnan(data.dsm[:, :7]).all()
 
 
+def test_load_opens_only_files_that_reach_the_grid(tmp_path):
+    """The file beside the tile does not exist, which is noted only with a halo that reaches it."""
+    whole = relief()
+    whole[3, 3] = np.nan
+    for name in ("dsm.tif", "dtm.tif"):
+        write(tmp_path / name, whole, **NORTH)
+    beside = (GRID.east + 5, GRID.south, GRID.east + 25, GRID.north)
+    layers = tuple(
+        Layer(name, (f"{name}.tif", "gone.tif"), extents=(GRID.bounds, beside)) for name in ("dsm", "dtm")
+    )
+    tile_with_files = Tile("a", GRID, layers, str(tmp_path), datetime(2020, 5, 1, tzinfo=UTC))
+    assert load(tile_with_files, Options(halo_m=5)).notes == ()
+    assert len(load(tile_with_files, Options(halo_m=6)).notes) == 2
+
+
 def test_load_other_formats_give_same_heights(tmp_path, dtm):
     dsm = relief().round(2)
     write_xyz(tmp_path / "down.xyz", dsm, **NORTH)
