@@ -68,9 +68,9 @@ class TileGraph:
     """The graph of one tile: the union of its variants' chains."""
 
     tile: Tile
-    """The tile, with only those files that its own stages read."""
+    """The tile with only those files of its rasters that reach it or its halo (`Tile.within`)."""
     around: Tile
-    """The tile with all its files, for the ground along its border."""
+    """The tile of the catalog, with all its files: for the ground along its border."""
     nodes: dict[str, Node]
     """Nodes by fingerprint; each node comes after its inputs."""
     variants: dict[str, dict[str, str]]

@@ -102,7 +102,7 @@ def plan_run(
     todo, states, new, changed, incomplete = array("L"), list[TileState](), 0, 0, 0
     for position, status in enumerate(tile_statuses(run, database)):
         incomplete += bool(own_files_missing(status.graph))
-        selected = only(status.graph.tile)
+        selected = only(run.catalog.tiles[position])
         if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
             status = replace(status, up_to_date=False)
         new += status.last_record is None
@@ -146,22 +146,23 @@ def _results(
     run: Run, executor: Executor, database: RunDatabase, jobs: Iterator[TileJob]
 ) -> Generator[TileResult, None, None]:
     """Yield the results of the jobs; at the end record tiles that were finished but whose result was lost."""
-    in_progress: dict[str, Tile] = {}
+    in_progress: set[str] = set()
 
     def submitted() -> Iterator[TileJob]:
         for job in jobs:
-            in_progress[job.graph.tile.id] = job.graph.tile
+            in_progress.add(job.graph.tile.id)
             yield job
 
     results = executor.map(process_tile, submitted(), _lost, partial(check_writable, run.store))
     try:
         for result in results:
-            in_progress.pop(result.tile_id)
+            in_progress.remove(result.tile_id)
             yield result
     finally:
         # After an interruption: stop all workers first, then read the markers they have written.
         results.close()
-        for status in tile_statuses(run, database, in_progress.values()):
+        unknown = [tile for tile in run.catalog.tiles if tile.id in in_progress]
+        for status in tile_statuses(run, database, unknown):
             if status.last_record and status.from_marker:
                 database.record(status.last_record)
 
