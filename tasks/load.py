@@ -16,6 +16,7 @@ from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import Unit, height_unit
+from flexroad.catalog.storage.paths import stat
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats, Source, TileData
@@ -152,15 +153,24 @@ def load_border(ground: Tile, core: Grid) -> TileData:
         dsm=mosaics["dsm"].values if "dsm" in mosaics else unknown,
         dtm=mosaics["dtm"].values if "dtm" in mosaics else unknown,
         road_mask=_road(ground, "road_mask", mosaics),
-        dop=_source(ground, "dop"),
-        roads=_source(ground, "roads"),
+        dop=_optional(_source(ground, "dop")),
+        roads=_optional(_source(ground, "roads")),
         border=True,
     )
 
 
 def _source(tile: Tile, name: str) -> Source | None:
+    """Return a layer that another stage reads, without missing files that do not reach the tile."""
     layer = tile.layer(name)
-    return Source(name, tile.paths(layer), layer.crs) if layer else None
+    if layer is None:
+        return None
+    needed = (layer.reaching(tile.grid.bounds) or layer).files
+    paths = zip(layer.files, tile.paths(layer), strict=True)
+    return Source(name, tuple(path for file, path in paths if file in needed or stat(path)), layer.crs)
+
+
+def _optional(source: Source | None) -> Source | None:
+    return replace(source, optional=True) if source else None
 
 
 def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:

@@ -25,6 +25,8 @@ class Source:
     """Files that reach the tile; where files overlap, the first one with a value is used."""
     crs: str | None = None
     """CRS of files without one."""
+    optional: bool = False
+    """Whether rasters that are missing or broken are left out, as around a border, and not an error."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -139,12 +138,8 @@ class Pattern:
                     steps[key] = step
             variants[variant] = by_stage
         exported = to_json(config.export.model_dump(mode="json"))
-        return cls(tuple(steps[key] for key in numbers), variants, config.export, exported)
-
-    @cached_property
-    def halo_m(self) -> float:
-        """The largest halo of a step (m)."""
-        return max(float(getattr(step.options, "halo_m", 0.0)) for step in self.steps)
+        halo_m = max(chain["load"].halo_m for chain in config.chains.values())
+        return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 
     def graph(
         self, tile: Tile, checksum: bool = False, stat_file: Stat = stat, recorded: Recorded = ()

@@ -18,7 +18,7 @@ from rasterio.vrt import WarpedVRT
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.io.raster import RasterGrid, Unreadable, opened, place
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
@@ -50,7 +50,9 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
     ------
     TaskError
         If a file that the area needs is missing or broken; if a file is rotated, in another CRS, or its
-        colours are not supported; if no file reaches the grid.
+        colours are not supported.
+    LayerMissing
+        If no file reaches the grid.
     """
     photo: Orthophoto | None = None
     broken: list[Unreadable] = []
@@ -70,12 +72,12 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
             if photo.known.all():
                 break
     # A tile also lists files around it: a broken file fails only the tiles that need it.
-    if broken and not reached.all():
+    if broken and not (source.optional or reached.all()):
         raise TaskError(str(broken[0]), broken[0].file, source.name)
     if photo is None:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         names = ", ".join(path.name for path in source.paths[:3])
-        raise TaskError(
+        raise LayerMissing(
             f"no {source.name} file overlaps the tile ({bounds}): {names}; build the catalog again",
             str(source.paths[0]),
             source.name,
