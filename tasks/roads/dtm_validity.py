@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
+from numpy.typing import NDArray
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 AGREE_M = 0.3
@@ -47,12 +48,12 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
     """
     kept = kept & np.isfinite(data.dsm)
     checked = road.mask & ~kept & np.isfinite(data.dtm)
-    if not (checked.any() and kept.any()):
-        return np.zeros_like(checked)
-    away = scipy.ndimage.distance_transform_edt(~kept) * data.grid.cell
-    expected, scatter = extrapolated_plane(data.dsm, kept, data.grid.cell)
-    off = np.abs(data.dtm - expected)
-    return np.asarray(checked & (away <= REACH_M) & (off > AGREE_M + scatter + rise(away)))
+    invalid = np.zeros_like(checked)
+    if checked.any() and kept.any():
+        expected, scatter, away = extrapolated_plane(data.dsm, kept, checked, data.grid.cell)
+        off = np.abs(data.dtm[checked] - expected)
+        invalid[checked] = (away <= REACH_M) & (off > AGREE_M + scatter + rise(away))
+    return invalid
 
 
 def rise(away: Floats) -> Floats:
@@ -67,11 +68,13 @@ def without_invalid_dtm(data: TileData, clusters: RoadClusters) -> TileData:
     return replace(data, dtm=np.where(clusters.dtm_invalid, np.nan, data.dtm))
 
 
-def extrapolated_plane(heights: Floats, valid: Bools, cell: float) -> tuple[Floats, Floats]:
-    """Return height and scatter (m) of the plane through the given cells around each cell, ``(H, W)`` each.
+def extrapolated_plane(
+    heights: Floats, valid: Bools, wanted: Bools, cell: float
+) -> tuple[Floats, Floats, Floats]:
+    """Extrapolate the plane through the given cells around each wanted cell.
 
-    Moving least squares with Gaussian weights; NaN where there is no given cell within `REACH_M`, or all of
-    them lie on a line.
+    Moving least squares with Gaussian weights over the given cells up to `REACH_M` away in rows and columns.
+    Height and scatter are NaN where there are none, or all of them lie on a line.
 
     Parameters
     ----------
@@ -79,23 +82,30 @@ def extrapolated_plane(heights: Floats, valid: Bools, cell: float) -> tuple[Floa
         Heights (m).
     valid : (H, W) array of bool
         Cells whose heights are used; at least one.
+    wanted : (H, W) array of bool
+        Cells at which the plane is evaluated; n in number.
     cell : float
         Size of a cell (m).
+
+    Returns
+    -------
+    height, scatter, away : (n,) array
+        Height of the plane, scatter of the given cells around it, and distance to the nearest of them (m),
+        which is inf where there are none. In row-major order of the wanted cells.
     """
-    datum = float(heights[valid].mean())
-    z = np.where(valid, heights - datum, 0.0)
-    total = _moment(valid.astype(np.float64), cell, 0, 0)
-    orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    datum, n = float(heights[valid].mean()), int(REACH_M / cell)
+    bell = np.exp(-0.5 * (np.arange(-n, n + 1) * cell / NEAR_M) ** 2)
+    sums, nearest = _sums(heights, valid, np.argwhere(wanted), bell, cell, datum)
     with np.errstate(invalid="ignore", divide="ignore"):
-        r, c, rr, rc, cc = (_moment(valid.astype(np.float64), cell, *order) / total for order in orders)
-        m, mr, mc = (_moment(z, cell, *order) / total for order in ((0, 0), (1, 0), (0, 1)))
+        r, c, rr, rc, cc, m, mr, mc, mm = sums[:, 1:].T / sums[:, 0]
         # Central moments give two equations for the slopes, then the height at offset 0.
         rr, rc, cc = rr - r * r, rc - r * c, cc - c * c
         mr, mc = mr - m * r, mc - m * c
         determinant = np.where(_least_spread(rr, rc, cc) >= THIN_M2, rr * cc - rc * rc, np.nan)
         by_row, by_col = (mr * cc - mc * rc) / determinant, (mc * rr - mr * rc) / determinant
-        left = _moment(z**2, cell, 0, 0) / total - m * m - by_row * mr - by_col * mc
-        return datum + m - by_row * r - by_col * c, np.sqrt(np.maximum(left, 0.0))
+        left = mm - m * m - by_row * mr - by_col * mc
+        height, scatter = datum + m - by_row * r - by_col * c, np.sqrt(np.maximum(left, 0.0))
+    return height, scatter, np.sqrt(nearest) * cell
 
 
 def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
@@ -103,10 +113,40 @@ def _least_spread(rr: Floats, rc: Floats, cc: Floats) -> Floats:
     return np.asarray((rr + cc) / 2 - np.hypot((rr - cc) / 2, rc))
 
 
-def _moment(values: Floats, cell: float, row_power: int, col_power: int) -> Floats:
-    """Return the sum of value x Gaussian weight x powers of the offsets (m) over each cell's neighbours."""
-    n = int(REACH_M / cell)
-    offset = np.arange(-n, n + 1) * cell
-    bell = np.exp(-0.5 * (offset / NEAR_M) ** 2)
-    along = scipy.ndimage.correlate1d(values, bell * offset**row_power, axis=0, mode="constant")
-    return np.asarray(scipy.ndimage.correlate1d(along, bell * offset**col_power, axis=1, mode="constant"))
+@compiled()
+def _sums(
+    heights: Floats, valid: Bools, cells: NDArray[np.intp], bell: Floats, cell: float, datum: float
+) -> tuple[Floats, Floats]:
+    """Return weighted sums over the valid cells around each cell, and the squared distance to the nearest.
+
+    The sums are those of 1, r, c, rr, rc, cc, z, rz, cz and zz, ``(n, 10)``, with offsets r and c (m) and
+    heights z above the datum (m). The distances are in cells, ``(n,)``.
+    """
+    reach = len(bell) // 2
+    sums, nearest = np.zeros((len(cells), 10)), np.full(len(cells), np.inf)
+    for k in range(len(cells)):
+        row, col = cells[k]
+        for i in range(max(row - reach, 0), min(row + reach + 1, len(valid))):
+            n, c, cc, z, cz, zz, beside = _row_sums(heights, valid, i, col, bell, cell, datum)
+            w, r = bell[i - row + reach], (i - row) * cell
+            terms = (n, r * n, c, r * r * n, r * c, cc, z, r * z, cz, zz)
+            for j in range(10):
+                sums[k, j] += w * terms[j]
+            nearest[k] = min(nearest[k], (i - row) ** 2 + beside**2)
+    return sums, nearest
+
+
+@compiled()
+def _row_sums(
+    heights: Floats, valid: Bools, row: int, col: int, bell: Floats, cell: float, datum: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return the weighted sums of 1, c, cc, z, cz and zz in one row, and the columns to the nearest cell."""
+    reach = len(bell) // 2
+    n, c, cc, z, cz, zz, beside = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
+    for j in range(max(col - reach, 0), min(col + reach + 1, valid.shape[1])):
+        if valid[row, j]:
+            w, x, up = bell[j - col + reach], (j - col) * cell, heights[row, j] - datum
+            n, c, cc = n + w, c + w * x, cc + w * x * x
+            z, cz, zz = z + w * up, cz + w * x * up, zz + w * up * up
+            beside = min(beside, abs(j - col))
+    return n, c, cc, z, cz, zz, beside

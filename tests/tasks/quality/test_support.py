@@ -2,12 +2,18 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.support import Support, of_faces, support
-from flexroad.tasks.roads.dtm_validity import REACH_M, extrapolated_plane, invalid_dtm, without_invalid_dtm
+from flexroad.tasks.roads.dtm_validity import (
+    NEAR_M,
+    REACH_M,
+    extrapolated_plane,
+    invalid_dtm,
+    without_invalid_dtm,
+)
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
@@ -66,33 +72,59 @@ def test_of_faces_uses_cell_under_centroid():
     np.testing.assert_array_equal(of_faces(classes, street(), mesh), [Support.MEASURED, Support.DTM])
 
 
+def plane_field(heights, ground):
+    """Return height, scatter and distance of the extrapolated plane at all cells of 1 m."""
+    fields = extrapolated_plane(heights, ground, np.ones(GRID.shape, bool), 1.0)
+    return [field.reshape(GRID.shape) for field in fields]
+
+
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-500, 5000))
+@settings(deadline=None)
 def test_extrapolated_plane_reproduces_plane(by_row, by_col, level):
     plane = level + by_row * ROW + by_col * COL
     ground = STREET & ((COL < 22) | (COL > 30))
-    extrapolated, scatter = extrapolated_plane(np.where(ground, plane, 1e4), ground, 1.0)
+    extrapolated, scatter, _ = plane_field(np.where(ground, plane, 1e4), ground)
     determined = np.isfinite(extrapolated)
     np.testing.assert_allclose(extrapolated[determined], plane[determined], atol=1e-5)
     assert scatter[determined].max() < 1e-3
 
 
 def test_extrapolated_plane_cells_on_line_is_nan():
-    extrapolated, _ = extrapolated_plane(RAMP, ROW == 25, 1.0)
+    extrapolated, _, _ = plane_field(RAMP, ROW == 25)
     assert np.isnan(extrapolated).all()
-    extrapolated, _ = extrapolated_plane(RAMP, (ROW == 25) | (ROW == 26), 1.0)
+    extrapolated, _, _ = plane_field(RAMP, (ROW == 25) | (ROW == 26))
     np.testing.assert_allclose(extrapolated[30], RAMP[30], atol=1e-6)
 
 
-def test_extrapolated_plane_equals_weighted_fit():
+def test_extrapolated_plane_far_from_given_cells_is_nan():
+    extrapolated, scatter, away = plane_field(RAMP, (ROW > 45) & (COL < 5))
+    nowhere = (ROW < 46 - REACH_M) | (COL > 4 + REACH_M)
+    assert np.isnan(extrapolated[nowhere]).all()
+    assert np.isnan(scatter[nowhere]).all()
+    np.testing.assert_array_equal(np.isinf(away), nowhere)
+
+
+@pytest.mark.parametrize("cell", [0.7, 1.0, 2.0])
+def test_extrapolated_plane_equals_weighted_fit(cell):
     rng = np.random.default_rng(1)
-    heights, ground = rng.normal(0, 1, GRID.shape), rng.random(GRID.shape) < 0.3
-    extrapolated, _ = extrapolated_plane(heights, ground, 1.0)
-    r, c = 20, 31
-    near = ground & (np.abs(ROW - r) <= 15) & (np.abs(COL - c) <= 15)
-    x = np.column_stack([np.ones(near.sum()), ROW[near] - r, COL[near] - c])
-    root = np.exp(-0.25 * (x[:, 1] ** 2 + x[:, 2] ** 2) / 25)
-    oracle = np.linalg.lstsq(x * root[:, None], heights[near] * root, rcond=None)[0][0]
-    assert extrapolated[r, c] == pytest.approx(oracle, abs=1e-9)
+    heights, ground = rng.normal(300, 1, GRID.shape), rng.random(GRID.shape) < 0.3
+    wanted = rng.random(GRID.shape) < 0.05
+    fits = [weighted_fit(heights, ground, r, c, cell) for r, c in np.argwhere(wanted)]
+    np.testing.assert_allclose(
+        np.transpose(extrapolated_plane(heights, ground, wanted, cell)), fits, rtol=0, atol=1e-9
+    )
+
+
+def weighted_fit(heights, ground, r, c, cell):
+    """Return height, scatter and distance to the nearest cell of the plane at a cell, by least squares."""
+    south, east = (ROW - r) * cell, (COL - c) * cell
+    near = ground & (np.abs(south) <= REACH_M) & (np.abs(east) <= REACH_M)
+    design = np.column_stack([np.ones(near.sum()), south[near], east[near]])
+    weight = np.exp(-0.5 * (south[near] ** 2 + east[near] ** 2) / NEAR_M**2)
+    root = np.sqrt(weight)
+    plane = np.linalg.lstsq(design * root[:, None], heights[near] * root, rcond=None)[0]
+    scatter = np.sqrt(np.average((heights[near] - design @ plane) ** 2, weights=weight))
+    return plane[0], scatter, np.hypot(south, east)[near].min()
 
 
 @pytest.mark.parametrize(("offset", "valid"), [(0.0, True), (0.2, True), (1.5, False), (-1.5, False)])
