@@ -57,7 +57,8 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
     slopes, smooth = _planes(heights, points, reach, roughness_m**2)
     trend = _trend(slopes, smooth, max(1, math.floor(STREET_M / cell + 1e-9)))
-    centres = smooth & (((slopes - trend) ** 2).sum(axis=2) <= (bend * cell) ** 2)
+    down, across = np.moveaxis(slopes - trend, 2, 0)
+    centres = smooth & (down**2 + across**2 <= (bend * cell) ** 2)
     return Patches(centres, trend, reach)
 
 
