@@ -132,8 +132,29 @@ def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
     parts, count = scipy.ndimage.label(mask, np.ones((3, 3)))
     street = np.zeros(count + 1, np.bool_)
     street[parts[kept]] = True
-    verge: Bools = ~mask & (scipy.ndimage.distance_transform_edt(~street[parts]) <= width)
-    return verge
+    return ~mask & _within(street[parts], width)
+
+
+def _within(cells: Bools, width: float) -> Bools:
+    """Return the cells at most ``width`` cells away from one of the given cells, ``(H, W)``."""
+    rows, reach = len(cells), min(math.floor(width), len(cells) - 1)
+    aside, near = _columns_away(cells), np.zeros_like(cells)
+    for down in range(-reach, reach + 1):
+        first, last = max(down, 0), min(rows + down, rows)
+        near[first:last] |= aside[first - down : last - down] <= math.floor(math.sqrt(width**2 - down**2))
+    return near
+
+
+def _columns_away(cells: Bools) -> NDArray[np.int32]:
+    """Return the number of columns to the nearest of the given cells in the same row, ``(H, W)``.
+
+    In rows without a given cell it is larger than any distance in the grid.
+    """
+    rows, cols = cells.shape
+    col, nowhere = np.arange(cols, dtype=np.int32), np.int32(rows + cols)
+    before = np.maximum.accumulate(np.where(cells, col, -nowhere), axis=1)
+    after = np.minimum.accumulate(np.where(cells, col, cols + nowhere)[:, ::-1], axis=1)[:, ::-1]
+    return np.minimum(col - before, after - col)
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

@@ -4,6 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -177,6 +178,28 @@ def test_labels_split_at_gaps_in_order_of_first_cell():
         {2},
     )
     assert clusters(mask, dsm, dtm, Options(keep_largest=1)).labels.max() == 1
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 50), st.sampled_from([0.5, 1.0]))
+@settings(max_examples=20, deadline=None)
+def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
+    mask = scattered_blocks(seed)
+    level = np.zeros(mask.shape)
+    options = Options(verge_m=verge, theta_xy_m=0, min_area_m2=6 * cell**2)
+    result = clusters(mask, level, level, options, cell)
+    away = scipy.ndimage.distance_transform_edt(~result.mask) * cell
+    near = (away <= verge) & result.mask.any()
+    np.testing.assert_array_equal(result.dtm_invalid, ~mask & near)
+
+
+def scattered_blocks(seed, shape=(30, 44)):
+    """Return a mask of small rectangles at random."""
+    rng = np.random.default_rng(seed)
+    mask = np.zeros(shape, bool)
+    for _ in range(rng.integers(0, 14)):
+        r, c, height, width = rng.integers(0, (*shape, 5, 9))
+        mask[r : r + height + 1, c : c + width + 1] = True
+    return mask
 
 
 @pytest.mark.parametrize("mask", [np.zeros((9, 9), bool), np.eye(9, dtype=bool), np.ones((2, 2), bool)])
