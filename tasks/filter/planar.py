@@ -163,11 +163,9 @@ def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArra
     Neighbouring patches share most of their cells, so they always merge. Across gaps, clusters merge if any
     two of their edge cells agree in height along the street's slope.
     """
-    forest = init(patches.centres)
-    _join(forest, patches.centres, forward_offsets(1.5), dsm, patches.trend, math.inf)
-    _join(forest, _edges(patches.centres), forward_offsets(gap), dsm, patches.trend, theta)
-    roots: NDArray[np.int32] = _covered(compress(forest).reshape(dsm.shape), patches.reach)
-    return roots
+    roots = _merged(patches.centres, gap, dsm, patches.trend, theta)
+    covered: NDArray[np.int32] = _covered(roots, patches.reach)
+    return covered
 
 
 def _on_ground(data: TileData, clusters: NDArray[np.int32], options: Options) -> Bools:
@@ -196,11 +194,26 @@ def _medians(values: Floats, member: NDArray[np.intp], count: int) -> Floats:
 
 def _labels(kept: Bools, cell: float, options: Options) -> NDArray[np.int32]:
     """Label the clusters of the kept cells by gaps alone; heights were checked before."""
-    forest, level, slope = init(kept), np.zeros(kept.shape), np.zeros((*kept.shape, 2))
-    _join(forest, kept, forward_offsets(1.5), level, slope, math.inf)
-    _join(forest, _edges(kept), forward_offsets(options.theta_xy_m / cell), level, slope, math.inf)
-    roots = compress(forest).reshape(kept.shape)
+    level, slope = np.zeros(kept.shape), np.zeros((*kept.shape, 2))
+    roots = _merged(kept, options.theta_xy_m / cell, level, slope, math.inf)
     return clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
+
+
+def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: float) -> NDArray[np.int32]:
+    """Unite neighbours, then sets across gaps; return the root of each member's set, ``(H, W)``, else -1.
+
+    Sets merge across a gap if any two of their edge cells are at most ``gap`` cells apart and agree in height
+    to ``theta`` along the slope.
+    """
+    forest, near = init(members), forward_offsets(1.5)
+    _join(forest, members, members, near, heights, slope, math.inf)
+    # Of any two sets one is not the largest, so no search starts in the largest, which has most cells.
+    edges = _edges(members)
+    largest = np.bincount(compress(forest)[members.ravel()], minlength=1).argmax()
+    others = edges & (forest.reshape(members.shape) != largest)
+    far = forward_offsets(gap)
+    _join(forest, others, edges, np.concatenate([far, -far]), heights, slope, theta)
+    return compress(forest).reshape(members.shape)
 
 
 def _edges(members: Bools) -> Bools:
@@ -211,24 +224,28 @@ def _edges(members: Bools) -> Bools:
 
 @compiled()
 def _join(
-    roots: Roots, members: Bools, steps: NDArray[np.int64], heights: Floats, slope: Floats, theta: float
+    roots: Roots,
+    starts: Bools,
+    ends: Bools,
+    steps: NDArray[np.int64],
+    heights: Floats,
+    slope: Floats,
+    theta: float,
 ) -> None:
-    """Unite the sets of members one of the steps apart and within ``theta`` in height along the slope."""
-    rows, cols = members.shape
-    for i in range(roots.size):
+    """Unite sets where an end is a step from a start and within ``theta`` in height along the slope."""
+    rows, cols = starts.shape
+    for i in np.flatnonzero(starts):
         r, c = i // cols, i % cols
-        if not members[r, c]:
-            continue
-        a = find(roots, i)
+        a = find(roots, int(i))
         for down, across in steps:
             row, col = r + down, c + across
-            if row >= rows or col < 0 or col >= cols or not members[row, col]:
+            if row < 0 or row >= rows or col < 0 or col >= cols or not ends[row, col]:
                 continue
             j = row * cols + col
             if roots[j] == a:
                 continue
-            fall = slope[r, c] + slope[row, col]
-            up = (down * fall[0] + across * fall[1]) / 2
+            fall, drift = slope[r, c, 0] + slope[row, col, 0], slope[r, c, 1] + slope[row, col, 1]
+            up = (down * fall + across * drift) / 2
             if abs(heights[row, col] - heights[r, c] - up) > theta:
                 continue
             b = find(roots, j)

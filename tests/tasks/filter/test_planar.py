@@ -180,6 +180,18 @@ def test_labels_split_at_gaps_in_order_of_first_cell():
     assert clusters(mask, dsm, dtm, Options(keep_largest=1)).labels.max() == 1
 
 
+@given(st.integers(0, 10_000), st.floats(0, 9), st.sampled_from([0.5, 1.0]))
+@settings(max_examples=20, deadline=None)
+def test_labels_on_level_ground_equal_components_of_near_cells(seed, gap, cell):
+    mask = scattered_blocks(seed)
+    level = np.zeros(mask.shape)
+    labels = clusters(mask, level, level, Options(theta_xy_m=gap, min_area_m2=0), cell).labels
+    row, col = np.nonzero(mask)
+    away = np.hypot(row[:, None] - row, col[:, None] - col)
+    truth = scipy.sparse.csgraph.connected_components(away <= max(gap / cell, 1.5))[1]
+    np.testing.assert_array_equal(labels[mask], 1 + truth)
+
+
 @given(st.integers(0, 10_000), st.floats(0.5, 50), st.sampled_from([0.5, 1.0]))
 @settings(max_examples=20, deadline=None)
 def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
