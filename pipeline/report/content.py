@@ -8,7 +8,7 @@ import pandas as pd
 import yaml
 
 from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
-from flexroad.pipeline.report.steps import edge_steps
+from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.store.tables import read_metrics
@@ -57,10 +57,8 @@ class Content:
     """Error estimates and support per variant, mean over tiles; empty if the run has none."""
     worst_estimates: pd.DataFrame
     """Tiles with the highest error estimate of the exported variant; needs no ground truth."""
-    steps: pd.DataFrame
-    """Height steps between neighbouring tiles."""
-    steps_note: str
-    """Which tiles `steps` covers; empty if all."""
+    steps: EdgeSteps
+    """Steps between the surfaces of neighbouring tiles."""
     failures: pd.DataFrame
     """One row per failed tile: stage, error, message and file."""
     versions: dict[str, str]
@@ -80,7 +78,6 @@ def gather(run: Run) -> Content:
     rows = read_metrics(run.path)
     done = rows[rows.status == "done"]
     counts = summary(run)
-    steps, steps_note = edge_steps(run)
     variants = [name for name in run.config.chains if name in set(done.variant)]
     exported = run.config.export.variants[0]
     failures = pd.DataFrame(
@@ -98,8 +95,7 @@ def gather(run: Run) -> Content:
         worst=_worst(done, exported),
         quality=over_tiles(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
-        steps=steps,
-        steps_note=steps_note,
+        steps=edge_steps(run),
         failures=failures,
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),

@@ -72,7 +72,8 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Worst tiles by road L2", content.worst, ""),
         ("Worst tiles by error estimate, without ground truth", content.worst_estimates, quality.MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
-        ("Height steps between neighbouring tiles", content.steps.head(10), content.steps_note),
+        ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
+        ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),
         ("Failures", content.failures, ""),
     )
     return (section for section in named if len(section[1]))

@@ -1,25 +1,30 @@
-"""Height steps between neighbouring tiles along their shared edges.
+"""Steps and angles between the surfaces of neighbouring tiles along their shared edges.
 
-Tiles are fitted independently, so their surfaces do not meet exactly.
+The surfaces of a fit that shares its borders (`pipeline.graph.borders`) meet exactly, and this is checked.
+Other fits know nothing of the neighbours.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import pandas as pd
 
 from flexroad.catalog import Grid, Tile
+from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.graph.graph import Node, TileGraph
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
-COLUMNS = ["variant", "tile", "neighbour", "mean step (m)", "largest step (m)", "on road, mean (m)"]
+MEAN, LARGEST, ON_ROAD, ANGLE = "mean step (m)", "largest step (m)", "on road, mean (m)", "largest angle (°)"
+COLUMNS = ["variant", "tile", "neighbour", MEAN, LARGEST, ON_ROAD, ANGLE]
+CHECK = ["variant", "edges", MEAN, LARGEST, ANGLE, "result"]
 MOST = 2000
 """Largest number of tiles compared with their neighbours; of larger runs, every n-th tile is compared."""
 KEPT = 1024
@@ -29,8 +34,20 @@ Nodes = tuple[Node, Node]
 """Nodes of the surface and of the road mask."""
 
 
-def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
-    """Return the steps per exported variant and pair of neighbours, and a note on the tiles compared.
+@dataclass(frozen=True, eq=False)
+class EdgeSteps:
+    """Steps at the shared edges of the finished tiles of a run."""
+
+    check: pd.DataFrame
+    """One row per exported variant: columns `CHECK`; empty if no two neighbours are done."""
+    edges: pd.DataFrame
+    """One row per edge where the surfaces do not meet: columns `COLUMNS`, largest steps first."""
+    note: str
+    """Which tiles were compared; empty if all."""
+
+
+def edge_steps(run: Run, most: int = MOST) -> EdgeSteps:
+    """Return the steps per exported variant and pair of neighbours.
 
     Parameters
     ----------
@@ -38,13 +55,6 @@ def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
         The run; pairs whose surfaces are not in its store are left out.
     most : int
         Largest number of tiles compared with their neighbours.
-
-    Returns
-    -------
-    table : DataFrame
-        Columns `COLUMNS`, largest steps first.
-    note : str
-        Which tiles were compared; empty if all.
     """
     tiles = run.catalog.tiles
     every = math.ceil(len(tiles) / most)
@@ -57,8 +67,27 @@ def edge_steps(run: Run, most: int = MOST) -> tuple[pd.DataFrame, str]:
     }
     rows = [row for variant in run.config.export.variants for row in _rows(run, pairs, done, variant)]
     table = pd.DataFrame(rows, columns=COLUMNS)
+    check = [_checked(run, str(variant), part) for variant, part in table.groupby("variant", sort=False)]
+    apart = table[(table[LARGEST] != 0) | (table[ANGLE] != 0)]
     note = f"Of one tile in {every}, against its neighbours in the east and north." if every > 1 else ""
-    return table.sort_values("largest step (m)", ascending=False, ignore_index=True), note
+    return EdgeSteps(
+        pd.DataFrame(check, columns=CHECK),
+        apart.sort_values(LARGEST, ascending=False, ignore_index=True),
+        note,
+    )
+
+
+def _checked(run: Run, variant: str, edges: pd.DataFrame) -> tuple[str, int, float, float, float, str]:
+    """Return the row of a variant in the table `EdgeSteps.check`."""
+    largest, angle = float(edges[LARGEST].max()), float(edges[ANGLE].max())
+    result = "tiles are fitted independently"
+    if has_borders(run.config.chains[variant]["fit"]):
+        # NaN, if all edges lie outside the survey, is no difference.
+        apart = int(((edges[LARGEST] > 0) | (edges[ANGLE] > 0)).sum())
+        result = (
+            f"error: {apart} edges do not meet" if apart else "one surface: all differences are exactly 0"
+        )
+    return variant, len(edges), float(edges[MEAN].mean()), largest, angle, result
 
 
 def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
@@ -77,7 +106,7 @@ def _nodes(graph: TileGraph) -> dict[str, Nodes]:
 
 def _rows(
     run: Run, pairs: Sequence[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
-) -> Iterator[tuple[str, str, str, float, float, float]]:
+) -> Iterator[tuple[str, str, str, float, float, float, float]]:
     store = ArtefactStore(run.store)
 
     @lru_cache(KEPT)
@@ -98,18 +127,33 @@ def _corner(grid: Grid, east: float, north: float) -> tuple[str, float, float]:
     return grid.crs, round(east, 3), round(north, 3)
 
 
-def _step(grid: Grid, other: Grid, a: Surface, road: RoadMask, b: Surface) -> tuple[float, float, float]:
+def _step(
+    grid: Grid, other: Grid, a: Surface, road: RoadMask, b: Surface
+) -> tuple[float, float, float, float]:
+    """Return mean and largest step, mean step on roads (m), and largest angle of the normals (degrees)."""
     east, north = _shared_edge(grid, other)
-    inside = ~road.outside[road.grid.cells(east, north)]
+    cells = road.grid.cells(east, north)
+    inside = ~road.outside[cells]
     step = np.abs(a.height(east, north) - b.height(east, north))
-    step = np.where(inside, step, np.nan)
-    on_road = step[road.mask[road.grid.cells(east, north)] & np.isfinite(step)]
-    valid = step[np.isfinite(step)]
-    return (
-        float(valid.mean()) if valid.size else float("nan"),
-        float(valid.max()) if valid.size else float("nan"),
-        float(on_road.mean()) if on_road.size else float("nan"),
-    )
+    angle = _angle_deg(a.normal(east, north), b.normal(east, north))
+    on_road = inside & road.mask[cells]
+    return _mean(step[inside]), _largest(step[inside]), _mean(step[on_road]), _largest(angle[inside])
+
+
+def _angle_deg(a: Floats, b: Floats) -> Floats:
+    """Return the angles between unit normals, ``(n,)``."""
+    sine = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.asarray(np.degrees(np.arctan2(sine, (a * b).sum(axis=-1))))
+
+
+def _mean(values: Floats) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else math.nan
+
+
+def _largest(values: Floats) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.max()) if values.size else math.nan
 
 
 def _shared_edge(grid: Grid, other: Grid) -> tuple[Floats, Floats]:

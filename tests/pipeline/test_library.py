@@ -125,9 +125,12 @@ def test_import_after_numpy_leaves_environment_unchanged():
     assert done.stdout.strip() == "True"
 
 
-def test_fit_equals_run_over_same_rasters(city, rasters):
+def test_fit_equals_run_over_same_rasters(tmp_path, rasters):
+    """The run has one tile: with neighbours it would know more ground than the rasters."""
     fitted = flexroad.fit(**rasters)
-    run = flexroad.open_run(city / "runs" / "city")
+    catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
+    run_tiles(Run.create(tmp_path / "run", load_config("nightly"), catalog), SerialExecutor())
+    run = flexroad.open_run(tmp_path / "run")
     west, south, east, north = fitted.bounds
     x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
     np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
@@ -135,13 +138,12 @@ def test_fit_equals_run_over_same_rasters(city, rasters):
     np.testing.assert_array_equal(
         fitted.clusters.mask[50:-50, 50:-50], run.tile("499980_5599980").road_filtered
     )
-    stored = flexroad.open_surface(
-        city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad_surface.npz"
-    )
+    products = tmp_path / "run" / "tiles" / "499980_5599980"
+    stored = flexroad.open_surface(products / "499980_5599980_flexroad_surface.npz")
     np.testing.assert_allclose(stored.height(x, y), fitted.height(x, y), rtol=0, atol=1e-9)
     with pytest.raises(flexroad.ConfigError, match="no road mask"):
         stored.to_mesh()
-    mesh = trimesh.load(city / "runs/city/tiles/499980_5599980/499980_5599980_flexroad.glb")
+    mesh = trimesh.load(products / "499980_5599980_flexroad.glb")
     assert sum(len(part.faces) for part in mesh.geometry.values()) == len(fitted.to_mesh().faces)
 
 

@@ -146,7 +146,7 @@ def test_report_writes_every_format(finished, form):
     assert "flexroad" in text
     if form == "md":
         assert "| method | tiles | L2 road (m) |" in text
-        assert "Height steps between neighbouring tiles" in text
+        assert "Steps between neighbouring tiles" in text
     if form == "html":
         assert text.count("data:image/png;base64,") >= 12
         assert "http" not in text.split("<body>")[1].split("Configuration")[0]

@@ -136,6 +136,7 @@ class Fault:
     """The layer whose file is at fault."""
     message: str
     stage: str = "load"
+    kind: str = "TaskError"
 
 
 FAULTS = (
@@ -167,7 +168,7 @@ def test_load_broken_file_fails_only_its_tile(fault, run, flexroad, survey, tmp_
 def assert_only_tile_failed(result: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:
     assert result.code == 1
     (line,) = result.errors
-    assert line.startswith(f"failed {tile.id}: {fault.stage}: TaskError: ")
+    assert line.startswith(f"failed {tile.id}: {fault.stage}: {fault.kind}: ")
     assert re.search(fault.message, line)
     assert line.endswith(f"  [{file}]" if file else line[-1])
     assert "3 done (0 cached), 1 failed, 0 pending" in result.out
@@ -180,7 +181,7 @@ def assert_only_tile_failed(result: Said, tile: Tile, fault: Fault, flexroad, ou
     assert bad.triangles.isna().all()
     (row,) = pd.read_csv(out / "failures.csv", keep_default_na=False).to_dict("records")
     assert (row["tile_id"], row["stage"], row["kind"], row["file"]) == (
-        tile.id, fault.stage, "TaskError", file,
+        tile.id, fault.stage, fault.kind, file,
     )  # fmt: skip
     status = json.loads(flexroad("status", out, "--json").out)
     assert (status["done"], status["failed"]) == (3, 1)
@@ -225,7 +226,8 @@ def test_tile_without_layer_fails_alone(name, stage, message, run, flexroad, sur
     tiles = list(Catalog.read(survey).tiles)
     tiles[1] = replace(tiles[1], layers=tuple(layer for layer in tiles[1].layers if layer.name != name))
     Catalog(tuple(tiles)).write(survey)
-    fault = Fault(None, name, message, stage)
+    kind = "LayerMissing" if name == "road_mask" else "TaskError"
+    fault = Fault(None, name, message, stage, kind)
     assert_only_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
 
 

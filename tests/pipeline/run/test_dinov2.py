@@ -54,7 +54,7 @@ def test_run_with_dinov2_fails_only_tile_without_photo(place):
     first, second = results_of(place, backbone=str(place / "backbone")).values()
     assert (first.status, second.status) == ("failed", "done")
     (failure,) = {fault.line for fault in first.failures}
-    assert failure.startswith("segment: TaskError: no orthophoto (layer dop)")
+    assert failure.startswith("segment: LayerMissing: no orthophoto (layer dop)")
     rows = read_metrics(place / "run")
     assert (rows[rows.tile_id == second.tile_id].road_fraction > 0).all()
     # A repeated run computes nothing; a head with other weights computes the stage again.

@@ -446,13 +446,14 @@ def test_products_open_in_standard_readers(run, executor):
 
 
 def test_edge_steps_of_large_run_are_a_sample(finished):
-    whole, note = edge_steps(finished)
-    part, sample_note = edge_steps(finished, most=2)
+    whole, part = edge_steps(finished), edge_steps(finished, most=2)
     pairs = ["tile", "neighbour"]
-    assert (len(whole), note) == (4, "")
-    assert 0 < len(part) < len(whole)
-    assert part.set_index(pairs).equals(whole.set_index(pairs).loc[pd.MultiIndex.from_frame(part[pairs])])
-    assert sample_note == "Of one tile in 2, against its neighbours in the east and north."
+    assert (len(whole.edges), whole.note) == (4, "")
+    assert 0 < len(part.edges) < len(whole.edges)
+    chosen = pd.MultiIndex.from_frame(part.edges[pairs])
+    assert part.edges.set_index(pairs).equals(whole.edges.set_index(pairs).loc[chosen])
+    assert part.note == "Of one tile in 2, against its neighbours in the east and north."
+    assert list(whole.check.result) == ["tiles are fitted independently"]
 
 
 def test_open_folder_without_run_raises(tmp_path):

@@ -264,7 +264,8 @@ def test_segment_cells_without_photo_are_no_road(heads, sample):
     wide = grid.buffered(30)
     rows, cols = wide.window(grid)
     around = {name: np.pad(getattr(data, name), 30, mode="edge") for name in ("dsm", "dtm")}
-    road = segmented(replace(data, grid=wide, core=grid, **around), heads[0], threshold=0.01)
+    own = replace(data.dop, paths=data.dop.paths[:1])
+    road = segmented(replace(data, grid=wide, core=grid, dop=own, **around), heads[0], threshold=0.01)
     beyond = np.ones(wide.shape, bool)
     beyond[rows, cols] = False
     assert not road.mask[beyond].any()
