@@ -16,11 +16,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import shapely
 
-from flexroad.catalog import Grid, Tile
+from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.borders import Border, border_of
 from flexroad.catalog.tile import REACH_M
-from flexroad.pipeline.config.models import Chain
+from flexroad.pipeline.config.models import Chain, Config
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.stages import stage_function, stage_module
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.load import READS, load_border
@@ -136,3 +138,51 @@ class BorderTask:
     def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of the corner, or of the edge between its two ends."""
         return self.stages.part(self.border, load_border(self.ground(tile), tile.grid), ends)
+
+
+def check_tiles(config: Config, catalog: Catalog) -> None:
+    """Check that tiles which meet have one size, cell and lattice, if a fit joins them to one surface.
+
+    Raises
+    ------
+    ConfigError
+        If two of them differ; the message names both.
+    """
+    if not any(has_borders(chain["fit"]) for chain in config.chains.values()):
+        return
+    lattices = [_lattice(tile.grid) for tile in catalog.tiles]
+    if len(set(lattices)) <= 1:
+        return
+    boxes = shapely.box(*np.array([tile.grid.bounds for tile in catalog.tiles]).T)
+    first, second = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    for a, b in zip(first, second, strict=True):
+        one, other = catalog.tiles[a], catalog.tiles[b]
+        if lattices[a] != lattices[b] and one.grid.crs == other.grid.crs:
+            raise ConfigError(
+                f"tiles {one.id} ({_size(one.grid)}) and {other.id} ({_size(other.grid)}) meet, but are not "
+                "of one size on one lattice, so they cannot have one surface; catalog them again with one "
+                "tile size, or set fit.method to nurbs, which fits each tile alone"
+            )
+
+
+def _lattice(grid: Grid) -> tuple[object, ...]:
+    """Return what tiles with a common surface have in common: cell, size and position on the lattice."""
+    width, height = grid.width * grid.cell, grid.height * grid.cell
+    return (
+        grid.crs,
+        grid.cell,
+        grid.width,
+        grid.height,
+        _offset(grid.west, width),
+        _offset(grid.south, height),
+    )
+
+
+def _offset(position: float, size: float) -> float:
+    """Return the distance of an edge from the last multiple of a size (m), rounded to a micrometre."""
+    offset = round(position % size, 6)
+    return 0.0 if offset >= round(size, 6) else offset
+
+
+def _size(grid: Grid) -> str:
+    return f"{grid.width} x {grid.height} cells of {grid.cell:g} m from {grid.west:.10g} {grid.south:.10g}"

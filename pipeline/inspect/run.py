@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike
 from flexroad.catalog import Bounds
 from flexroad.catalog.storage.paths import exists, parse_location, read
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.inspect.assembled import assembled
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
 from flexroad.pipeline.inspect.points import Answer, Ground
+from flexroad.pipeline.inspect.surface import Surface
 from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
@@ -234,6 +236,40 @@ class RunView:
         )
         placed: xr.Dataset = raster.rio.write_crs(grid.crs).rio.write_transform(grid.transform)
         return placed
+
+    def surface(self, bounds: Bounds | None = None) -> Surface:
+        """Return the surface of several finished tiles as one, with one lattice of control points.
+
+        Parameters
+        ----------
+        bounds : tuple of float, optional
+            West, south, east, north (m); the surface has all tiles that reach into them. By default all.
+
+        Returns
+        -------
+        Surface
+            Equal to the surfaces of its tiles except for rounding (below 1e-9 m), see docs/mosaic.md. NaN in
+            tiles that are not finished, and on their edges. It has no road mask, and so no mesh.
+
+        Raises
+        ------
+        ConfigError
+            If there is no finished tile in the bounds, or the tiles have no common lattice: only the method
+            ``smoothing_spline`` fits one surface.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> run = flexroad.open_run("runs/city")
+        >>> surface = run.surface()
+        >>> surface
+        <flexroad.Surface: nurbs of 20 x 20 control points>
+        EPSG:25832, 60 x 60 m, bounds 499980 5599980 500040 5600040
+        road: unknown
+        >>> bool(abs(surface.height(500010.0, 5600030.0) - run.height(500010.0, 5600030.0)) < 1e-9)
+        True
+        """
+        return assembled(self.run, self.variant, bounds)
 
     def tile(self, tile_id: str) -> xr.Dataset:
         """Return the input rasters, masks and fitted surface of one tile.

@@ -39,6 +39,7 @@ from flexroad.catalog.storage.paths import (
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import Pattern, TileGraph
 from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
@@ -85,9 +86,11 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder or the store cannot be written, or a model is missing.
+            If the folder or the store cannot be written, a model is missing, or tiles that meet cannot have
+            one surface (`check_tiles`).
         """
         check_models(config)
+        check_tiles(config, catalog)
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
         origin = (old or read_summary(path)).get("origin") or _origin(catalog)

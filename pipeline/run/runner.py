@@ -12,6 +12,7 @@ from functools import partial
 from flexroad.catalog import Tile
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_models
@@ -61,11 +62,12 @@ def run_tiles(
     Raises
     ------
     ConfigError
-        If a model is missing, or each of several tiles lacks a file.
+        If a model is missing, tiles that meet cannot have one surface, or each of several tiles lacks a file.
     OSError
         If the database or the tables cannot be written, for example on a full disk.
     """
     check_models(run.config)
+    check_tiles(run.config, run.catalog)
     with RunDatabase.open(run.path / DATABASE) as database, EventLog(run.path) as log:
         log.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
         close = partial(_close, run, database, log, utc_now(), time.perf_counter())
