@@ -76,7 +76,7 @@ def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
         The corners in the south-west, south-east, north-west and north-east, then the edges in the south,
         north, west and east.
     """
-    west, south, east, north = (round(value, DECIMALS) for value in tile.bounds)
+    west, south, east, north = tile.exact_bounds
     corners = [(west, south), (east, south), (west, north), (east, north)]
     edges: list[tuple[Kind, tuple[float, float]]] = [
         ("east", (west, south)),

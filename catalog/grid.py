@@ -74,6 +74,12 @@ class Grid:
         return self.west, self.south, self.east, self.north
 
     @property
+    def exact_bounds(self) -> Bounds:
+        """The bounds rounded to a micrometre (m), so that an edge of two tiles is the same number in both."""
+        west, south, east, north = (float(round(edge, 6)) for edge in self.bounds)
+        return west, south, east, north
+
+    @property
     def hull(self) -> Bounds:
         """West, south, east and north of the outermost cell centres (m)."""
         half = self.cell / 2

@@ -84,6 +84,10 @@ def sample(
     origin = road.core.origin
     west, south, east, north = _domain(road, frame)
     local = west - origin[0], south - origin[1], east - origin[0], north - origin[1]
+    if frame:
+        # Subtraction leaves rounding errors if the size of the tile is no whole number of metres.
+        west, south, east, north = (round(edge, DECIMALS) for edge in local)
+        local = west, south, east, north
     if options.method == "dynamic":
         points = _dynamic(surface, road, mask, local, options, frame)
         faces = _delaunay(points)
@@ -101,7 +105,9 @@ def sample(
 
 def _domain(road: RoadMask, frame: Frame | None) -> Bounds:
     """Return west, south, east and north of the area to be meshed (m)."""
-    if frame or road.core != road.grid:
+    if frame:
+        return road.core.exact_bounds
+    if road.core != road.grid:
         return road.core.bounds
     if min(road.core.shape) < 2:
         raise TaskError(

@@ -84,7 +84,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
     held = frame.control(shape) if frame else np.full(shape, np.nan)
     z = _control_heights(data, clusters, lattice, start, (0, n), (0, m), held, options)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    return surface_on(space, data.core, data.core.bounds, z, np.ones_like(z), datum=0.0)
+    return surface_on(space, data.core, data.core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
 
 def corner(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> Corner:

@@ -1,0 +1,207 @@
+"""Corners and edges as nodes of the graph: shared by neighbours, changed only by files that reach them."""
+
+import os
+import shutil
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+
+from flexroad.catalog import Catalog, Grid, Layer, Tile
+from flexroad.catalog.sources import prepared, rasters
+from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import STAGE, check_tiles
+from flexroad.pipeline.graph.graph import files_read, tile_graphs
+
+NIGHTLY = load_config("nightly")
+SIZE_M = 250
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory):
+    """A prepared survey of 3 x 3 flat tiles of 250 m."""
+    folder = tmp_path_factory.mktemp("flat")
+    for column in range(3):
+        for row in range(3):
+            north = 5600000 + (row + 1) * SIZE_M
+            grid = Grid("EPSG:25832", 500000 + column * SIZE_M, north, 5.0, 50, 50)
+            layers = {"dsm": np.full(grid.shape, 200.0), "dtm": np.full(grid.shape, 200.0)}
+            layers["road_mask"] = np.ones(grid.shape, bool)
+            tile_id = f"{grid.west:.0f}_{grid.south:.0f}"
+            prepared.write_tile(folder, tile_id, grid, layers, date=MADE, dataset="flat")
+    return folder
+
+
+@pytest.fixture
+def survey(flat, tmp_path):
+    return shutil.copytree(flat, tmp_path / "survey")
+
+
+def by_rasters(folder):
+    patterns = {name: f"{name}/*.tif" for name in ("dsm", "dtm", "road_mask")}
+    return Catalog(rasters.index(folder, patterns, tile_size_m=SIZE_M).tiles)
+
+
+def by_prepared(folder):
+    return Catalog(tuple(prepared.index(folder)))
+
+
+CATALOGS = pytest.mark.parametrize("catalog_of", [by_rasters, by_prepared])
+
+
+def borders(graph):
+    return [node for node in graph.nodes.values() if node.stage == STAGE]
+
+
+def names(catalog, config=NIGHTLY):
+    """Return the fingerprints of tiles by id, and of corners and edges by kind and start."""
+    tiles, parts = {}, defaultdict(set)
+    for graph in tile_graphs(catalog, config):
+        tiles[graph.tile.id] = graph.fingerprint
+        for node in borders(graph):
+            parts[node.border.border.kind, node.border.border.start].add(node.fingerprint)
+    return tiles, parts
+
+
+@CATALOGS
+def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
+    _, parts = names(catalog_of(survey))
+    assert len(parts) == 16 + 12 + 12
+    assert all(len(fingerprints) == 1 for fingerprints in parts.values())
+    graph = next(tile_graphs(catalog_of(survey), NIGHTLY))
+    fit = graph.nodes[graph.variants["flexroad"]["fit"]]
+    assert [graph.nodes[name].border.border.kind for name in fit.frame] == [
+        *["corner"] * 4, "east", "east", "north", "north",
+    ]  # fmt: skip
+    assert graph.nodes[graph.variants["flexroad"]["sample"]].frame == fit.frame
+
+
+def touch(path):
+    os.utime(path, (1_700_000_000, 1_700_000_000))
+
+
+@CATALOGS
+def test_changed_file_changes_only_what_it_reaches(catalog_of, survey):
+    """The DSM of the middle tile reaches all tiles' halos, and the borders within 100 m of it."""
+    tiles, parts = names(catalog_of(survey))
+    touch(survey / "dsm" / "500250_5600250.tif")
+    new_tiles, new_parts = names(catalog_of(survey))
+    assert all(new_tiles[tile] != tiles[tile] for tile in tiles)
+    changed = {part for part in parts if parts[part] != new_parts[part]}
+    inner = {500250.0, 500500.0}, {5600250.0, 5600500.0}
+    corners = {("corner", (east, north)) for east in inner[0] for north in inner[1]}
+    # Of the middle tile's 4 edges the whole ground, and of 8 edges the ends reach it.
+    eastward = {("east", (east, north)) for east in (500000.0, 500250.0, 500500.0) for north in inner[1]}
+    northward = {("north", (east, north)) for east in inner[0] for north in (5600000.0, 5600250.0, 5600500.0)}
+    assert changed == corners | eastward | northward
+
+
+def test_changed_file_at_rim_leaves_far_tiles(survey):
+    tiles, parts = names(by_prepared(survey))
+    touch(survey / "dtm" / "500000_5600000.tif")
+    new_tiles, new_parts = names(by_prepared(survey))
+    changed = {tile for tile in tiles if tiles[tile] != new_tiles[tile]}
+    assert changed == {"500000_5600000", "500250_5600000", "500000_5600250", "500250_5600250"}
+    starts = {part[1] for part in parts if parts[part] != new_parts[part]}
+    assert max(east for east, _ in starts) <= 500250
+    assert max(north for _, north in starts) <= 5600250
+
+
+@CATALOGS
+def test_borders_do_not_depend_on_tiles_in_catalog(catalog_of, survey):
+    """A tile that is left out of the run, but whose files exist, changes nothing."""
+    whole = catalog_of(survey)
+    tiles, parts = names(whole)
+    fewer = Catalog(tuple(tile for tile in whole.tiles if tile.id != "500250_5600250"))
+    some_tiles, some_parts = names(fewer)
+    assert some_tiles.items() <= tiles.items()
+    assert all(parts[part] == some_parts[part] for part in some_parts)
+
+
+def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
+    catalog = by_prepared(survey)
+    _, parts = names(catalog)
+    for stage, option, changes in (
+        ("fit", {"huber_m": 0.2}, True),
+        ("ecsrc", {"verge_m": 3}, True),
+        ("load", {"halo_m": 20}, False),
+        ("sample", {"road_m": 2}, False),
+    ):
+        raw = {**NIGHTLY.raw, stage: {**NIGHTLY.raw[stage], **option}}
+        _, other = names(catalog, compose(raw, "other"))
+        assert (other != parts) == changes, stage
+
+
+def test_paper_has_no_borders(survey):
+    for graph in tile_graphs(by_prepared(survey), load_config("paper")):
+        assert not borders(graph)
+        assert not any(node.frame for node in graph.nodes.values())
+
+
+def test_border_reads_only_files_around_it(survey):
+    graph = next(tile_graphs(by_prepared(survey), NIGHTLY))
+    corner = borders(graph)[3]
+    assert corner.border.border.start == (500250, 5600250)
+    read = {path.relative_to(survey).as_posix() for path in files_read(graph, corner)}
+    near = ("500000_5600000", "500000_5600250", "500250_5600000", "500250_5600250")
+    assert read == {f"{layer}/{tile}.tif" for layer in ("dsm", "dtm", "road_mask") for tile in near}
+
+
+def placed(*grids):
+    layers = (Layer("dsm", ("dsm.tif",)), Layer("dtm", ("dtm.tif",)))
+    return Catalog(tuple(Tile(f"t{k}", grid, layers, "/data", MADE) for k, grid in enumerate(grids)))
+
+
+def square(west, south, size=250, cell=1.0, crs="EPSG:25832"):
+    return Grid(crs, west, south + size * cell, cell, size, size)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        square(250, 0, 125),
+        square(250, 0, 500, 0.5),
+        square(250, 100),
+        square(240, 0),
+        square(250, -125, 125, 2.0),
+    ],
+    ids=["smaller", "finer", "shifted along", "overlapping", "coarser"],
+)
+def test_tiles_that_meet_on_different_lattices_are_refused(other):
+    with pytest.raises(ConfigError, match=r"tiles t0 \(250 x 250 cells of 1 m from 0 0\) and t1 \(.*\) meet"):
+        check_tiles(NIGHTLY, placed(square(0, 0), other))
+    check_tiles(load_config("paper"), placed(square(0, 0), other))
+
+
+def test_tiles_on_one_lattice_or_apart_are_accepted():
+    check_tiles(NIGHTLY, placed(square(0, 0), square(250, 0), square(-500, 750)))
+    check_tiles(NIGHTLY, placed(square(0.5, 0.25), square(250.5, 250.25)))
+    check_tiles(NIGHTLY, placed(square(0, 0), square(1000, 0, 60)))
+    check_tiles(NIGHTLY, placed(square(0, 0), square(100, 0, crs="EPSG:25833")))
+
+
+def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):
+    write_scenes(tmp_path / "survey", 1, seed=0, size_m=60)
+    catalog = Catalog.read(tmp_path / "survey" / "catalog.parquet")
+    tile = catalog.tiles[0]
+    smaller = replace(
+        tile, id="smaller", grid=Grid("EPSG:25832", tile.grid.east, tile.grid.north, 1.0, 30, 30)
+    )
+    Catalog((tile, smaller)).write(tmp_path / "mixed.json")
+    arguments = ("--catalog", tmp_path / "mixed.json", "--allow", tmp_path, "--out", tmp_path / "run")
+    (line,) = flexroad("run", "--config", "nightly", *arguments).expected(2).errors
+    assert "set fit.method to nurbs, which fits each tile alone" in line
+
+
+def test_neighbours_share_nodes_where_files_overlap(survey):
+    with rasterio.open(survey / "dsm" / "500000_5600000.tif") as file:
+        profile = file.profile
+    west = {**profile, "width": 60, "transform": profile["transform"]}
+    with rasterio.open(survey / "dsm" / "a.tif", "w", **west) as file:
+        file.write(np.full((1, 50, 60), 201.0, np.float32))
+    _, parts = names(by_rasters(survey))
+    assert all(len(fingerprints) == 1 for fingerprints in parts.values())

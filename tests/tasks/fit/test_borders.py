@@ -1,0 +1,211 @@
+"""Surfaces of tiles from shared corners and edges, against one fit of all tiles together."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexroad.catalog.borders import border_of
+from flexroad.catalog.grid import Grid
+from flexroad.pipeline.graph.borders import ENDS
+from flexroad.tasks.filter import planar
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.roads.extent import beyond_extent
+from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
+from flexroad.tasks.synthetic import make_scene
+from flexroad.tasks.types import RoadMask, TileData
+
+AROUND_M = 100
+FILTER = planar.Options(verge_m=5)
+OPTIONS = smoothing_spline.Options()
+ALL = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
+"""Two by two tiles of 250 m."""
+
+
+@cache
+def made_world(stratum):
+    scene = make_scene(ALL.buffered(AROUND_M), 3, stratum)
+    return TileData(
+        "world", scene.grid, ALL, scene.dsm, scene.dtm, scene.road_mask, scene.reference, scene.reference_road
+    )
+
+
+def part(world, grid, core):
+    window = world.grid.window(grid)
+    dsm, dtm, road = (values[window] for values in (world.dsm, world.dtm, world.road_mask))
+    return TileData("part", grid, core, dsm, dtm, road, border=True)
+
+
+def filtered(data):
+    road = RoadMask(data.grid, data.core, data.road_mask, beyond_extent(data))
+    return road, planar.ecsrc(data, road, FILTER)
+
+
+def border_part(world, border, ends, options=OPTIONS):
+    data = part(world, border.grid, border.grid)
+    road, clusters = filtered(data)
+    if border.kind == "corner":
+        return smoothing_spline.corner(data, clusters, border, options)
+    return smoothing_spline.edge(data, road, clusters, border, ends, options)
+
+
+def frame_of(world, tile):
+    parts = []
+    for number, border in enumerate(border_of(tile, AROUND_M)):
+        ends = [parts[end] for end in ENDS[number - 4]] if number >= 4 else []
+        parts.append(border_part(world, border, ends))
+    return Frame(*parts)
+
+
+def fit_tiles(world, halo_m=50):
+    """Return the surfaces of the four tiles by (column, row), each fitted with the ground around it alone."""
+    surfaces = {}
+    for _, tile in ALL.tiles(250):
+        data = part(world, tile.buffered(halo_m), tile)
+        key = round(tile.west - ALL.west) // 250, round(tile.south - ALL.south) // 250
+        surfaces[key] = smoothing_spline.fit(data, filtered(data)[1], OPTIONS, frame_of(world, tile))
+    return surfaces
+
+
+def joined(surfaces):
+    m, n = (points - 3 for points in surfaces[0, 0].A.shape)
+    control = np.empty((2 * m + 3, 2 * n + 3))
+    for (column, row), surface in surfaces.items():
+        control[row * m : row * m + m + 3, column * n : column * n + n + 3] = surface.A
+    return control
+
+
+def fit_together(world):
+    """Return the control heights of one precise fit of the whole world, on the same lattice."""
+    data = replace(world, border=True)
+    options = OPTIONS.model_copy(update={"stop_tolerance": 1e-8})
+    lattice = smoothing_spline._lattice((250, 250), 1.0, options)
+    (n, m), (k, j) = lattice.intervals, lattice.lines_within(AROUND_M)
+    u, v = (-k, 2 * n + k), (-j, 2 * m + j)
+    free = np.full((2 * m + 2 * j + 3, 2 * n + 2 * k + 3), np.nan)
+    start = AROUND_M + 500, AROUND_M
+    control = smoothing_spline._control_heights(data, filtered(data)[1], lattice, start, u, v, free, options)
+    return control[j : j + 2 * m + 3, k : k + 2 * n + 3]
+
+
+def at_cells(control):
+    """Return the heights of the joined tiles at all cells, row 0 in the north."""
+    n = control.shape[1] - 3
+    along = basis_matrix(uniform_knots(0, n, 3), 3, (np.arange(500) + 0.5) * n / 500)[0]
+    return (along @ control @ along.T)[::-1]
+
+
+def with_void(world, radius):
+    """Return the world without heights around the corner in its middle, and the cells of the void."""
+    east, north = np.meshgrid(world.grid.eastings - 500250, world.grid.northings - 5600250)
+    void = np.hypot(east, north) < radius
+    dsm, dtm = (np.where(void, np.nan, heights) for heights in (world.dsm, world.dtm))
+    return replace(world, dsm=dsm, dtm=dtm), void[world.grid.window(ALL)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stratum", ["urban", "rural"])
+def test_tiles_equal_one_fit_of_all(stratum):
+    world = made_world(stratum)
+    off = np.abs(at_cells(joined(fit_tiles(world))) - at_cells(fit_together(world)))
+    on_road = off[world.reference_road[world.grid.window(ALL)]]
+    assert on_road.mean() < 0.5e-3
+    assert np.percentile(on_road, 99) < 5e-3
+    assert off.mean() < 0.5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stratum", ["urban", "rural"])
+def test_void_on_corner_is_bridged_as_by_one_fit_of_all(stratum):
+    world, void = with_void(made_world(stratum), radius=70)
+    off = np.abs(at_cells(joined(fit_tiles(world))) - at_cells(fit_together(world)))
+    assert off[void].max() < 0.010
+    assert off[~void].mean() < 0.5e-3
+
+
+def test_neighbours_meet_exactly():
+    surfaces = fit_tiles(made_world("rural"))
+    along = np.random.default_rng(0).uniform(0, 250, 500)
+    for one, other, x, y in (
+        ((0, 0), (1, 0), np.full(500, 500250.0), 5600000 + along),
+        ((0, 1), (1, 1), np.full(500, 500250.0), 5600250 + along),
+        ((0, 0), (0, 1), 500000 + along, np.full(500, 5600250.0)),
+        ((0, 0), (1, 1), np.array([500250.0]), np.array([5600250.0])),
+    ):
+        a, b = surfaces[one], surfaces[other]
+        np.testing.assert_array_equal(a.height(x, y), b.height(x, y))
+        np.testing.assert_array_equal(a.normal(x, y), b.normal(x, y))
+
+
+def test_change_beyond_reach_leaves_border_unchanged():
+    """1 m of change 30 m beyond the eastern edge: the tile's own border is fitted up to 25 m."""
+    world = made_world("rural")
+    tile = Grid("EPSG:25832", 500000, 5600250, 1.0, 250, 250)
+    changed = replace(world, dtm=world.dtm.copy())
+    changed.dtm[:, world.grid.cells(np.array([500280.5]), np.array([5600000.5]))[1][0] :] += 1.0
+    assert (
+        frame_of(changed, tile).control((73, 73)).tobytes()
+        == frame_of(world, tile).control((73, 73)).tobytes()
+    )
+
+
+def viaduct(height_m=8.0):
+    """A deck over a valley, 300 m long and across the border between two tiles; the DTM has the valley."""
+    grid = ALL.buffered(AROUND_M)
+    east, north = np.meshgrid(grid.eastings - 500250, grid.northings - 5600125)
+    road = np.abs(north) < 6
+    valley = height_m * np.clip((150 - np.abs(east)) / 40, 0, 1)
+    rng = np.random.default_rng(0)
+    dtm = 200 - valley + rng.normal(0, 0.02, grid.shape)
+    dsm = np.where(road, 200 + rng.normal(0, 0.02, grid.shape), dtm)
+    return TileData("viaduct", grid, ALL, dsm, dtm, road)
+
+
+def test_viaduct_across_border_is_kept():
+    surfaces = fit_tiles(viaduct())
+    deck = np.arange(500110, 500400, 0.5)
+    for east in (deck[deck <= 500250], deck[deck >= 500250]):
+        tile = surfaces[0 if east[0] < 500250 else 1, 0]
+        assert np.abs(tile.height(east, np.full(east.size, 5600125.0)) - 200).max() < 0.1
+
+
+def test_border_without_ground_is_left_free():
+    world = made_world("rural")
+    nothing = replace(world, dsm=np.full_like(world.dsm, np.nan), dtm=np.full_like(world.dtm, np.nan))
+    tile = Grid("EPSG:25832", 500000, 5600250, 1.0, 250, 250)
+    frame = frame_of(nothing, tile)
+    assert np.isnan(frame.control((73, 73))).all()
+    assert not frame.south.inside.any()
+    data = part(world, tile, tile)
+    alone, free = (smoothing_spline.fit(data, filtered(data)[1], OPTIONS, f) for f in (None, frame))
+    np.testing.assert_array_equal(free.A, alone.A)
+
+
+def test_border_without_road_or_dtm_is_fitted():
+    """With a DSM and no DTM there is only the road to fit, and without a road only the DTM."""
+    world = made_world("rural")
+    border = border_of(Grid("EPSG:25832", 500000, 5600250, 1.0, 250, 250), AROUND_M)[3]
+    no_road = replace(world, road_mask=np.zeros_like(world.road_mask))
+    assert np.isfinite(border_part(no_road, border, []).control).all()
+    no_dtm = replace(world, dtm=np.full_like(world.dtm, np.nan), road_mask=np.ones_like(world.road_mask))
+    assert np.isfinite(border_part(no_dtm, border, []).control).all()
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_borders_of_other_degrees_meet(degree):
+    world = made_world("rural")
+    options = OPTIONS.model_copy(update={"degree": degree, "spacing_m": 6.0})
+    west, east = (Grid("EPSG:25832", 500000 + x, 5600250, 1.0, 250, 250) for x in (0, 250))
+    surfaces = []
+    for tile in (west, east):
+        parts = []
+        for number, border in enumerate(border_of(tile, AROUND_M)):
+            ends = [parts[end] for end in ENDS[number - 4]] if number >= 4 else []
+            parts.append(border_part(world, border, ends, options))
+        data = part(world, tile, tile)
+        surfaces.append(smoothing_spline.fit(data, filtered(data)[1], options, Frame(*parts)))
+    x, y = np.full(100, 500250.0), np.linspace(5600000, 5600250, 100)
+    np.testing.assert_array_equal(surfaces[0].height(x, y), surfaces[1].height(x, y))
+    np.testing.assert_array_equal(surfaces[0].normal(x, y), surfaces[1].normal(x, y))
