@@ -173,5 +173,5 @@ class Grid:
         rows = range(math.floor((self.south + slack) / size_m), math.ceil((self.north - slack) / size_m))
         for j in rows:
             for i in columns:
-                west, south = i * size_m, j * size_m
+                west, south = float(i * size_m), float(j * size_m)
                 yield f"{west:.0f}_{south:.0f}", Grid(self.crs, west, south + size_m, self.cell, n, n)

@@ -214,7 +214,8 @@ def _tile(item: Item, folder: str) -> Tile:
     height, width = properties["proj:shape"]
     crs = properties.get("proj:code") or properties["proj:wkt2"]
     assets = item["assets"]
-    grid = Grid(crs, west, north, cell, int(width), int(height))
+    # JSON may hold whole numbers; fingerprints are of the text of numbers.
+    grid = Grid(crs, float(west), float(north), float(cell), int(width), int(height))
     layers, nearby = by_cover([_layer(name, assets[name]) for name in LAYERS if assets.get(name)], grid)
     return Tile(
         id=item["id"],

@@ -9,6 +9,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.types import RoadClusters, RoadMask
+from tests.mesh_union import Union
 from tests.tasks.test_sample import Hills, areas
 
 WEST, SOUTH = 295500.0, 5629250.0
@@ -44,20 +45,7 @@ def meshes(tiles, rng, options, outside=lambda east, north: False):
 
 
 def union(parts):
-    """Return vertices and faces of all meshes; equal vertices are one."""
-    parts = list(parts)
-    vertices = np.concatenate([mesh.vertices + np.array(mesh.origin) for mesh in parts])
-    first = np.cumsum([0] + [len(mesh.vertices) for mesh in parts])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(parts, first, strict=False)])
-    unique, number = np.unique(vertices, axis=0, return_inverse=True)
-    return unique, number.reshape(-1)[faces]
-
-
-def edge_uses(vertices, faces):
-    """Return the middle of each edge (easting, northing), and the number of its faces."""
-    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, count = np.unique(pairs, axis=0, return_counts=True)
-    return vertices[edges].mean(axis=1)[:, :2], count
+    return Union.of((mesh.vertices + np.array(mesh.origin), mesh.faces) for mesh in parts)
 
 
 @settings(deadline=None, max_examples=30)
@@ -76,13 +64,10 @@ def test_meshes_of_four_tiles_join_without_open_edges(seed, cell, size_m, share,
     size = tuple(round(length / cell) for length in size_m)
     tiles = block(rng, cell, size, share)
     options = Options(method=method, road_m=road_m * max(cell, 0.5), terrain_m=7 * max(cell, 0.5), mask=mask)
-    vertices, faces = union(meshes(tiles, rng, options))
-    middles, count = edge_uses(vertices, faces)
-    assert count.max() == 2
-    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
-    at_rim = ((middles == low) | (middles == high)).any(axis=1)
-    assert (count[~at_rim] == 2).all()
-    assert (high - low).prod() == pytest.approx(4 * size[0] * size[1] * cell**2, rel=1e-12)
+    whole = union(meshes(tiles, rng, options))
+    assert whole.uses.max() == 2
+    assert (whole.uses[whole.inside] == 2).all()
+    assert whole.area == pytest.approx(4 * size[0] * size[1] * cell**2, rel=1e-12)
 
 
 def test_mesh_borders_are_exact_in_float32():
@@ -119,13 +104,12 @@ def test_faces_along_border_inside_survey_are_kept_on_both_sides():
         # Beside the border, in the western tile only.
         return (easting > east - 30) & (easting < east) & (np.abs(northing - SOUTH - 50) < 20)
 
-    vertices, faces = union(meshes(tiles, rng, Options(), outside))
-    middles, count = edge_uses(vertices, faces)
-    at_border = middles[:, 0] == east
+    whole = union(meshes(tiles, rng, Options(), outside))
+    at_border = whole.middles[:, 0] == east
     assert at_border.sum() > 10
-    assert (count[at_border] == 2).all()
-    holes = (count == 1) & (np.abs(middles - [WEST + 85, SOUTH + 50]) < [20, 30]).all(axis=1)
-    assert holes.any()
+    assert (whole.uses[at_border] == 2).all()
+    in_void = (np.abs(whole.middles - [WEST + 85, SOUTH + 50]) < [20, 30]).all(axis=1)
+    assert (whole.uses[in_void] == 1).any()
 
 
 def test_border_beyond_survey_ends_mesh():
