@@ -24,7 +24,7 @@ from flexroad.tasks.types import Bools, Floats, Source, TileData
 if TYPE_CHECKING:
     from flexroad.tasks.io.raster import RasterWindow, Unreadable
 
-VERSION = 1
+VERSION = 2
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")

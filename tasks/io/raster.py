@@ -205,6 +205,10 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
         src_nodata=np.nan,
         dst_nodata=np.nan,
         resampling=resampling,
+        # GDAL would estimate the ratio of the cells from the window, and then give other values for a cell of
+        # two overlapping windows.
+        XSCALE=lattice.dx / grid.cell,
+        YSCALE=lattice.dy / grid.cell,
     )
     return values
 

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.borders import border_of
+from flexroad.catalog.sources import rasters
 from flexroad.tasks import TaskError
-from flexroad.tasks.load import Options, load
+from flexroad.tasks.load import Options, load, load_border
 from tests.make_rasters import UTM, write, write_xyz
 
 GRID = Grid(UTM, 295500.0, 5629480.0, 1.0, 20, 20)
@@ -409,3 +411,21 @@ def test_options_out_of_bounds_raise_error():
     for bad in ({"halo_m": -1}, {"halo_m": 501}, {"min_valid": 1.5}, {"halo": 3}):
         with pytest.raises(ValidationError):
             Options(**bad)
+
+
+@pytest.mark.parametrize(("cell", "shift"), [(1.0, 0.3), (0.8, 0.0), (0.4, 0.1), (2.0, 0.5)])
+def test_load_border_resamples_as_for_the_tile(tmp_path, cell, shift):
+    """A cell's height must not depend on the window that is read: a border's reaches beyond the tile's."""
+    heights = 200 + np.random.default_rng(0).normal(size=(int(500 / cell),) * 2).astype(np.float32)
+    write(tmp_path / "dsm.tif", np.full((500, 500), 200, np.float32), 500000, 5600500)
+    write(tmp_path / "dtm.tif", heights, 500000 + shift, 5600500 + shift, cell=cell)
+    place = rasters.index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=250).tiles[0]
+    whole = load(place, Options(halo_m=20))
+    for border in border_of(place.grid, 30):
+        around = load_border(place.around(border.grid, border.within(200)), place.grid)
+        west, south = (max(whole.grid.bounds[k], around.grid.bounds[k]) for k in (0, 1))
+        east, north = (min(whole.grid.bounds[k], around.grid.bounds[k]) for k in (2, 3))
+        common = Grid(UTM, west, north, 1.0, int(east - west), int(north - south))
+        ours, theirs = (data.dtm[data.grid.window(common)] for data in (whole, around))
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+        assert np.isfinite(ours).any()
