@@ -52,8 +52,8 @@ class Options(options.Options):
         0.0,
         ge=0,
         le=500,
-        description="ground read around the tile (m), so that neighbouring surfaces meet; 0 in the paper; "
-        "catalogs of rasters and of prepared tiles list the files up to 200 m around a tile",
+        description="ground read around the tile (m): for the filter, and for a fit without shared borders; "
+        "0 in the paper; catalogs of rasters and of prepared tiles list the files up to 200 m around a tile",
     )
     min_valid: float = Field(
         0.25, ge=0, le=1, description="share of the tile's cells that need a DSM height, or the tile fails"

@@ -27,8 +27,9 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, z
 def encode(surface: NurbsSurface) -> bytes:
     """Return a surface as ``.npz``: one array per field of `NurbsSurface`, and ``version``.
 
-    ``z(u, v) = datum + A(u, v) / W(u, v)`` with u and v from 0 to 1 over ``bounds`` (west, south, east,
-    north; m); coefficients are (row, col) with row 0 in the south. No pickled objects; float64.
+    ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
+    m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
+    with row 0 in the south. No pickled objects; float64.
     """
     buffer = io.BytesIO()
     np.savez_compressed(
