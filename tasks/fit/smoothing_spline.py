@@ -196,6 +196,9 @@ def _control_heights(
     dtm = without_invalid_dtm(data, clusters).dtm[window]
     ground = np.where(road, dsm, dtm)
     if np.isnan(ground).all():
+        # Of a corner or edge: tiles that bridge it must still hold the same points.
+        dtm = ground = dsm
+    if np.isnan(ground).all():
         return held
     first, datum = start_heights(dsm, dtm, road, space)
     is_held = np.isfinite(held)

@@ -193,6 +193,23 @@ def test_border_without_road_or_dtm_is_fitted():
     assert np.isfinite(border_part(no_dtm, border, []).control).all()
 
 
+def without_heights_around_middle(world, half_m, layers=("dsm", "dtm")):
+    east, north = np.meshgrid(world.grid.eastings - 500250, world.grid.northings - 5600250)
+    void = np.maximum(np.abs(east), np.abs(north)) < half_m
+    lost = {name: np.where(void, np.nan, getattr(world, name)) for name in layers}
+    return replace(world, road_mask=world.road_mask & ~void, **lost)
+
+
+def test_corner_far_from_road_and_dtm_is_fitted_to_dsm():
+    """Tiles bridge ground that has only a DSM: their common corner must not be left to each of them."""
+    world = without_heights_around_middle(made_world("rural"), 120, ("dtm",))
+    tile = Grid("EPSG:25832", 500000, 5600250, 1.0, 250, 250)
+    border = border_of(tile, AROUND_M)[3]
+    control = border_part(world, border, []).control
+    middle = world.grid.cells(np.array([500250.0]), np.array([5600250.0]))
+    np.testing.assert_allclose(control, world.dsm[middle][0], atol=5)
+
+
 @pytest.mark.parametrize("degree", [2, 4])
 def test_borders_of_other_degrees_meet(degree):
     world = made_world("rural")
