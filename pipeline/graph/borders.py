@@ -35,7 +35,7 @@ STAGE = "border"
 """Name of the nodes in the store, the log and the table of failures."""
 AROUND_M = 100.0
 """Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
-its cluster, and a short piece of a viaduct would look like an object."""
+its cluster, and a short piece of a viaduct would look like an object. A larger halo counts instead."""
 ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
 """Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
 
@@ -52,11 +52,14 @@ class BorderStages:
     segment: Options
     ecsrc: Options
     fit: Options
+    halo_m: float = 0.0
+    """The halo of the tiles (m): if it sees the far side of a void, so must the corner or edge."""
 
     @classmethod
     def of(cls, chain: Chain) -> BorderStages:
         """Return those of a variant."""
-        return cls(chain["segment"], chain["ecsrc"], chain["fit"])
+        halo_m: float = getattr(chain["load"], "halo_m", 0.0)
+        return cls(chain["segment"], chain["ecsrc"], chain["fit"], halo_m)
 
     @property
     def by_name(self) -> dict[str, Options]:
@@ -70,9 +73,9 @@ class BorderStages:
 
     @property
     def reach_m(self) -> float:
-        """Distance from a corner or edge up to which ground is read (m)."""
+        """Distance from a corner or edge up to which ground is read (m), at most `REACH_M`."""
         context_m: float = getattr(stage_module(self.segment), "CONTEXT_M", 0.0)
-        return AROUND_M + context_m
+        return min(max(AROUND_M, self.halo_m) + context_m, REACH_M)
 
     def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of a corner, or of an edge between its two ends.

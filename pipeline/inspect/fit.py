@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,7 +89,7 @@ def fit(
         framed: dict[str, Frame] = {}
         # As in a run, the control points on the border are fitted first.
         if has_borders(chain["fit"]):
-            stages = BorderStages(mask.Options(), chain["ecsrc"], chain["fit"])
+            stages = replace(BorderStages.of(chain), segment=mask.Options())
             wide = chain["load"].model_copy(update={"halo_m": stages.reach_m})
             framed["frame"] = stages.frame(load_arrays(dsm, dtm, road_mask, wide), data.core)
         fitted = stage_function("fit", chain["fit"])(data, clusters, chain["fit"], **framed)

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 VERSION = 2
 
 REACHES_M = (25.0, 50.0, 100.0)
-"""Distances from a corner or edge up to which its control points are fitted (m): the first that is enough."""
+"""Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
+else all the ground around it."""
 BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 BORDER_TOLERANCE = 1e-6
@@ -100,7 +101,7 @@ def corner(data: TileData, clusters: RoadClusters, border: Border, options: Opti
     from flexroad.tasks.spline.frame import Corner, rounded
 
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
-    k, j = lattice.lines_within(_reach(data, clusters, border))
+    k, j = _lines(data, clusters, border, lattice)
     held = np.full((2 * j + p, 2 * k + p), np.nan)
     z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, _precise(options))
     return Corner(rounded(z[j : j + p, k : k + p]))
@@ -128,7 +129,7 @@ def edge(
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     eastward = border.kind == "east"
     n, m = (lattice.intervals[0], 0) if eastward else (0, lattice.intervals[1])
-    k, j = lattice.lines_within(_reach(data, clusters, border))
+    k, j = _lines(data, clusters, border, lattice)
     held = np.full((m + 2 * j + p, n + 2 * k + p), np.nan)
     acting = slice(j, j + m + p), slice(k, k + n + p)
     held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
@@ -168,16 +169,18 @@ def _ground(data: TileData, clusters: RoadClusters) -> Floats:
     return np.where(clusters.mask, data.dsm, without_invalid_dtm(data, clusters).dtm)
 
 
-def _reach(data: TileData, clusters: RoadClusters, border: Border) -> float:
-    """Return the distance from a corner or edge up to which it is fitted (m)."""
+def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Lattice) -> tuple[int, int]:
+    """Return the number of intervals up to which a corner or edge is fitted, along easting and northing."""
     import scipy
 
-    missing = np.isnan(_ground(data, clusters))
-    if missing.all():
-        return REACHES_M[-1]
-    away = scipy.ndimage.distance_transform_edt(missing) * data.grid.cell
-    needed = BEYOND_DATA_M + max(float(away[side].max()) for side in border.sides)
-    return next((reach for reach in REACHES_M if reach >= needed), REACHES_M[-1])
+    missing, cell = np.isnan(_ground(data, clusters)), data.grid.cell
+    if not missing.all():
+        away = scipy.ndimage.distance_transform_edt(missing) * cell
+        needed = BEYOND_DATA_M + max(float(away[side].max()) for side in border.sides)
+        for lines in map(lattice.lines_within, REACHES_M):
+            if min(np.multiply(lines, lattice.unit_m)) >= needed:
+                return lines
+    return lattice.lines_over((border.cell[1] - 0.5) * cell)
 
 
 def _control_heights(

@@ -51,6 +51,11 @@ class Lattice:
         u_m, v_m = self.unit_m
         return max(1, int(distance_m / u_m + 1e-9)), max(1, int(distance_m / v_m + 1e-9))
 
+    def lines_over(self, distance_m: float) -> tuple[int, int]:
+        """Return the number of intervals that reach up to a distance or beyond it; at least 1."""
+        u_m, v_m = self.unit_m
+        return max(1, math.ceil(distance_m / u_m - 1e-9)), max(1, math.ceil(distance_m / v_m - 1e-9))
+
     def part(
         self, shape: tuple[int, int], start: tuple[int, int], u: Range, v: Range
     ) -> tuple[Space, tuple[slice, slice]]:

@@ -14,7 +14,7 @@ from flexroad.catalog.sources import prepared, rasters
 from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.borders import STAGE, check_tiles
+from flexroad.pipeline.graph.borders import STAGE, BorderStages, check_tiles
 from flexroad.pipeline.graph.graph import files_read, tile_graphs
 
 NIGHTLY = load_config("nightly")
@@ -78,6 +78,13 @@ def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
         *["corner"] * 4, "east", "east", "north", "north",
     ]  # fmt: skip
     assert graph.nodes[graph.variants["flexroad"]["sample"]].frame == fit.frame
+
+
+@pytest.mark.parametrize(("halo_m", "reach_m"), [(0, 100), (50, 100), (150, 150), (300, 200)])
+def test_borders_see_as_far_as_the_halo(halo_m, reach_m):
+    """Otherwise a tile would bridge a void whose far side its border does not see."""
+    config = compose({"fit": "smoothing_spline", "load": {"halo_m": halo_m}}, "halo")
+    assert BorderStages.of(config.chains["flexroad"]).reach_m == reach_m
 
 
 def touch(path):

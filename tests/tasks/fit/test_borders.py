@@ -210,6 +210,14 @@ def test_corner_far_from_road_and_dtm_is_fitted_to_dsm():
     np.testing.assert_allclose(control, world.dsm[middle][0], atol=5)
 
 
+def test_corner_is_fitted_to_ground_at_the_end_of_its_grid():
+    """Three intervals of 27.8 m would end before the ground, which begins 97 m away."""
+    world = without_heights_around_middle(made_world("rural"), 97)
+    border = border_of(Grid("EPSG:25832", 500000, 5600250, 1.0, 250, 250), AROUND_M)[3]
+    options = OPTIONS.model_copy(update={"spacing_m": 30.0})
+    assert np.isfinite(border_part(world, border, [], options).control).all()
+
+
 @pytest.mark.parametrize("degree", [2, 4])
 def test_borders_of_other_degrees_meet(degree):
     world = made_world("rural")

@@ -80,6 +80,13 @@ def test_lattice_spacing_is_at_most_the_given_one(spacing, intervals):
     assert max(lattice.unit_m) <= max(spacing, 250 / 3)
 
 
+def test_lattice_lines_over_a_distance():
+    lattice = Lattice.of((250, 200), 1.0, 3, 30.0)
+    assert lattice.lines_within(99.5) == (3, 3)
+    assert lattice.lines_over(99.5) == (4, 4)
+    assert Lattice.of((250, 200), 1.0, 3, 5.0).lines_over(100.0) == (20, 20)
+
+
 def test_lattice_part_has_cells_between_its_lines():
     lattice = Lattice.of((250, 200), 1.0, 3, 5.0)
     space, (rows, cols) = lattice.part((300, 400), start=(280, 60), u=(-4, 10), v=(0, 6))
