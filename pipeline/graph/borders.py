@@ -35,7 +35,8 @@ STAGE = "border"
 """Name of the nodes in the store, the log and the table of failures."""
 AROUND_M = 100.0
 """Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
-its cluster, and a short piece of a viaduct would look like an object. A larger halo counts instead."""
+its cluster, and a short piece of a viaduct would look like an object. A larger halo counts instead, or
+the distance up to which the control points act: without ground there, the mesh must not depend on them."""
 ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
 """Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
 
@@ -75,7 +76,9 @@ class BorderStages:
     def reach_m(self) -> float:
         """Distance from a corner or edge up to which ground is read (m), at most `REACH_M`."""
         context_m: float = getattr(stage_module(self.segment), "CONTEXT_M", 0.0)
-        return min(max(AROUND_M, self.halo_m) + context_m, REACH_M)
+        fit: Any = stage_module(self.fit)
+        acting_m: float = fit.acting_m(self.fit)
+        return min(max(AROUND_M, self.halo_m, acting_m) + context_m, REACH_M)
 
     def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of a corner, or of an edge between its two ends.

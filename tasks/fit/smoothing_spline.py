@@ -88,6 +88,11 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
     return surface_on(space, data.core, data.core.exact_bounds, z, np.ones_like(z), datum=0.0)
 
 
+def acting_m(options: Options) -> float:
+    """Return the distance (m) beyond which no control point of a corner or edge acts."""
+    return options.degree * options.spacing_m
+
+
 def corner(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> Corner:
     """Fit the control points that act on a corner of tiles to the ground around it.
 

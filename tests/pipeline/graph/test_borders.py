@@ -80,10 +80,16 @@ def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
     assert graph.nodes[graph.variants["flexroad"]["sample"]].frame == fit.frame
 
 
-@pytest.mark.parametrize(("halo_m", "reach_m"), [(0, 100), (50, 100), (150, 150), (300, 200)])
-def test_borders_see_as_far_as_the_halo(halo_m, reach_m):
-    """Otherwise a tile would bridge a void whose far side its border does not see."""
-    config = compose({"fit": "smoothing_spline", "load": {"halo_m": halo_m}}, "halo")
+@pytest.mark.parametrize(
+    ("halo_m", "spacing_m", "reach_m"),
+    [(0, 3.6, 100), (50, 3.6, 100), (150, 3.6, 150), (300, 3.6, 200), (50, 50, 150)],
+)
+def test_borders_see_as_far_as_the_halo_and_as_they_act(halo_m, spacing_m, reach_m):
+    """Otherwise a tile would bridge a void whose far side its border does not see, or a corner far beyond the
+    survey would act on ground within it.
+    """
+    fit = {"method": "smoothing_spline", "spacing_m": spacing_m}
+    config = compose({"fit": fit, "load": {"halo_m": halo_m}}, "reach")
     assert BorderStages.of(config.chains["flexroad"]).reach_m == reach_m
 
 
