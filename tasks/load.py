@@ -133,14 +133,16 @@ def load_border(ground: Tile, core: Grid) -> TileData:
     Raises
     ------
     TaskError
-        If a file is in another CRS, or the layers differ in their unit of height.
+        If the layers differ in their unit of height.
     """
     from flexroad.catalog.headers.rasters import quiet
 
     grid = ground.grid
     with quiet():
         mosaics = {
-            layer.name: _mosaic(ground, layer, grid, core) for layer in ground.layers if layer.name in READS
+            layer.name: _mosaic(ground, layer, grid, core, around=True)
+            for layer in ground.layers
+            if layer.name in READS
         }
     patches = [patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches]
     if patches:
@@ -183,11 +185,14 @@ def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:
     return np.where(np.isfinite(decks), decks, mosaics["dtm"].values)
 
 
-def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid) -> _Mosaic:
-    """Return a layer on a grid; files that are missing or broken are left out."""
+def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> _Mosaic:
+    """Return a layer on a grid; files that are missing or broken are left out.
+
+    If the grid is ground ``around`` tiles, so are those in another CRS: they fail the tiles that they lie on.
+    """
     from rasterio.enums import Resampling
 
-    from flexroad.tasks.io.raster import Unreadable, misalignment, read_window, resample_to
+    from flexroad.tasks.io.raster import OtherCrs, Unreadable, misalignment, read_window, resample_to
 
     values = np.full(grid.shape, np.nan)
     reached = np.zeros(grid.shape, bool)
@@ -200,6 +205,10 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid) -> _Mosaic:
             patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs)
         except Unreadable as error:
             broken.append(error)
+            continue
+        except OtherCrs as error:
+            if not around:
+                raise TaskError(str(error), error.file) from error
             continue
         if patch is None:
             continue

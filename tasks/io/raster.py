@@ -24,6 +24,10 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
 
+class OtherCrs(TaskError):
+    """A file is in another CRS than the grid that it overlaps."""
+
+
 class Unreadable(TaskError):
     """A file that is missing or broken, so that its position is unknown."""
 
@@ -252,7 +256,7 @@ def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str 
         return lattice
     if not _overlap(transform_bounds(file_crs, grid.crs, *lattice.bounds), grid.bounds):
         return None
-    raise TaskError(
+    raise OtherCrs(
         f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
         f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}",
         str(path),

@@ -350,6 +350,17 @@ def test_load_layer_in_other_crs_fails(tmp_path, dtm):
     assert file == str(tmp_path / "dtm.tif")
 
 
+def test_border_leaves_out_file_in_other_crs(tmp_path, dtm):
+    """It fails the tile that it lies on, not those around."""
+    from rasterio.warp import transform
+
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    (east,), (north,) = transform(UTM, "EPSG:25833", [GRID.west - 10], [GRID.north + 10])
+    write(tmp_path / "other.tif", relief(40, 40), east, north, crs="EPSG:25833")
+    ground = load_border(tile(tmp_path, dtm=("other.tif", "dtm.tif")), GRID)
+    np.testing.assert_array_equal(ground.dtm, relief(seed=9))
+
+
 def test_load_file_in_other_crs_outside_tile_is_ignored(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH)
     write(tmp_path / "far.tif", relief(), **NORTH, crs="EPSG:25833")
