@@ -20,6 +20,7 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
     rasters that `load` reads) are computed again when a later node needs them.
     """
     artefacts, totals, tiles = ArtefactStore(store), Counter[tuple[str, str]](), 0
+    counted: set[str] = set()
     for graph in graphs:
         tiles += 1
         done = TileProducts.of(run, graph.tile.id).done(graph) is not None
@@ -27,7 +28,10 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
         users = _users(graph)
         for node in graph.nodes.values():
             state = "stored" if node.stored and artefacts.has(node) else "to do"
-            totals[node.stage, "done" if done else state] += 1
+            if node.fingerprint not in counted:
+                totals[node.stage, "done" if done else state] += 1
+            # Corners and edges are nodes of several tiles.
+            counted |= {node.fingerprint} if node.border else set()
             needed = (*node.inputs, *node.frame)
             inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in needed) or "files"
             yield (

@@ -147,15 +147,19 @@ class BorderTask:
 
 
 def check_tiles(config: Config, catalog: Catalog) -> None:
-    """Check that tiles which meet have one size, cell and lattice, if a fit joins them to one surface.
+    """Check that tiles which meet can have one surface, if a fit joins them.
 
     Raises
     ------
     ConfigError
-        If two of them differ; the message names both.
+        If two of them differ in size, cell or lattice (the message names both), or if control points act
+        farther than catalogs list files.
     """
-    if not any(has_borders(chain["fit"]) for chain in config.chains.values()):
+    joined = [chain["fit"] for chain in config.chains.values() if has_borders(chain["fit"])]
+    if not joined:
         return
+    size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in catalog.tiles))
+    _check_acting(joined, size_m)
     lattices = [_lattice(tile.grid) for tile in catalog.tiles]
     if len(set(lattices)) <= 1:
         return
@@ -168,6 +172,18 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
                 f"tiles {one.id} ({_size(one.grid)}) and {other.id} ({_size(other.grid)}) meet, but are not "
                 "of one size on one lattice, so they cannot have one surface; catalog them again with one "
                 "tile size, or set fit.method to nurbs, which fits each tile alone"
+            )
+
+
+def _check_acting(fits: Sequence[Options], tile_m: float) -> None:
+    for fit in fits:
+        module: Any = stage_module(fit)
+        # The points of small tiles are closer to each other than the options say.
+        acting_m = min(module.acting_m(fit), tile_m)
+        if acting_m > REACH_M:
+            raise ConfigError(
+                f"fit.degree times fit.spacing_m is {acting_m:g} m: control points would act farther than "
+                f"the {REACH_M:g} m up to which catalogs list files; lower fit.spacing_m"
             )
 
 

@@ -197,6 +197,25 @@ def test_tiles_on_one_lattice_or_apart_are_accepted():
     check_tiles(NIGHTLY, placed(square(0, 0), square(100, 0, crs="EPSG:25833")))
 
 
+@pytest.mark.parametrize(
+    ("spacing_m", "size", "accepted"), [(60, 250, True), (80, 250, False), (80, 100, True)]
+)
+def test_control_points_that_act_beyond_listed_files_are_refused(spacing_m, size, accepted):
+    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": spacing_m}}, "coarse")
+    if accepted:
+        check_tiles(config, placed(square(0, 0, size)))
+    else:
+        with pytest.raises(ConfigError, match=r"act farther than the 200 m .*; lower fit\.spacing_m"):
+            check_tiles(config, placed(square(0, 0, size)))
+
+
+def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
+    by_prepared(survey).write(survey / "catalog.json")
+    words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
+    out = flexroad("run", "--config", "nightly", *words).expected(0).out
+    assert "  border   40 to do" in out.splitlines()
+
+
 def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):
     write_scenes(tmp_path / "survey", 1, seed=0, size_m=60)
     catalog = Catalog.read(tmp_path / "survey" / "catalog.parquet")
