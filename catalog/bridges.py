@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.point_clouds import chunks
+from flexroad.catalog.storage.paths import output_file
 
 Floats = NDArray[np.float64]
 
@@ -79,4 +80,4 @@ def _write(target: Path, heights: Floats, transform: Affine, crs: str) -> None:
         temporary, "w", width=cols, height=rows, transform=transform, crs=crs, **profile
     ) as raster:
         raster.write(heights.astype(np.float32), 1)
-    temporary.replace(target)
+    temporary.replace(output_file(target))

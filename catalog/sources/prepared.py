@@ -26,6 +26,7 @@ from rasterio.errors import CRSError, RasterioIOError
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
+from flexroad.catalog.storage.paths import output_file
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "reference")
@@ -160,6 +161,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
         grid = Grid(grid.crs, grid.west, grid.north, grid.width * grid.cell / width, width, height)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        target = output_file(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with rasterio.open(
             temporary,
@@ -176,7 +178,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
         ) as dataset:
             dataset.write(bands)
             dataset.update_tags(**tags)
-        temporary.replace(path)
+        temporary.replace(target)
     except (OSError, RasterioIOError, CRSError) as error:
         # rasterio's error has GDAL's error, with the reason, as its cause.
         raise CatalogError(f"cannot write {path}: {error.__cause__ or error}") from error

@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 from uuid import uuid4
@@ -281,12 +282,14 @@ def atomic_path(where: Path) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If it cannot be written; names ``where``. No temporary file is left.
+        If it cannot be written, or ``where`` is no regular file (`output_file`); names ``where``. No
+        temporary file is left.
     """
-    temporary = where.with_name(f".{where.name}.{uuid4().hex}.tmp")
+    target = output_file(where)
+    temporary = target.with_name(f".{target.name}.{uuid4().hex}.tmp")
     try:
         yield temporary
-        temporary.replace(where)
+        temporary.replace(target)
     except OSError as error:
         # The error of a full disk has no file name, that of a failed rename has the temporary one.
         number = error.errno or errno.EIO
@@ -294,6 +297,29 @@ def atomic_path(where: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def output_file(where: Path) -> Path:
+    """Return the file that is written for a name: the name itself, or the file that a link points to.
+
+    Raises
+    ------
+    OSError
+        If something else than a regular file has that name: a rename would replace a device, a pipe or a
+        socket by a file.
+    """
+    try:
+        target = where.resolve() if where.is_symlink() else where
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return target
+    except RuntimeError as error:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(where)) from error
+    if S_ISREG(mode):
+        return target
+    if S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(where))
+    raise OSError(errno.EINVAL, "is a device, pipe or socket and is not replaced", str(where))
 
 
 def remove(where: Location) -> None:

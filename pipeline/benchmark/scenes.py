@@ -12,6 +12,7 @@ from pathlib import Path
 from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.headers.vectors import opened, with_roads
 from flexroad.catalog.sources import prepared
+from flexroad.catalog.storage.paths import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
@@ -124,7 +125,7 @@ def _write_scene(job: SceneJob) -> str:
 
 def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
     """Write the centre lines of all scenes to one file; return the tiles with it as layer ``roads``."""
-    path.unlink(missing_ok=True)
+    output_file(path).unlink(missing_ok=True)
     # Neighbouring tiles share streets; equal lines are written once.
     lines = {
         line.points.tobytes(): line
@@ -141,13 +142,14 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
     import geopandas
     import shapely
 
+    target = output_file(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.gpkg")
     columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
         with _fixed_date():
             geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs).to_file(temporary, layer="roads")
-        temporary.replace(path)
+        temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 

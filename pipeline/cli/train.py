@@ -45,6 +45,7 @@ def train(
 ) -> None:
     """Train a segmenter on labelled tiles and validate it on others; write MODEL, MODEL.html, MODEL.json."""
     from flexroad.catalog import Catalog
+    from flexroad.catalog.storage.paths import output_file
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
     from flexroad.pipeline.report.training import summary, write_model
@@ -56,6 +57,9 @@ def train(
     tiles, loaded_config = Catalog.read(catalog), load_config(config)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)
+    # Refused before the training and not after it.
+    for suffix in ("", ".html", ".json"):
+        output_file(output.with_name(output.name + suffix))
     try:
         outcome = train(tiles, loaded_config, options, lambda line: typer.echo(line, err=True))
         model, page, _ = write_model(outcome, output)

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from flexroad.catalog.storage.paths import atomic_path
+
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
@@ -86,11 +88,13 @@ class Textfile:
         OSError
             If the folder does not exist or is not writable.
         """
-        from prometheus_client import write_to_textfile
+        from prometheus_client import generate_latest
 
         with self._lock:
-            registry = self._registry()
-        write_to_textfile(str(self.path), registry)
+            text = generate_latest(self._registry())
+        # The library's own function would replace a device or a pipe by a file.
+        with atomic_path(self.path) as temporary:
+            temporary.write_bytes(text)
 
     def _keep_writing(self) -> None:
         while not self._stop.wait(self.every_s):

@@ -27,6 +27,7 @@ from rasterio.windows import Window
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
+from flexroad.catalog.storage.paths import output_file
 from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Orthophoto
@@ -94,6 +95,9 @@ class RasterWriter:
         """Folder for temporary files, also of the caller; removed when the context ends."""
         try:
             out.mkdir(parents=True, exist_ok=True)
+            for name in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
+                # Refused at the start and not after the rasters are computed.
+                output_file(out / name)
             _remove_stale(out)
             self.scratch.mkdir()
         except OSError as error:
@@ -193,9 +197,9 @@ class RasterWriter:
     def _replace(self, names: list[str]) -> None:
         # A catalog must only exist beside complete rasters: removed first, written last.
         for name in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
-            (self.out / name).unlink(missing_ok=True)
+            output_file(self.out / name).unlink(missing_ok=True)
         for layer in names:
-            (self.scratch / f"{layer}.tif").replace(self.out / f"{layer}.tif")
+            (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
 
     def _tiles(
         self, names: list[str], size_m: float, date: datetime | None, dataset: str

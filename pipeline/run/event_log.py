@@ -16,7 +16,7 @@ import json
 from dataclasses import asdict
 from typing import IO, Any
 
-from flexroad.catalog.storage.paths import Location, is_remote
+from flexroad.catalog.storage.paths import Location, is_remote, output_file
 from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.worker.profiling import utc_now
 from flexroad.pipeline.worker.tile import TileResult
@@ -32,7 +32,8 @@ class EventLog:
 
     def __enter__(self) -> EventLog:
         with contextlib.suppress(OSError):
-            self._file = self._staged.path.open("a", buffering=1)
+            # A pipe without a reader would block the run.
+            self._file = output_file(self._staged.path).open("a", buffering=1)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,5 +1,7 @@
 """Files behave the same on disk and in a bucket."""
 
+import os
+import socket
 import sys
 from pathlib import Path
 
@@ -131,3 +133,56 @@ def test_storage_always_fails_error_names_bucket(bucket, storage, answer):
         with pytest.raises(OSError, match=str(bucket)) as caught:
             attempt()
         assert isinstance(caught.value, PermissionError) == (answer == "denied")
+
+
+def special(kind, tmp_path):
+    """Make something in a folder that is no regular file; never a real device."""
+    name = tmp_path / "there"
+    if kind == "pipe":
+        os.mkfifo(name)
+    elif kind == "folder":
+        name.mkdir()
+    elif kind == "loop":
+        name.symlink_to(name)
+    else:
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(name))
+    return name
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("pipe", "is a device, pipe or socket and is not replaced"),
+        ("socket", "is a device, pipe or socket and is not replaced"),
+        ("folder", "Is a directory"),
+        ("loop", "Too many levels of symbolic links"),
+    ],
+)
+def test_write_does_not_replace_special_file(kind, reason, tmp_path):
+    name = special(kind, tmp_path)
+    before = name.lstat()
+    with pytest.raises(OSError, match=reason) as caught:
+        paths.write(name, b"new")
+    assert caught.value.filename == str(name)
+    after = name.lstat()
+    assert (after.st_mode, after.st_ino) == (before.st_mode, before.st_ino)
+    assert list(tmp_path.iterdir()) == [name]
+
+
+def test_write_through_link_keeps_link(tmp_path):
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "old.txt").write_bytes(b"old")
+    for target in ("old.txt", "new.txt"):
+        link = tmp_path / f"to_{target}"
+        link.symlink_to(folder / target)
+        paths.write(link, b"written")
+        assert link.is_symlink()
+        assert (folder / target).read_bytes() == b"written"
+    pipe = folder / "pipe"
+    os.mkfifo(pipe)
+    (tmp_path / "to_pipe").symlink_to(pipe)
+    with pytest.raises(OSError, match="pipe or socket"):
+        paths.write(tmp_path / "to_pipe", b"new")
+    assert pipe.is_fifo()

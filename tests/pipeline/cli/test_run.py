@@ -104,6 +104,15 @@ def test_run_with_failed_tile_notifies_and_shows_it_on_the_map(
     assert (values["flexroad_run_exit_code"], values["flexroad_run_running"]) == (1, 0)
 
 
+def test_run_with_pipe_as_output_is_refused_at_the_start(flexroad, nightly, tmp_path):
+    pipe = tmp_path / "run.prom"
+    os.mkfifo(pipe)
+    said = flexroad(*nightly, "--prometheus", pipe, expect=2)
+    assert f"cannot write --prometheus {pipe}: is a device, pipe or socket and is not replaced" in said
+    assert pipe.is_fifo()
+    assert not (tmp_path / "run" / "tiles").exists()
+
+
 def test_run_that_cannot_start_notifies(flexroad, nightly, notification, tmp_path, monkeypatch):
     said = flexroad(*nightly, *notification.words, "--executor", "x", expect=2)
     received = notification.received

@@ -1,5 +1,7 @@
 """The rasters of an area are valid COGs that `run` can read; a failure leaves no partial files."""
 
+import os
+
 import numpy as np
 import pytest
 import rasterio
@@ -150,3 +152,10 @@ def test_writer_removes_folder_of_killed_process(tmp_path):
     (stale / "dsm.tmp.tif").write_bytes(b"x")
     with RasterWriter(tmp_path, grid(50, 50), None, TAGS):
         assert not stale.exists()
+
+
+def test_writer_refuses_to_replace_pipe(tmp_path):
+    os.mkfifo(tmp_path / "dtm.tif")
+    with pytest.raises(ConfigError, match=r"dtm\.tif.*|is a device, pipe or socket"):
+        RasterWriter(tmp_path, grid(), None, TAGS)
+    assert (tmp_path / "dtm.tif").is_fifo()

@@ -456,6 +456,13 @@ def test_edge_steps_of_large_run_are_a_sample(finished):
     assert list(whole.check.result) == ["tiles are fitted independently"]
 
 
+def test_run_with_pipe_as_log_does_not_wait_for_a_reader(run):
+    (run.path / "log.jsonl").unlink(missing_ok=True)
+    os.mkfifo(run.path / "log.jsonl")
+    assert run_tiles(run, SerialExecutor()).done == len(run.catalog.tiles)
+    assert (run.path / "log.jsonl").is_fifo()
+
+
 def test_open_folder_without_run_raises(tmp_path):
     with pytest.raises(ConfigError, match="is no run"):
         Run.open(tmp_path)
