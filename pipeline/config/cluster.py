@@ -29,6 +29,13 @@ class Cluster(Options):
         description="memory of each worker, as 4 GiB; by default an equal share of this machine's memory, "
         "on slurm and kubernetes 4 GiB; a tile that needs more is stopped and becomes a failed row",
     )
+    tile_timeout_s: float = Field(
+        3600,
+        ge=1,
+        le=604_800,
+        description="longest time for one tile (s): a worker that takes longer is stopped, the tile is tried "
+        "once more alone, and is then a failed row; not with the serial executor",
+    )
     patience_s: float = Field(
         60, ge=0, le=86_400, description="waiting time for a new worker when all workers are lost (s)"
     )

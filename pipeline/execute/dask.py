@@ -83,7 +83,7 @@ class DaskExecutor:
                 function,
                 chain(first, queue),
                 lost,
-                self.cluster.patience_s,
+                self.cluster,
                 self.say,
             )
             yield from session.results()

@@ -11,7 +11,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import count, islice
 from typing import Generic
 
@@ -20,6 +21,7 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
 
+from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, R
 from flexroad.pipeline.execute.scheduler import task_function
@@ -36,6 +38,7 @@ class InFlight(Generic[J]):
     job: J
     reserved_worker: str = ""
     """Address of the worker that runs only this job; empty if the job is not quarantined."""
+    submitted: float = field(default_factory=time.monotonic)
 
 
 class Session(Generic[J, R]):
@@ -55,8 +58,8 @@ class Session(Generic[J, R]):
         The jobs; taken as there is room.
     lost : callable
         Takes a job and the reason, returns the result of a lost job.
-    patience_s : float
-        How long to wait for a worker when there is none (s).
+    cluster : Cluster
+        How long to wait for a worker when there is none, and longest time of a job.
     say : callable
         Prints one line for the user.
     """
@@ -69,7 +72,7 @@ class Session(Generic[J, R]):
         function: Callable[[J], R],
         jobs: Iterator[J],
         lost: Callable[[J, str], R],
-        patience_s: float,
+        cluster: Cluster,
         say: Callable[[str], None],
     ) -> None:
         self.client = client
@@ -80,7 +83,8 @@ class Session(Generic[J, R]):
         self.quarantined: deque[J] = deque()
         """Jobs that were assigned to a worker that died."""
         self.lost = lost
-        self.patience_s = patience_s
+        self.patience_s = cluster.patience_s
+        self.limit_s = cluster.tile_timeout_s
         self.say = say
         self.in_flight: dict[Future, InFlight[J]] = {}
         self.completed: queue.SimpleQueue[Future] = queue.SimpleQueue()
@@ -128,7 +132,7 @@ class Session(Generic[J, R]):
         # Numbered: Dask would return the old error for a key that failed. Not pure: a job writes files.
         future = self.client.submit(
             self.run_task,
-            dumps((work, self.function, flight.job)),
+            dumps((partial(work, limit_s=self.limit_s), self.function, flight.job)),
             self.check,
             key=f"{name}-{self.check}-{next(self.numbers)}",
             pure=False,
@@ -215,14 +219,20 @@ class Session(Generic[J, R]):
 
     def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
         if flight.reserved_worker:
-            yield self.lost(flight.job, self._death_reason(error))
+            yield self.lost(flight.job, self._death_reason(flight, error))
         else:
             self.quarantined.append(flight.job)
 
     def _cluster_lost(self) -> ClusterLost:
         return ClusterLost(f"{self.name} is gone")
 
-    def _death_reason(self, error: KilledWorker) -> str:
+    def _death_reason(self, flight: InFlight[J], error: KilledWorker) -> str:
+        # A reserved worker starts its job at once.
+        if time.monotonic() - flight.submitted >= self.limit_s:
+            return (
+                f"it took more than {self.limit_s:g} s, 2 times, and was stopped; look at its source files, "
+                "or raise cluster.tile_timeout_s"
+            )
         worker = error.last_worker
         for _, event in self.client.get_events("worker-restart-memory") or ():
             if event["worker"] == worker.address:

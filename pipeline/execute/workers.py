@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import faulthandler
 import importlib.metadata
 import os
 import platform
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from threading import Lock, local
 from typing import Any
 
@@ -83,13 +86,29 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
         return ""
 
 
-def work(function: Callable[[J], R], job: J) -> R:
-    """Do one job on a worker that passed its check."""
+def work(function: Callable[[J], R], job: J, limit_s: float) -> R:
+    """Do one job on a worker that passed its check; the process ends if it takes longer than ``limit_s``."""
     if not hasattr(_thread, "pinned"):
         # Some libraries have a limit per calling thread. Libraries loaded later read the environment.
         pin_threads()
         _thread.pinned = True
-    return function(job)
+    with _time_limit(limit_s):
+        return function(job)
+
+
+@contextlib.contextmanager
+def _time_limit(limit_s: float) -> Iterator[None]:
+    """End the process if the block takes longer (s).
+
+    The timer of faulthandler also ends a process that hangs in a library without giving other threads a
+    turn. There is one per process: on a worker with several threads it covers the last job started.
+    """
+    with Path(os.devnull).open("w") as nowhere:
+        faulthandler.dump_traceback_later(limit_s, exit=True, file=nowhere)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
 
 
 async def find_fault(check: str, dask_worker: Any) -> str:

@@ -49,6 +49,15 @@ def double(job):
     return 2 * job
 
 
+def hanging(job):
+    """Sleep if the job is "sleep"; if it is "hold", do so without a turn for other threads of the process."""
+    if job == "sleep":
+        time.sleep(600)
+    if job == "hold":
+        ctypes.PyDLL(None).sleep(600)
+    return job
+
+
 def deadly(job):
     """Kill the worker process if the job is "segfault..." or "exit..."; else return the job."""
     if str(job).startswith("segfault"):
@@ -315,3 +324,21 @@ def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     catalog = Catalog.read(made_survey / "catalog.parquet")
     plain = [graph.fingerprint for graph in tile_graphs(catalog, load_config("paper"))]
     assert [graph.fingerprint for graph in tile_graphs(catalog, heir)] == plain
+
+
+def test_hanging_jobs_are_stopped_tried_again_and_lost(running):
+    limited = Cluster(tile_timeout_s=3)
+    jobs = ["a", "sleep", "b", "hold", *map(str, range(20))]
+    start = time.monotonic()
+    results = list(DaskExecutor(scheduler=running.address, cluster=limited).map(hanging, jobs, lost))
+    reason = (
+        "it took more than 3 s, 2 times, and was stopped; look at its source files, or raise "
+        "cluster.tile_timeout_s"
+    )
+    assert sorted(result for result in results if isinstance(result, str)) == sorted(
+        {*jobs} - {"sleep", "hold"}
+    )
+    assert sorted(result for result in results if isinstance(result, tuple)) == [
+        ("hold", reason), ("sleep", reason),
+    ]  # fmt: skip
+    assert time.monotonic() - start < 120
