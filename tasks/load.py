@@ -24,7 +24,7 @@ from flexroad.tasks.types import Bools, Floats, Source, TileData
 if TYPE_CHECKING:
     from flexroad.tasks.io.raster import RasterWindow, Unreadable
 
-VERSION = 2
+VERSION = 3
 
 HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")
@@ -33,6 +33,9 @@ READS = HEIGHTS + CLASSES
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights outside this range are taken as undeclared nodata."""
+
+MAX_CELLS = 25_000_000
+"""Largest number of cells of a tile with its halo: 0.2 GB for each of several layers."""
 
 METRE: Unit = ("metre", 1.0)
 
@@ -93,6 +96,11 @@ def load(tile: Tile, options: Options) -> TileData:
     from flexroad.catalog.headers.rasters import quiet
 
     grid = tile.grid.buffered(options.halo_m)
+    if grid.width * grid.height > MAX_CELLS:
+        raise TaskError(
+            f"the tile has {grid.width} x {grid.height} cells with its halo, more than {MAX_CELLS:,}; "
+            "catalog smaller tiles (--tile-size)"
+        )
     tile = tile.within(grid.bounds)
     core = grid.window(tile.grid)
     with quiet():
@@ -197,12 +205,14 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
     values = np.full(grid.shape, np.nan)
     reached = np.zeros(grid.shape, bool)
     broken: list[Unreadable] = []
-    resampling = Resampling.bilinear if layer.name in HEIGHTS else Resampling.nearest
+    heights = layer.name in HEIGHTS
+    resampling = Resampling.bilinear if heights else Resampling.nearest
+    together = Resampling.average if heights else Resampling.mode
     patches: list[RasterWindow] = []
     absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs)
+            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs, together)
         except Unreadable as error:
             broken.append(error)
             continue
@@ -213,7 +223,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
         if patch is None:
             continue
         reached |= _reached(patch, grid)
-        if layer.name in HEIGHTS:
+        if heights:
             patch, absurd = _metres(patch)
             absurd_cells += absurd
         patches.append(patch)
@@ -222,7 +232,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
             break
     notes = [
         f"{layer.name} resampled: {reason}"
-        for reason in dict.fromkeys(misalignment(p.lattice, grid) for p in patches)
+        for reason in dict.fromkeys(misalignment(p.file_lattice, grid) for p in patches)
         if reason
     ]
     notes += [f"a file that the tile does not need was left out: {error}" for error in broken]

@@ -83,6 +83,24 @@ class RasterGrid:
         cols = slice(max(0, math.floor(west)), min(self.width, math.ceil(east)))
         return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
 
+    def step_for(self, grid: Grid) -> int:
+        """Return the number of cells along an axis to be read as one, so that 2 to 4 lie in a grid's cell."""
+        return max(1, math.floor(grid.cell / max(self.dx, self.dy) / 2 + 1e-9))
+
+    def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
+        """Return the slices grown to steps that are counted from the file's corner.
+
+        Cells are then read together in the same way in every window.
+        """
+        grown = (slice(part.start // step * step, -(-part.stop // step) * step) for part in (rows, cols))
+        tall, wide = grown
+        return slice(tall.start, min(tall.stop, self.height)), slice(wide.start, min(wide.stop, self.width))
+
+    def coarser(self, step: int) -> RasterGrid:
+        """Return the lattice of cells read together; a last step with fewer cells counts as a whole one."""
+        width, height = -(-self.width // step), -(-self.height // step)
+        return RasterGrid(self.west, self.north, self.dx * step, self.dy * step, width, height)
+
     def cut(self, rows: slice, cols: slice) -> RasterGrid:
         """Return the lattice of a part; rows from the north."""
         west, north = self.west + cols.start * self.dx, self.north - rows.start * self.dy
@@ -113,10 +131,28 @@ class RasterWindow:
     """Unit of the values declared by the band, or empty."""
     crs: str | None
     """CRS of the file, else the one given by the caller."""
+    step: int = 1
+    """Number of cells of the file along an axis that were read as one."""
+
+    @property
+    def file_lattice(self) -> RasterGrid:
+        """The lattice of the file's own cells in the window."""
+        grid, n = self.lattice, self.step
+        return RasterGrid(grid.west, grid.north, grid.dx / n, grid.dy / n, grid.width * n, grid.height * n)
 
 
-def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterWindow | None:
+def read_window(
+    path: Location,
+    name: str,
+    grid: Grid,
+    core: Grid,
+    crs: str | None,
+    resampling: Resampling = Resampling.average,
+) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
+
+    Of a file with many cells in one cell of the grid, several are read as one, through the file's overviews
+    where it has them, so that the memory does not depend on the resolution of the file.
 
     Parameters
     ----------
@@ -130,6 +166,8 @@ def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | No
         Position of a file without georeference, if it has as many cells.
     crs : str, optional
         CRS of a file without one.
+    resampling : Resampling
+        How several cells are read as one: ``average`` of heights, ``mode`` of classes.
 
     Returns
     -------
@@ -148,9 +186,11 @@ def read_window(path: Location, name: str, grid: Grid, core: Grid, crs: str | No
         slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:
             return None
-        values, unit = _values(src, lattice, *slices), src.units[0] or ""
+        step = lattice.step_for(grid)
+        slices = lattice.whole_steps(step, *slices)
+        values, unit = _values(src, lattice, step, slices, resampling), src.units[0] or ""
         crs = src.crs.to_wkt() if src.crs else crs
-    return RasterWindow(name, str(path), values, lattice.cut(*slices), unit, crs)
+    return RasterWindow(name, str(path), values, lattice.cut(*slices).coarser(step), unit, crs, step)
 
 
 @contextmanager
@@ -268,12 +308,33 @@ def _overlap(a: Bounds, b: Bounds) -> bool:
     return not (a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1])
 
 
-def _values(src: Any, lattice: RasterGrid, rows: slice, cols: slice) -> Floats:
+def _values(
+    src: Any, lattice: RasterGrid, step: int, slices: tuple[slice, slice], resampling: Resampling
+) -> Floats:
+    """Return the cells of a window, ``step`` x ``step`` of them as one; rows from the north."""
+    tall, wide = ([part for part in _whole_and_rest(part, step) if part] for part in slices)
+    return np.block([[_part(src, lattice, step, rows, cols, resampling) for cols in wide] for rows in tall])
+
+
+def _whole_and_rest(part: slice, step: int) -> tuple[slice | None, slice | None]:
+    """Return the whole steps of a slice, and the last step if it has fewer cells, at the end of the file."""
+    end = part.stop - (part.stop - part.start) % step
+    whole, rest = slice(part.start, end), slice(end, part.stop)
+    return (whole if whole.stop > whole.start else None), (rest if rest.stop > rest.start else None)
+
+
+def _part(
+    src: Any, lattice: RasterGrid, step: int, rows: slice, cols: slice, resampling: Resampling
+) -> Floats:
     top = lattice.height - rows.stop if lattice.northward else rows.start
-    window = Window(cols.start, top, cols.stop - cols.start, rows.stop - rows.start)
-    values: Floats = src.read(1, window=window).astype(np.float64)
+    tall, wide = rows.stop - rows.start, cols.stop - cols.start
+    how: dict[str, Any] = {"window": Window(cols.start, top, wide, tall)}
+    if step > 1:
+        how |= {"out_shape": (-(-tall // step), -(-wide // step)), "resampling": resampling}
+    values: Floats = src.read(1, **how).astype(np.float64)
     if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
         values = values * src.scales[0] + src.offsets[0]
     if MaskFlags.all_valid not in src.mask_flag_enums[0]:
-        values[src.read_masks(1, window=window) == 0] = np.nan
+        how |= {"resampling": Resampling.mode} if step > 1 else {}
+        values[src.read_masks(1, **how) == 0] = np.nan
     return values[::-1] if lattice.northward else values

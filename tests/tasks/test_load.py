@@ -8,11 +8,13 @@ from affine import Affine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.sources import rasters
 from flexroad.tasks import TaskError
+from flexroad.tasks.io.raster import misalignment, read_window, resample_to
 from flexroad.tasks.load import Options, load, load_border
 from tests.make_rasters import UTM, write, write_xyz
 
@@ -440,3 +442,46 @@ def test_load_border_resamples_as_for_the_tile(tmp_path, cell, shift):
         ours, theirs = (data.dtm[data.grid.window(common)] for data in (whole, around))
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
         assert np.isfinite(ours).any()
+
+
+@pytest.mark.parametrize("nodata", [None, -9999.0])
+@pytest.mark.parametrize("cell", [0.25, 0.1, 0.04])
+def test_load_fine_file_is_read_with_few_cells_in_one(tmp_path, cell, nodata):
+    """The mean of a plane with noise, the same from two windows; a file has no whole number of steps."""
+    count = int(61.5 / cell)
+    steps = (np.arange(count) + 0.5) * cell
+    heights = 200 + 0.05 * steps - 0.03 * steps[:, None]
+    heights += np.random.default_rng(0).normal(0, 0.1, heights.shape)
+    void = slice(round(20 / cell), round(30 / cell))
+    if nodata is not None:
+        heights[void, void] = nodata
+    write(tmp_path / "fine.tif", heights.astype(np.float32), 500000, 5600100, cell=cell, nodata=nodata)
+    grids = Grid(UTM, 500000.0, 5600100.0, 1.0, 61, 61), Grid(UTM, 500007.0, 5600081.0, 1.0, 40, 40)
+    loaded = []
+    for grid in grids:
+        patch = read_window(tmp_path / "fine.tif", "dsm fine.tif", grid, grid, None)
+        assert grid.width * 2 <= patch.values.shape[1] <= grid.width * 4 + 8
+        assert misalignment(patch.file_lattice, grid) == f"its cells are {cell:g} m, the tile's 1 m"
+        loaded.append(resample_to(patch, grid, Resampling.bilinear))
+    whole, part = loaded
+    np.testing.assert_allclose(whole[19:59, 7:47], part, rtol=0, atol=1e-9)
+    east, north = np.meshgrid(grids[0].eastings - 500000, 5600100 - grids[0].northings)
+    off = whole - (200 + 0.05 * east - 0.03 * north)
+    assert np.nanstd(off) < 0.1 * cell
+    assert abs(np.nanmean(off)) < 0.01
+    assert np.isnan(whole).sum() == (100 if nodata is not None else 0)
+
+
+def test_load_fine_mask_takes_most_frequent_class(tmp_path):
+    classes = np.kron(np.random.default_rng(0).integers(0, 5, (20, 20)), np.ones((8, 8))).astype(np.uint8)
+    write(tmp_path / "mask.tif", classes, 500000, 5600100, cell=0.125)
+    grid = Grid(UTM, 500000.0, 5600100.0, 1.0, 20, 20)
+    patch = read_window(tmp_path / "mask.tif", "mask", grid, grid, None, Resampling.mode)
+    assert patch.step == 4
+    np.testing.assert_array_equal(resample_to(patch, grid, Resampling.nearest), classes[::8, ::8])
+
+
+def test_load_tile_of_too_many_cells_fails_before_reading(tmp_path, dtm):
+    huge = Grid(UTM, 295500.0, 5629480.0, 1.0, 30_000, 30_000)
+    with pytest.raises(TaskError, match=r"30000 x 30000 cells with its halo, more than 25,000,000; catalog"):
+        load(tile(tmp_path, grid=huge), Options())
