@@ -10,8 +10,8 @@ import numpy as np
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.database import NAME as DATABASE
-from flexroad.pipeline.store.database import RunDatabase, TileState
+from flexroad.pipeline.run.status import open_database, recorded
+from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.records import TileRecord
 
 NAME = "tiles.geojson"
@@ -32,18 +32,10 @@ def write_states(run: Run, where: Location) -> None:
     """
     from geopandas import GeoDataFrame
 
-    missing = {tile.id: tile for tile in run.catalog.tiles}
-    with RunDatabase.open_readonly(run.path / DATABASE) as database:
-        rows = [
-            _row(missing.pop(tile_id), state, record, run.config.export.variants[0])
-            for tile_id, state, record in database.entries()
-            if tile_id in missing
-        ]
-    # Tiles that were added to the catalog after the last run.
-    rows += [_row(tile, "pending", None, "") for tile in missing.values()]
-    table = GeoDataFrame(
-        [row for _, row in rows], columns=COLUMNS, dtype=object, geometry=outlines([tile for tile, _ in rows])
-    )
+    variant = run.config.export.variants[0]
+    with open_database(run) as database:
+        rows = [_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)]
+    table = GeoDataFrame(rows, columns=COLUMNS, dtype=object, geometry=outlines(run.catalog.tiles))
     write(where, table.set_index("id", drop=False).to_json().encode())
 
 
@@ -64,10 +56,8 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     return transform(shapes, lambda degrees: degrees.round(7))
 
 
-def _row(
-    tile: Tile, state: TileState, record: TileRecord | None, variant: str
-) -> tuple[Tile, dict[str, Any]]:
-    row: dict[str, Any] = {"id": tile.id, "state": state}
+def _row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:
+    row: dict[str, Any] = {"id": tile_id, "state": state}
     # The record of a pending tile belongs to earlier files or options.
     if record is not None and state != "pending":
         row |= {"seconds": round(record.seconds, 3), "finished": record.finished or None}
@@ -76,4 +66,4 @@ def _row(
         for metrics in record.rows:
             if metrics["variant"] == variant:
                 row["error_estimate_m"] = metrics.get("error_estimate_m")
-    return tile, row
+    return row

@@ -21,10 +21,8 @@ from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
-from flexroad.pipeline.run.status import tile_statuses
+from flexroad.pipeline.run.status import open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
-from flexroad.pipeline.store.database import NAME as DATABASE
-from flexroad.pipeline.store.database import RunDatabase
 from flexroad.pipeline.store.products import safe_name
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import SUFFIXES
@@ -139,9 +137,8 @@ def _needed(runs: Iterable[Run]) -> set[bytes]:
     needed: set[bytes] = set()
     for run in runs:
         check_models(run.config)
-        with RunDatabase.open_readonly(run.path / DATABASE) as database:
-            for status in tile_statuses(run, database):
-                needed |= {bytes.fromhex(name) for name, node in status.graph.nodes.items() if node.stored}
+        for status in peek_statuses(run, run.catalog.tiles):
+            needed |= {bytes.fromhex(name) for name, node in status.graph.nodes.items() if node.stored}
     return needed
 
 
@@ -159,7 +156,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
     tiles = {safe_name(tile.id): tile for tile in run.catalog.tiles}
     current = _ends(run.config.export.variants, run.config.export.formats)
     ever = _ends(run.exported, SUFFIXES) | current
-    with RunDatabase.open_readonly(run.path / DATABASE) as database:
+    with open_database(run) as database:
         for folder, files in _folders(run.path / "tiles"):
             yield from _temporary(folder, files)
             products = [folder.name + end for end in sorted(ever) if folder.name + end in files]
@@ -168,7 +165,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
                 # Markers come last, so that an interrupted deletion is continued by the next clean.
                 markers = [name for name in (DONE, FAILED) if name in files]
                 yield from (Garbage("tiles", folder / name, files[name]) for name in [*products, *markers])
-            elif entry := database.get(tile.id):
+            elif entry := database.lookup(tile.id):
                 kept = {folder.name + end for end in current} | entry.sizes.keys()
                 yield from (
                     Garbage("products", folder / name, files[name]) for name in products if name not in kept

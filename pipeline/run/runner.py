@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from array import array
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,10 +17,9 @@ from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_models
-from flexroad.pipeline.run.status import tile_statuses
+from flexroad.pipeline.run.status import open_database, recorded_summary, tile_states, tile_statuses
 from flexroad.pipeline.run.summary import Summary, summarise, write_summary
 from flexroad.pipeline.store.artefacts import check_writable
-from flexroad.pipeline.store.database import NAME as DATABASE
 from flexroad.pipeline.store.database import RunDatabase, TileState
 from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.store.tables import write_tables
@@ -57,7 +57,8 @@ def run_tiles(
     watch : callable
         Receives every result when it is available, including those of cached tiles.
     verify : bool
-        Compare all products with their checksums, and process tiles with a difference again.
+        Compare all products with their checksums, process tiles with a difference again, and make the tables
+        from the markers, whatever the database has.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def run_tiles(
     """
     check_models(run.config)
     check_tiles(run.config, run.catalog)
-    with RunDatabase.open(run.path / DATABASE) as database, EventLog(run.path) as log:
+    with open_database(run, write=True) as database, EventLog(run.path) as log:
         log.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
         close = partial(_close, run, database, log, utc_now(), time.perf_counter())
         plan = None
@@ -102,7 +103,7 @@ def plan_run(
         If each of several tiles lacks a file.
     """
     todo, states, new, changed, incomplete = array("L"), list[TileState](), 0, 0, 0
-    for position, status in enumerate(tile_statuses(run, database)):
+    for position, status in enumerate(tile_statuses(run, database, from_markers=verify)):
         incomplete += bool(own_files_missing(status.graph))
         selected = only(run.catalog.tiles[position])
         if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
@@ -184,7 +185,11 @@ def _close(
     """
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
-    summary = replace(summarise(len(run.catalog.tiles), database), interrupted=interrupted, refused=refused)
+    summary = replace(
+        _final_summary(run, database, start, plan is not None, interrupted),
+        interrupted=interrupted,
+        refused=refused,
+    )
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         write_tables(run.path, database.rows(), database.failures())
@@ -193,6 +198,29 @@ def _close(
     about = {"start": start, "end": utc_now(), "config": run.config.name, "origin": list(run.origin)}
     write_summary(run.path, summary, **about)
     return summary
+
+
+def _final_summary(run: Run, database: RunDatabase, start: str, planned: bool, interrupted: bool) -> Summary:
+    """Return the summary at the end of a run, of which ``start`` is the time."""
+    if planned:
+        _repair(run, database, start)
+    elif interrupted and database.listed(tile.id for tile in run.catalog.tiles) is None:
+        # The run is to end soon: checking the tiles would take as long as the start that was interrupted.
+        return summarise(len(run.catalog.tiles), Counter(), ())
+    return recorded_summary(run, database, start)[0]
+
+
+def _repair(run: Run, database: RunDatabase, start: str) -> None:
+    """Make the list of tiles anew if it was damaged during the run."""
+    if database.listed(tile.id for tile in run.catalog.tiles) is not None:
+        return
+    states: list[tuple[str, TileState]] = []
+    for status, state in tile_states(run, database, start):
+        if status.last_record and status.from_marker:
+            database.record(status.last_record)
+        states.append((status.graph.tile.id, state))
+    database.flush()
+    database.set_states(states)
 
 
 def _lost(job: TileJob, reason: str) -> TileResult:

@@ -12,16 +12,17 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import repeat
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import FileStat, Location, is_remote, listing, read
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
-from flexroad.pipeline.run.lock import Owner
+from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise
-from flexroad.pipeline.store.database import NAME, RunDatabase
+from flexroad.pipeline.store.database import NAME, RunDatabase, TileState
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
     DONE,
@@ -84,24 +85,29 @@ class Folders:
 
 def peek_statuses(run: Run, tiles: Iterable[Tile]) -> Iterator[TileStatus]:
     """Yield the current state of tiles of a run; opens the database read-only."""
-    with RunDatabase.open_readonly(run.path / NAME) as database:
+    with open_database(run) as database:
         yield from tile_statuses(run, database, tiles)
 
 
 def tile_statuses(
-    run: Run, database: RunDatabase, tiles: Iterable[Tile] | None = None
+    run: Run, database: RunDatabase, tiles: Iterable[Tile] | None = None, from_markers: bool = False
 ) -> Iterator[TileStatus]:
-    """Yield the current state of tiles of a run, by default of all, in the catalog's order; read-only."""
+    """Yield the current state of tiles of a run, by default of all, in the catalog's order; read-only.
+
+    With ``from_markers`` all markers are read, also those that the database has.
+    """
     folders, stat_file = Folders(run.path), run.stat_cache()
     for tile in run.catalog.tiles if tiles is None else tiles:
-        yield _status(run, tile, database, folders(tile.id), stat_file)
+        entry = database.get(tile.id)
+        # A failure on a full disk has no marker, only a database entry.
+        known = None if from_markers and entry and entry.marker else entry
+        yield _status(run, tile, known, folders(tile.id), stat_file)
 
 
 def _status(
-    run: Run, tile: Tile, database: RunDatabase, files: dict[str, FileStat], stat_file: Stat
+    run: Run, tile: Tile, entry: TileRecord | None, files: dict[str, FileStat], stat_file: Stat
 ) -> TileStatus:
-    """Return the state of one tile whose folder has ``files``."""
-    entry = database.get(tile.id)
+    """Return the state of one tile that has this entry in the database and whose folder has ``files``."""
     record = _last_record(run.folder(tile.id).path, entry, files)
     graph = run.graph(tile, stat_file)
     current, from_marker = _matches(record, graph, files), record is not entry
@@ -136,32 +142,98 @@ def _matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileS
     return all(name in files and files[name].size == size for name, size in record.sizes.items())
 
 
+def open_database(run: Run, write: bool = False) -> RunDatabase:
+    """Open the run's database; entries that it lacks are read from the markers.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    opened = RunDatabase.open if write else RunDatabase.open_readonly
+    return opened(run.path / NAME, partial(_read_marker, run))
+
+
+def _read_marker(run: Run, tile_id: str) -> TileRecord | None:
+    folder = run.folder(tile_id).path
+    return _last_record(folder, None, listing(folder))
+
+
+def tile_states(
+    run: Run, database: RunDatabase, since: str | None = None
+) -> Iterator[tuple[TileStatus, TileState]]:
+    """Yield the status and the state of every tile; checks every tile, its sources and its products.
+
+    A done tile is ``cached`` if the database says so; if its list of tiles is damaged, if the tile was
+    finished before ``since``, by default the start of the last run.
+    """
+    listed = database.listed(tile.id for tile in run.catalog.tiles)
+    since = last_start(run) if since is None else since
+    states = database.states() if listed else repeat(None, len(run.catalog.tiles))
+    for status, last in zip(tile_statuses(run, database), states, strict=True):
+        if not status.done or status.last_record is None:
+            yield status, "failed" if status.failed else "pending"
+            continue
+        cached = last == "cached" if last else status.last_record.finished < since
+        yield status, "cached" if cached else "done"
+
+
+def last_start(run: Run) -> str:
+    """Return when the active run, or else the last one, started (ISO 8601, UTC); empty if unknown."""
+    holder = owner(run.path)
+    start = holder.since if holder else read_summary(run.path).get("start")
+    return start if isinstance(start, str) else ""
+
+
+def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, TileRecord | None]]:
+    """Yield id, state and record of every tile: from the database, or if that is damaged by `tile_states`."""
+    if database.listed(tile.id for tile in run.catalog.tiles):
+        yield from database.entries()
+        return
+    for status, state in tile_states(run, database):
+        yield status.graph.tile.id, state, status.last_record
+
+
 def summary(run: Run) -> Summary:
     """Return the current summary of a run; checks every tile, its sources and its products."""
-    counts: Counter[str] = Counter()
-    failures: list[Failure] = []
-    with RunDatabase.open_readonly(run.path / NAME) as database:
-        for status in tile_statuses(run, database):
-            counts["done"] += status.done
-            counts["failed"] += status.failed
-            counts["cached"] += status.done and database.state(status.graph.tile.id) == "cached"
-            if status.failed and status.last_record and len(failures) < MAX_FAILURES:
-                failures += status.last_record.failures
-    tiles, done, failed = len(run.catalog.tiles), counts["done"], counts["failed"]
-    current = Summary(tiles, done, failed, counts["cached"], tiles - done - failed, failures=tuple(failures))
+    with open_database(run) as database:
+        current = _checked(run, database)[0]
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(current, **{name: last[name] for name in names if name in last})
 
 
+def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summary, int]:
+    """Return the summary of a run and the number of tiles finished since a time (ISO 8601, UTC).
+
+    They are read from the database; only if it is damaged or has other tiles, every tile is checked.
+    """
+    listed = database.listed((tile.id for tile in run.catalog.tiles), since)
+    if listed is None:
+        return _checked(run, database, since)
+    return summarise(len(run.catalog.tiles), listed.counts, database.failures()), listed.finished
+
+
+def _checked(run: Run, database: RunDatabase, since: str | None = None) -> tuple[Summary, int]:
+    """Return what `recorded_summary` returns, from the tiles' folders and source files."""
+    counts, failures, finished = Counter[TileState](), list[Failure](), 0
+    for status, state in tile_states(run, database, since):
+        counts[state] += 1
+        record = status.last_record
+        finished += record is not None and record.finished >= (since or "")
+        if state == "failed" and record and len(failures) < MAX_FAILURES:
+            failures += record.failures
+    return summarise(len(run.catalog.tiles), counts, failures), finished
+
+
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:
     """Return the summary of an active run and its rate as text, ``""`` if no tile is finished yet.
 
-    Only the database is read, so it can be repeated every few seconds. ``owner`` is the process that runs it.
+    Only the database is read, so it can be repeated every few seconds; every tile is checked only if the
+    database is damaged or does not have the catalog's tiles yet. ``owner`` is the process that runs it.
     """
-    with RunDatabase.open_readonly(run.path / NAME) as database:
-        summary = summarise(len(run.catalog.tiles), database)
-        finished = database.finished_since(owner.since)
+    with open_database(run) as database:
+        summary, finished = recorded_summary(run, database, owner.since)
     minutes = (time.time() - datetime.fromisoformat(owner.since).timestamp()) / 60
     if not finished or minutes <= 0:
         return summary, ""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Any
 
 from flexroad.catalog.storage.paths import Location, read, write
-from flexroad.pipeline.store.database import RunDatabase
+from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.records import Failure
 
 NAME = "summary.json"
@@ -53,13 +55,11 @@ class Summary:
         return 2 if self.refused else int(self.failed + self.pending > 0)
 
 
-def summarise(tiles: int, database: RunDatabase) -> Summary:
-    """Return the summary of a run with ``tiles`` tiles from the database, without checking any files."""
-    counts = database.counts()
-    done = counts["done"] + counts["cached"]
-    failures = tuple(islice(database.failures(), MAX_FAILURES))
+def summarise(tiles: int, counts: Counter[TileState], failures: Iterable[Failure]) -> Summary:
+    """Return the summary of a run with ``tiles`` tiles from the number of tiles in each state."""
+    done, first = counts["done"] + counts["cached"], tuple(islice(failures, MAX_FAILURES))
     pending = tiles - done - counts["failed"]
-    return Summary(tiles, done, counts["failed"], counts["cached"], pending, failures=failures)
+    return Summary(tiles, done, counts["failed"], counts["cached"], pending, failures=first)
 
 
 def write_summary(run: Location, summary: Summary, **about: Any) -> None:

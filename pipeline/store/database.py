@@ -6,59 +6,90 @@ One run writes the database; other processes may read it at the same time. Table
 keeps read locks short and memory use small. ::
 
     entry   one row per tile that was ever processed: `TileRecord`
-    asked   the tiles of the catalog, in its order, each with its state
+    asked   the tiles of the catalog, in its order, each with its state and the checksum of its entry
+    total   the checksums of all rows of `asked`, combined by exclusive or
+
+Every row has a checksum, and nothing is returned that does not agree with it. A damaged, lost or old entry is
+noticed by its row in `asked`, a damaged, lost or old row of `asked` by the total (`RunDatabase.listed`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
-import os
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import reduce
+from operator import xor
+from typing import Any, Literal, TypeVar
 
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord
+from flexroad.pipeline.store.sqlite_file import (
+    Damage,
+    create,
+    is_damage,
+    open_readonly,
+    open_writable,
+    os_error,
+)
 
 NAME = "database.sqlite"
-VERSION = 1
+VERSION = 2
 TileState = Literal["cached", "done", "failed", "pending"]
 """cached: already done when the last run started; pending: no result for the current files and options."""
+Recover = Callable[[str], TileRecord | None]
+"""Returns the record in a tile's marker, by the tile's id."""
 
 PAGE = 500
 """Rows read at a time."""
-WAIT_S = 60.0
-"""Longest wait for another process to release its lock on the file (s)."""
 FLUSH_S = 1.0
 """Interval between writes of recorded tiles (s)."""
-FIELDS = "tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker"
-SCHEMA = f"""
-CREATE TABLE entry (tile TEXT PRIMARY KEY, state TEXT, fingerprint TEXT, rows TEXT, failures TEXT,
-                    sources TEXT, sizes TEXT, finished TEXT, seconds REAL, marker TEXT);
-CREATE TABLE asked (position INTEGER PRIMARY KEY, tile TEXT UNIQUE, standing TEXT);
-PRAGMA user_version = {VERSION};
-"""
+CHECKSUM_BYTES = 16
+TABLES = (
+    "CREATE TABLE entry (tile TEXT PRIMARY KEY, finished TEXT, record TEXT, checksum BLOB)",
+    "CREATE TABLE asked (position INTEGER PRIMARY KEY, tile TEXT UNIQUE, standing TEXT, finished TEXT,"
+    " record BLOB, checksum BLOB)",
+    "CREATE TABLE total (checksum BLOB)",
+)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Counts over the tiles of the last run."""
+
+    counts: Counter[TileState] = field(default_factory=Counter)
+    finished: int = 0
+    """Number of tiles finished (done or failed) since the time asked for."""
 
 
 class RunDatabase:
     """Records and states of a run's tiles; a context manager that writes all pending records on exit."""
 
-    def __init__(self, connection: sqlite3.Connection, staged: StagedFile) -> None:
+    def __init__(self, connection: sqlite3.Connection, staged: StagedFile, recover: Recover) -> None:
         self._connection = connection
         self._staged = staged
+        self._recover = recover
         self._pending: dict[str, TileRecord] = {}
         self._flushed = time.monotonic()
 
     @classmethod
-    def open(cls, path: Location) -> RunDatabase:
+    def open(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
         """Open a database for writing; it is created empty if it is missing or damaged.
+
+        Parameters
+        ----------
+        path : Location
+            The file.
+        recover : callable
+            Reads the marker of a tile whose entry is lost or damaged.
 
         Raises
         ------
@@ -68,27 +99,17 @@ class RunDatabase:
         staged = StagedFile(path)
         staged.fetch()
         try:
-            connection = _open_valid(staged.path, "rwc")
-            if connection is None:
-                staged.path.unlink(missing_ok=True)
-                connection = _connect(staged.path, "rwc")
-                connection.executescript(SCHEMA)
-        except sqlite3.Error as error:
-            raise _os_error(error, path) from error
-        return cls(connection, staged)
+            connection = open_writable(staged.path, TABLES, VERSION)
+        except Damage as error:
+            raise os_error(error, path) from error
+        return cls(connection, staged, recover)
 
     @classmethod
-    def open_readonly(cls, path: Location) -> RunDatabase:
+    def open_readonly(cls, path: Location, recover: Recover = lambda tile_id: None) -> RunDatabase:
         """Open a database for reading, also while a run writes it; empty if it is missing or damaged."""
         staged = StagedFile(path, writable=False)
         staged.fetch()
-        connection = None
-        with contextlib.suppress(sqlite3.Error):
-            connection = _open_valid(staged.path, "ro", check=False)
-        if connection is None:
-            connection = sqlite3.connect(":memory:")
-            connection.executescript(SCHEMA)
-        return cls(connection, staged)
+        return cls(open_readonly(staged.path, TABLES, VERSION), staged, recover)
 
     def __enter__(self) -> RunDatabase:
         return self
@@ -125,14 +146,8 @@ class RunDatabase:
         OSError
             If the disk is full.
         """
-        with self._writing():
-            self._connection.execute("DELETE FROM asked")
-            self._connection.executemany(
-                "INSERT INTO asked (tile, standing) VALUES (?, ?)",
-                tiles,
-            )
-            deleted = self._connection.execute("DELETE FROM entry WHERE tile NOT IN (SELECT tile FROM asked)")
-        return deleted.rowcount
+        states = list(tiles)
+        return self._write(lambda: self._set_states(states))
 
     def record(self, entry: TileRecord) -> None:
         """Add a tile's record; it is written within seconds, on a full disk as soon as there is space."""
@@ -152,155 +167,223 @@ class RunDatabase:
             If the disk is full.
         """
         self._flushed = time.monotonic()
-        if not self._pending:
-            return
-        entries = list(self._pending.values())
-        with self._writing():
-            self._connection.executemany(
-                f"INSERT OR REPLACE INTO entry ({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                map(_to_row, entries),
-            )
-            self._connection.executemany(
-                "UPDATE asked SET standing = ? WHERE tile = ?",
-                [(entry.state, entry.tile_id) for entry in entries],
-            )
-        self._pending.clear()
+        if self._pending:
+            self._write(self._write_pending)
+            self._pending.clear()
 
     def get(self, tile_id: str) -> TileRecord | None:
-        """Return a tile's record, None if it has none."""
+        """Return a tile's record, None if it has none or it is damaged."""
         if tile_id in self._pending:
             return self._pending[tile_id]
-        row = self._row(f"SELECT {FIELDS} FROM entry WHERE tile = ?", tile_id)
-        return _from_row(row) if row else None
+        row = self._row("SELECT finished, record, checksum FROM entry WHERE tile = ?", tile_id)
+        return _record(tile_id, *row) if row else None
 
-    def counts(self) -> Counter[TileState]:
-        """Return the number of tiles in each state, as set by the last run."""
+    def lookup(self, tile_id: str) -> TileRecord | None:
+        """Return a tile's record, from its marker if the database has none."""
+        return self.get(tile_id) or self._recover(tile_id)
+
+    def listed(self, tiles: Iterable[str], since: str = "") -> Listed | None:
+        """Return the counts over the list of tiles; None if it is damaged or has other tiles.
+
+        Parameters
+        ----------
+        tiles : iterable of str
+            The ids that the list should have, in its order.
+        since : str
+            Count the tiles finished since this time (ISO 8601, UTC).
+        """
         self.flush()
-        return Counter(
-            dict(self._connection.execute("SELECT standing, count(*) FROM asked GROUP BY standing"))
+        counts, finished = Counter[TileState](), 0
+        combined, total = 0, bytes(CHECKSUM_BYTES)
+        # One query sees one state of the file, also while a run writes it.
+        query = (
+            "SELECT position, tile, standing, finished, record, checksum, (SELECT checksum FROM total)"
+            " FROM asked ORDER BY position"
         )
+        try:
+            rows = self._connection.execute(query)
+            for number, (tile, row) in enumerate(zip(tiles, rows, strict=True), 1):
+                *fields, checksum, total = row
+                if fields[:2] != [number, tile] or digest(*fields) != checksum:
+                    return None
+                counts[fields[2]] += 1
+                finished += bool(fields[3]) and str(fields[3]) >= since
+                combined ^= int.from_bytes(checksum)
+        except (*Damage, ValueError):
+            return None
+        return Listed(counts, finished) if total == _bytes(combined) else None
 
-    def finished_since(self, start: str) -> int:
-        """Return the number of tiles finished (done or failed) since a time (ISO 8601, UTC)."""
-        self.flush()
-        row = self._row("SELECT count(*) FROM entry WHERE finished >= ?", start)
-        return int(row[0]) if row else 0
+    def states(self) -> Iterator[TileState]:
+        """Yield the state of every tile as set by the last run, in the catalog's order.
 
-    def state(self, tile_id: str) -> TileState | None:
-        """Return a tile's state as set by the last run, None if the tile was not part of it."""
-        row = self._row("SELECT standing FROM asked WHERE tile = ?", tile_id)
-        return row[0] if row else None
+        Raises
+        ------
+        OSError
+            As `entries`.
+        """
+        for row in self._asked():
+            yield row[2]
 
     def entries(self) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        """Yield id, state and record (None if there is none) of every tile, in the catalog's order."""
-        fields = ", ".join(f"entry.{name.strip()}" for name in FIELDS.split(","))
-        for _, tile, state, *row in self._pages(
-            f"SELECT position, asked.tile, standing, {fields} FROM asked LEFT JOIN entry USING (tile)"
-            " WHERE position > ?"
-        ):
-            yield tile, state, _from_row(row) if row[0] else None
+        """Yield id, state and record (None if there is none) of every tile, in the catalog's order.
+
+        A record that is lost or damaged is read from the tile's marker.
+
+        Raises
+        ------
+        OSError
+            If the list of tiles is damaged, which `listed` tells.
+        """
+        return self._entries("")
 
     def rows(self) -> Iterator[MetricsRow]:
-        """Yield the metrics rows of all tiles that are not pending, in the catalog's order."""
-        for _, rows in self._pages(
-            "SELECT position, rows FROM asked JOIN entry USING (tile)"
-            " WHERE position > ? AND standing != 'pending'"
-        ):
-            yield from json.loads(rows)
+        """Yield the metrics rows of all tiles that are not pending, in the catalog's order.
+
+        Raises
+        ------
+        OSError
+            As `entries`.
+        """
+        for _, _, record in self._entries("AND standing != 'pending'"):
+            yield from record.rows if record else ()
 
     def failures(self) -> Iterator[Failure]:
-        """Yield the failures of all failed tiles, in the catalog's order."""
-        for _, failures in self._pages(
-            "SELECT position, failures FROM asked JOIN entry USING (tile)"
-            " WHERE position > ? AND standing = 'failed'"
-        ):
-            yield from (Failure(**failure) for failure in json.loads(failures))
+        """Yield the failures of all failed tiles, in the catalog's order.
+
+        Raises
+        ------
+        OSError
+            As `entries`.
+        """
+        for _, _, record in self._entries("AND standing = 'failed'"):
+            yield from record.failures if record else ()
+
+    def _entries(self, condition: str) -> Iterator[tuple[str, TileState, TileRecord | None]]:
+        for _, tile, state, _, link, _ in self._asked(condition):
+            # No join: where an entry cannot be read, the rest of the page can.
+            row = self._row("SELECT finished, record FROM entry WHERE tile = ?", tile) if link else None
+            record = _record(tile, row[0], row[1], link) if row else None
+            yield tile, state, self._recover(tile) if record is None and state != "pending" else record
+
+    def _asked(self, condition: str = "") -> Iterator[Sequence[Any]]:
+        """Yield rows of `asked`, read in pages."""
+        self.flush()
+        query = (
+            "SELECT position, tile, standing, finished, record, checksum FROM asked"
+            f" WHERE position > ? {condition} ORDER BY position LIMIT {PAGE}"
+        )
+        last = 0
+        while page := self._page(query, last):
+            for row in page:
+                if digest(*row[:5]) != row[5] or row[0] <= last:
+                    raise OSError(errno.EIO, "the list of tiles is damaged", str(self._staged.where))
+                last = row[0]
+                yield row
+
+    def _page(self, query: str, last: int) -> list[Sequence[Any]]:
+        try:
+            return self._connection.execute(query, (last,)).fetchall()
+        except Damage as error:
+            raise os_error(error, self._staged.where) from error
 
     def _row(self, query: str, value: str) -> Sequence[Any] | None:
         """Return the first row of a query, None if there is none or the database is damaged."""
-        with contextlib.suppress(sqlite3.DatabaseError):
+        with contextlib.suppress(*Damage):
             row: Sequence[Any] | None = self._connection.execute(query, (value,)).fetchone()
             return row
         return None
 
-    def _pages(self, query: str) -> Iterator[Sequence[Any]]:
-        """Yield a query's rows in pages; column 0 is ``position``, the parameter the last position read."""
-        self.flush()
-        last = 0
-        while rows := self._connection.execute(f"{query} ORDER BY position LIMIT {PAGE}", (last,)).fetchall():
-            yield from rows
-            last = rows[-1][0]
+    def _set_states(self, tiles: Sequence[tuple[str, TileState]]) -> int:
+        execute = self._connection.execute
+        execute("DELETE FROM asked")
+        combined = 0
+        for position, (tile, state) in enumerate(tiles, 1):
+            entry = execute("SELECT finished, record, checksum FROM entry WHERE tile = ?", (tile,)).fetchone()
+            intact = entry is not None and digest(tile, *entry[:2]) == entry[2]
+            fields = (position, tile, state, *((entry[0], entry[2]) if intact else ("", b"")))
+            checksum = digest(*fields)
+            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?)", (*fields, checksum))
+            combined ^= int.from_bytes(checksum)
+        execute("DELETE FROM total")
+        execute("INSERT INTO total VALUES (?)", (_bytes(combined),))
+        others = "FROM entry WHERE tile NOT IN (SELECT tile FROM asked)"
+        vanished = execute(f"SELECT tile, finished, record, checksum {others}")
+        count = sum(digest(*fields) == checksum for *fields, checksum in vanished)
+        execute(f"DELETE {others}")
+        return int(count)
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _write_pending(self) -> None:
+        changes: list[int] = []
+        for entry in self._pending.values():
+            content = vars(entry) | {"failures": [asdict(failure) for failure in entry.failures]}
+            row = (entry.tile_id, entry.finished, json.dumps(content))
+            checksum = digest(*row)
+            self._connection.execute("INSERT OR REPLACE INTO entry VALUES (?, ?, ?, ?)", (*row, checksum))
+            change = self._update_asked(entry, checksum)
+            if change is None:
+                # Without a total the list counts as damaged.
+                self._connection.execute("DELETE FROM total")
+            else:
+                changes.append(change)
+        for (total,) in self._connection.execute("SELECT checksum FROM total").fetchall():
+            if isinstance(total, bytes) and len(total) == CHECKSUM_BYTES:
+                combined = _bytes(reduce(xor, changes, int.from_bytes(total)))
+                self._connection.execute("UPDATE total SET checksum = ?", (combined,))
+
+    def _update_asked(self, entry: TileRecord, link: bytes) -> int | None:
+        """Set a tile's state and the checksum of its entry; return the change of the total.
+
+        It is None if the tile has no row, or a damaged one, which stays as it is.
+        """
+        query = "SELECT position, standing, finished, record, checksum FROM asked WHERE tile = ?"
+        row = self._connection.execute(query, (entry.tile_id,)).fetchone()
+        if row is None or digest(row[0], entry.tile_id, *row[1:4]) != row[4]:
+            return None
+        fields = (row[0], entry.tile_id, entry.state, entry.finished, link)
+        checksum = digest(*fields)
+        self._connection.execute(
+            "UPDATE asked SET standing = ?, finished = ?, record = ?, checksum = ? WHERE position = ?",
+            (*fields[2:], checksum, row[0]),
+        )
+        return int.from_bytes(row[4]) ^ int.from_bytes(checksum)
+
+    def _write(self, change: Callable[[], T]) -> T:
+        """Write in one transaction, into a new and empty file if the old one turns out to be damaged."""
         try:
+            try:
+                with self._connection:
+                    return change()
+            except Damage as error:
+                if not is_damage(error):
+                    raise
+            self._connection.close()
+            self._connection = create(self._staged.path, TABLES, VERSION)
             with self._connection:
-                yield
-        except sqlite3.Error as error:
-            raise _os_error(error, self._staged.where) from error
+                return change()
+        except Damage as error:
+            raise os_error(error, self._staged.where) from error
 
 
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=WAIT_S)
+def digest(*fields: Any) -> bytes:
+    """Return a checksum over the fields of a row and their types."""
+    return hashlib.blake2b(repr(fields).encode(), digest_size=CHECKSUM_BYTES).digest()
 
 
-def _open_valid(path: Path, mode: str, check: bool = True) -> sqlite3.Connection | None:
-    """Return a connection, None if the file is missing, of another version or (with ``check``) damaged."""
-    if not path.exists():
+def _bytes(combined: int) -> bytes:
+    return combined.to_bytes(CHECKSUM_BYTES)
+
+
+def _record(tile_id: str, finished: Any, text: Any, checksum: Any) -> TileRecord | None:
+    """Return the record in an entry's row, None if it does not have the checksum."""
+    if digest(tile_id, finished, text) != checksum:
         return None
-    connection = _connect(path, mode)
-    try:
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version == VERSION and not (check and _damaged(connection)):
-            return connection
-    except sqlite3.OperationalError:
-        # The file is locked or read-only, not damaged.
-        connection.close()
-        raise
-    except sqlite3.DatabaseError:
-        pass
-    connection.close()
-    return None
-
-
-def _damaged(connection: sqlite3.Connection) -> bool:
-    (result,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    return bool(result != "ok")
-
-
-def _os_error(error: sqlite3.Error, path: Location) -> OSError:
-    full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
-    number, reason = (errno.ENOSPC, os.strerror(errno.ENOSPC)) if full else (errno.EIO, str(error))
-    return OSError(number, reason, str(path))
-
-
-def _to_row(entry: TileRecord) -> tuple[Any, ...]:
-    return (
-        entry.tile_id,
-        entry.state,
-        entry.fingerprint,
-        json.dumps(entry.rows),
-        json.dumps([asdict(failure) for failure in entry.failures]),
-        json.dumps(entry.sources),
-        json.dumps(entry.sizes),
-        entry.finished,
-        entry.seconds,
-        json.dumps(entry.marker),
-    )
-
-
-def _from_row(row: Sequence[Any]) -> TileRecord:
-    tile, state, fingerprint, rows, failures, sources, sizes, finished, seconds, marker = row
-    file = json.loads(marker)
+    content = json.loads(text)
+    marker = content["marker"]
     return TileRecord(
-        tile,
-        state,
-        fingerprint,
-        tuple(json.loads(rows)),
-        tuple(Failure(**failure) for failure in json.loads(failures)),
-        json.loads(sources),
-        json.loads(sizes),
-        finished,
-        seconds,
-        (file[0], file[1], file[2]) if file else None,
+        **content
+        | {
+            "rows": tuple(content["rows"]),
+            "failures": tuple(Failure(**failure) for failure in content["failures"]),
+            "marker": (marker[0], marker[1], marker[2]) if marker else None,
+        }
     )

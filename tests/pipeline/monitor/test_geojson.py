@@ -17,21 +17,22 @@ from flexroad.pipeline.store.records import Failure, TileRecord
 
 @pytest.fixture
 def run(made_survey, quick_config, tmp_path) -> Run:
-    """A run of four tiles: done, cached, failed, and one that is not in the database."""
+    """A run of four tiles: done, cached, failed and pending."""
     catalog = Catalog.read(made_survey / "catalog.parquet")
     run = Run.create(tmp_path / "run", load_config(quick_config), catalog)
-    one, two, three, _ = (tile.id for tile in catalog.tiles)
+    one, two, three, four = (tile.id for tile in catalog.tiles)
+    states = [(one, "done"), (two, "cached"), (three, "failed"), (four, "pending")]
     rows = tuple(
         {"variant": name, "error_estimate_m": estimate}
         for name, estimate in (("rgt", 9.0), ("flexroad", 0.25))
     )
     with RunDatabase.open(run.path / NAME) as database:
-        database.set_states([(one, "done"), (two, "cached"), (three, "failed")])
+        database.set_states(states)
         database.record(TileRecord(one, "done", "f", rows, finished="2026-11-21T02:00:00+00:00", seconds=1.5))
         database.record(
             TileRecord(three, "failed", "f", (), (Failure(three, "load", "TaskError", "no, file"),))
         )
-        database.set_states([(one, "done"), (two, "cached"), (three, "failed")])
+        database.set_states(states)
     return run
 
 

@@ -1,11 +1,15 @@
 """The database returns what was recorded, also after damage to its file and on a full disk."""
 
+import contextlib
 import errno
+import json
+import sqlite3
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
-from flexroad.pipeline.store.database import NAME, PAGE, RunDatabase
+from flexroad.pipeline.store.database import NAME, PAGE, Listed, RunDatabase, digest
 from flexroad.pipeline.store.records import Failure, TileRecord
 
 TILES = [f"{i}_{i}" for i in range(2 * PAGE + 7)]
@@ -46,7 +50,9 @@ def test_recorded_tiles_are_read_in_catalog_order(full):
             failure for record in records.values() for failure in record.failures
         ]
         states = Counter(record.state for record in records.values())
-        assert database.counts() == {**states, "pending": 1}
+        assert database.listed(TILES) == Listed(Counter({**states, "pending": 1}), len(records))
+        assert database.listed(TILES, "2026-01-01").finished == len(records)
+        assert database.listed(TILES, "2026-01-02").finished == 0
 
 
 def test_tables_contain_only_current_tiles(full):
@@ -55,7 +61,7 @@ def test_tables_contain_only_current_tiles(full):
         assert vanished == len(TILES) - 1 - 3
         assert [row["tile_id"] for row in database.rows()] == [TILES[3], TILES[4]]
         assert [failure.tile_id for failure in database.failures()] == [TILES[3]]
-        assert (database.state(TILES[4]), database.state(TILES[0])) == ("cached", None)
+        assert list(database.states()) == ["pending", "failed", "cached"]
         database.record(entry(TILES[5]))
         assert [row["tile_id"] for row in database.rows()] == [TILES[5], TILES[3], TILES[4]]
         assert database.get(TILES[0]) is None
@@ -75,9 +81,132 @@ def test_tables_contain_only_current_tiles(full):
 def test_open_damaged_database_starts_empty(damage, full):
     full.write_bytes(damage(full.read_bytes()))
     with RunDatabase.open(full) as database:
-        assert not database.counts()
+        assert database.listed([]) == Listed()
         assert database.get(TILES[0]) is None
         database.set_states([(TILES[0], "pending")])
+        database.record(entry(TILES[0]))
+    with RunDatabase.open_readonly(full) as database:
+        assert database.get(TILES[0]) == entry(TILES[0])
+
+
+def change(path, *statements):
+    """Change a database without changing its checksums."""
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE entry SET record = replace(record, '0.25', '8.25') WHERE tile = '4_4'",
+        "UPDATE entry SET record = substr(record, 2) WHERE tile = '4_4'",
+        "UPDATE entry SET record = CAST(record AS BLOB) WHERE tile = '4_4'",
+        "UPDATE entry SET record = CAST(x'7bff7d' AS TEXT) WHERE tile = '4_4'",
+        "UPDATE entry SET finished = 7 WHERE tile = '4_4'",
+        "UPDATE entry SET checksum = NULL WHERE tile = '4_4'",
+        "UPDATE entry SET tile = '5-5' WHERE tile = '4_4'",
+        "DELETE FROM entry WHERE tile = '4_4'",
+    ],
+)
+def test_damaged_entry_is_recovered_from_marker(damage, full):
+    change(full, damage)
+    asked = []
+
+    def recover(tile):
+        asked.append(tile)
+        return entry(tile)
+
+    for opened in (RunDatabase.open_readonly, RunDatabase.open):
+        with opened(full, recover) as database:
+            assert (database.get("4_4"), database.get("7_7")) == (None, entry("7_7"))
+            assert database.lookup("4_4") == entry("4_4")
+            assert database.listed(TILES) is not None
+            assert list(database.rows()) == [row for tile in TILES[:-1] for row in entry(tile).rows]
+            assert [record for _, _, record in database.entries()] == [*map(entry, TILES[:-1]), None]
+    assert set(asked) <= {"4_4"}
+
+
+def test_entry_of_earlier_write_is_not_taken(full):
+    """A page that was written once more, but is there as before: its rows have valid checksums."""
+    with RunDatabase.open(full) as database:
+        database.record(replace(entry("4_4"), seconds=9.0))
+    with contextlib.closing(sqlite3.connect(full)) as connection:
+        (new,) = connection.execute("SELECT record FROM entry WHERE tile = '4_4'").fetchall()
+    old = json.dumps(json.loads(new[0]) | {"seconds": 0.25})
+    checksum = digest("4_4", "2026-01-01", old).hex()
+    change(full, f"UPDATE entry SET record = '{old.replace(chr(39), chr(39) * 2)}', checksum = x'{checksum}'"
+           " WHERE tile = '4_4'")  # fmt: skip
+    with RunDatabase.open_readonly(full, lambda tile: replace(entry(tile), seconds=9.0)) as database:
+        assert database.get("4_4").seconds == 0.25
+        assert {tile: record.seconds for tile, _, record in database.entries() if record}["4_4"] == 9.0
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE asked SET standing = 'done' WHERE tile = '3_3'",
+        "UPDATE asked SET standing = CAST(x'ff' AS TEXT) WHERE tile = '3_3'",
+        "UPDATE asked SET finished = '' WHERE tile = '3_3'",
+        "UPDATE asked SET position = 5000 WHERE tile = '3_3'",
+        "UPDATE asked SET checksum = x'00' WHERE tile = '3_3'",
+        "DELETE FROM asked WHERE tile = '3_3'",
+        "DELETE FROM asked WHERE position > 3",
+        "DELETE FROM asked",
+        "DELETE FROM total",
+        "UPDATE total SET checksum = zeroblob(16)",
+        "UPDATE total SET checksum = 7",
+    ],
+)
+def test_damaged_list_is_noticed_and_replaced(damage, full):
+    change(full, damage)
+    with RunDatabase.open_readonly(full) as database:
+        assert database.listed(TILES) is None
+    with RunDatabase.open(full) as database:
+        # A record written meanwhile does not hide the damage.
+        database.record(entry("3_3"))
+        assert database.listed(TILES) is None
+        assert database.set_states((tile, "pending") for tile in TILES) == 0
+        assert database.listed(TILES).counts == {"pending": len(TILES)}
+
+
+def test_list_of_earlier_write_is_noticed(full):
+    with contextlib.closing(sqlite3.connect(full)) as connection:
+        (old,) = connection.execute("SELECT * FROM asked WHERE tile = '4_4'").fetchall()
+    with RunDatabase.open(full) as database:
+        database.record(replace(entry("4_4"), state="failed"))
+    with RunDatabase.open_readonly(full) as database:
+        assert database.listed(TILES) is not None
+        assert list(database.states())[4] == "failed"
+    with contextlib.closing(sqlite3.connect(full)) as connection, connection:
+        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?)", old)
+    with RunDatabase.open_readonly(full) as database:
+        assert database.listed(TILES) is None
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000, 60_000])
+def test_database_damaged_while_open_is_made_anew(size, full):
+    with RunDatabase.open(full) as database:
+        database._connection.execute("PRAGMA cache_size = 1")
+        with full.open("r+b") as file:
+            file.truncate(size)
+            file.seek(0)
+            file.write(b"\xff" * min(size, 8192))
+        database.record(replace(entry("4_4"), seconds=9.0))
+        database.flush()
+        assert database.listed(TILES) is None
+        assert database.get("4_4").seconds == 9.0
+        database.set_states((tile, "done") for tile in TILES)
+        assert database.listed(TILES).counts == {"done": len(TILES)}
+    with RunDatabase.open_readonly(full) as database:
+        assert database.listed(TILES).counts == {"done": len(TILES)}
+
+
+def test_file_that_calls_itself_read_only_is_replaced(full):
+    data = bytearray(full.read_bytes())
+    data[18] = 9
+    full.write_bytes(data)
+    with RunDatabase.open(full) as database:
         database.record(entry(TILES[0]))
     with RunDatabase.open_readonly(full) as database:
         assert database.get(TILES[0]) == entry(TILES[0])
@@ -91,12 +220,12 @@ def test_read_while_writing_returns_new_records(full):
         writer.record(entry(TILES[-1]))
         writer.flush()
         assert reader.get(TILES[-1]) == entry(TILES[-1])
-        assert reader.counts() == {"pending": len(TILES) - 1, "done": 1}
+        assert reader.listed(TILES).counts == {"pending": len(TILES) - 1, "done": 1}
 
 
 def test_open_readonly_missing_database_creates_no_file(tmp_path):
     with RunDatabase.open_readonly(tmp_path / NAME) as database:
-        assert not database.counts()
+        assert database.listed([]) == Listed()
     assert not list(tmp_path.iterdir())
 
 

@@ -1,0 +1,243 @@
+"""Commands on a damaged run database: they give the figures of the undamaged one, from the tiles' markers."""
+
+import contextlib
+import json
+import os
+import random
+import shutil
+import sqlite3
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.garbage import find_garbage
+from flexroad.pipeline.run.lock import Owner
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import plan_run, run_tiles
+from flexroad.pipeline.run.status import open_database, progress, recorded, summary
+from flexroad.pipeline.store.database import NAME
+from flexroad.pipeline.store.sqlite_file import Damage
+from flexroad.pipeline.store.tables import read_metrics
+
+LIGHT = {
+    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
+    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
+}
+PAGE = 4096
+"""Size of a page of the file (bytes)."""
+DAMAGES = 2000
+
+
+@pytest.fixture(scope="module")
+def made(made_survey, tmp_path_factory) -> Path:
+    """The folder of a run, run twice: two cached tiles, one computed by the second run, one failed."""
+    folder = tmp_path_factory.mktemp("damaged")
+    catalog = Catalog.read(shutil.copytree(made_survey, folder / "survey") / "catalog.parquet")
+    dsm = [tile.paths(tile.layer("dsm"))[0] for tile in catalog.tiles]
+    dsm[3].write_bytes(dsm[3].read_bytes()[:1000])
+    run = Run.create(folder / "run", compose(LIGHT, "light"), catalog)
+    run_tiles(run, SerialExecutor())
+    os.utime(dsm[2], (1, 1))
+    counts = run_tiles(run, SerialExecutor())
+    assert (counts.done, counts.cached, counts.failed) == (3, 2, 1)
+    return folder / "run"
+
+
+@pytest.fixture
+def run(made, tmp_path) -> Run:
+    """A copy of that run, for tests to damage."""
+    return Run.open(shutil.copytree(made, tmp_path / "run"))
+
+
+@pytest.fixture
+def no_fsync(monkeypatch):
+    """Do not wait for the disk, which would take most of the time."""
+    connect = sqlite3.connect
+
+    def connected(*arguments, **options):
+        connection = connect(*arguments, **options)
+        with contextlib.suppress(*Damage):
+            connection.execute("PRAGMA synchronous = OFF")
+        return connection
+
+    monkeypatch.setattr(sqlite3, "connect", connected)
+
+
+def outcome_of_readers(run: Run) -> dict:
+    """What `status`, the map and `clean` find."""
+    last = json.loads((run.path / "summary.json").read_bytes())
+    holder = replace(Owner.me(), since=last["start"])
+    with open_database(run) as database:
+        states = list(recorded(run, database))
+    live, _ = progress(run, holder)
+    found = {"status": summary(run), "live": replace(live, seconds=0), "states": states}
+    return found | {"garbage": list(find_garbage([run]))}
+
+
+def outcome(run: Run) -> dict:
+    """What commands find, and the plan and the tables of another run; changes the database alone."""
+    found = outcome_of_readers(run)
+    with open_database(run, write=True) as database:
+        plan = plan_run(run, database, lambda tile: True, frozenset(), lambda result: None, False)
+        found["plan"] = (list(plan.todo), plan.new, plan.changed, plan.vanished)
+        found["rows"], found["failures"] = list(database.rows()), list(database.failures())
+    return found
+
+
+def damage_figures(path: Path) -> None:
+    """Change a digit in all copies of a figure, and the state of a tile, in a file that stays a database."""
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(
+            "UPDATE entry SET record = replace(record, '\"l2_road_m\": 0', '\"l2_road_m\": 8')"
+        )
+        connection.execute("UPDATE asked SET standing = 'failed' WHERE position = 1")
+
+
+def damage_json(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("UPDATE entry SET record = substr(record, 3)")
+
+
+def damage_all(path: Path) -> None:
+    path.write_bytes(bytes(range(256)) * 64)
+
+
+EACH = pytest.mark.parametrize("damage", [damage_figures, damage_json, damage_all])
+
+
+@EACH
+def test_commands_on_damaged_database_print_the_same(damage, run, flexroad):
+    commands = [
+        ("status", run.path),
+        ("status", run.path, "--json"),
+        ("clean", run.path, "--dry-run"),
+        ("report", run.path, "--format", "md"),
+    ]
+    expected = [flexroad(*words) for words in commands]
+    report = (run.path / "report.md").read_text()
+    for words, said in zip(commands, expected, strict=True):
+        damage(run.path / NAME)
+        assert flexroad(*words) == said
+    assert (run.path / "report.md").read_text() == report
+
+
+@EACH
+@pytest.mark.parametrize("options", [(), ("--verify",)], ids=["rerun", "verify"])
+def test_rerun_on_damaged_database_writes_the_same_tables(damage, options, run, flexroad):
+    before = {name: (run.path / name).read_bytes() for name in ("metrics.parquet", "failures.csv")}
+    damage(run.path / NAME)
+    for name in before:
+        (run.path / name).unlink()
+    said = flexroad("rerun", run.path, "--executor", "serial", *options).expected(1)
+    assert "4 tiles: 3 done (3 cached), 1 failed, 0 pending; 0 new, 0 changed, 0 vanished" in said.out
+    assert {name: (run.path / name).read_bytes() for name in before} == before
+    assert summary(run).cached == 3
+
+
+def test_map_of_damaged_database_is_the_same(run, flexroad, tmp_path):
+    maps = [tmp_path / "whole.geojson", tmp_path / "damaged.geojson"]
+    for path in maps:
+        flexroad("status", run.path, "--geojson", path).expected(0)
+        damage_figures(run.path / NAME)
+    assert maps[0].read_bytes() == maps[1].read_bytes()
+
+
+def test_database_damaged_during_run_is_repaired(run):
+    rows = read_metrics(run.path)
+
+    def damage(_):
+        damage_all(run.path / NAME)
+
+    counts = run_tiles(run, SerialExecutor(), watch=damage)
+    assert (counts.done, counts.cached, counts.failed) == (3, 3, 1)
+    pd.testing.assert_frame_equal(read_metrics(run.path), rows)
+    with open_database(run) as database:
+        assert database.listed(tile.id for tile in run.catalog.tiles)
+
+
+def test_verify_takes_tables_from_markers(run):
+    """An entry that is wrong, but has a valid checksum and names the marker that is there."""
+    rows = read_metrics(run.path)
+    first = run.catalog.tiles[0].id
+    with open_database(run, write=True) as database:
+        record = database.get(first)
+        database.record(replace(record, rows=tuple(row | {"l2_road_m": 8.0} for row in record.rows)))
+    run_tiles(run, SerialExecutor())
+    assert (read_metrics(run.path).l2_road_m == 8).sum() == len(record.rows)
+    run_tiles(run, SerialExecutor(), verify=True)
+    pd.testing.assert_frame_equal(read_metrics(run.path), rows)
+
+
+def test_status_of_damaged_database_does_not_write(run):
+    for damage in (damage_figures, damage_json, damage_all):
+        damage(run.path / NAME)
+        before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
+        outcome_of_readers(run)
+        assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before
+
+
+def flip_bits(data: bytearray, rng: random.Random) -> bytes:
+    for _ in range(rng.choice((1, 1, 1, 2, 8, 64))):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return data
+
+
+def cut_off(data: bytearray, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data))]
+
+
+def overwrite(data: bytearray, rng: random.Random) -> bytes:
+    length, start = rng.choice((1, 16, 512, PAGE)), rng.randrange(len(data))
+    end = min(start + length, len(data))
+    data[start:end] = rng.choice((bytes(end - start), b"\xff" * (end - start), rng.randbytes(end - start)))
+    return data
+
+
+def drop_bytes(data: bytearray, rng: random.Random) -> bytes:
+    start = rng.randrange(len(data))
+    del data[start : start + rng.choice((1, 1, 7, 100, PAGE))]
+    return data
+
+
+def swap_pages(data: bytearray, rng: random.Random) -> bytes:
+    one, two = (slice(PAGE * i, PAGE * i + PAGE) for i in rng.sample(range(len(data) // PAGE), 2))
+    # Half of the time one page is lost, as by a write to a wrong place.
+    data[one], data[two] = data[two], rng.choice((data[one], data[two]))
+    return data
+
+
+def append_bytes(data: bytearray, rng: random.Random) -> bytes:
+    return data + rng.randbytes(rng.choice((1, 100, PAGE)))
+
+
+def flip_text(data: bytearray, rng: random.Random) -> bytes:
+    """Change a digit of a figure: the file stays a valid database with valid JSON."""
+    digits = [i for i, byte in enumerate(data) if 0x30 <= byte <= 0x39]
+    data[rng.choice(digits)] = rng.choice(b"0123456789")
+    return data
+
+
+KINDS: list[Callable[[bytearray, random.Random], bytes]] = [
+    flip_bits, cut_off, overwrite, drop_bytes, swap_pages, append_bytes, flip_text,
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_any_damage_of_database_changes_no_figure(kind, run, no_fsync):
+    path = run.path / NAME
+    whole = path.read_bytes()
+    expected = outcome(run)
+    assert expected["plan"] == ([3], 0, 0, 0)
+    assert [state for _, state, _ in expected["states"]] == ["cached", "cached", "done", "failed"]
+    # The plan of a run turns done tiles into cached ones, so the file is the first one again each time.
+    rng = random.Random(kind.__name__)
+    for number in range(-(-DAMAGES // len(KINDS))):
+        path.write_bytes(kind(bytearray(whole), rng))
+        assert outcome(run) == expected, f"damage {number}"
