@@ -75,7 +75,10 @@ def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[F
     import pyarrow.parquet as pq
 
     schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
-    with atomic_file(run / "metrics.parquet") as path, pq.ParquetWriter(path, schema) as table:
+    with (
+        atomic_file(run / "metrics.parquet") as path,
+        pq.ParquetWriter(path, schema, write_page_checksum=True) as table,
+    ):
         for chunk in _chunks(rows):
             table.write_table(pa.Table.from_pandas(metrics_frame(chunk), schema, preserve_index=False))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
@@ -103,9 +106,12 @@ def read_metrics(run: Location) -> pd.DataFrame:
     if not exists(path):
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
+        frame = frame_of(read(path))
+        if unknown := set(frame.columns) - set(COLUMNS):
+            raise ValueError(f"it has the columns {', '.join(map(repr, sorted(unknown, key=repr)))}")
         # Tables of older versions lack the newer columns.
-        return frame_of(read(path)).reindex(columns=list(COLUMNS))
-    except (OSError, ValueError) as error:
+        return frame.reindex(columns=list(COLUMNS))
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it again") from error
 
 
@@ -121,6 +127,6 @@ def frame_of(data: bytes) -> pd.DataFrame:
     import pyarrow.parquet as pq
 
     # pandas.read_parquet starts threads; those still running when a short command exits can abort it.
-    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
     table: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
     return table
