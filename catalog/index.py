@@ -29,6 +29,7 @@ from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 from flexroad.catalog.tile import LAYERS, Layer, Tile, by_cover
+from flexroad.catalog.trust import AllowedFolders
 
 Item = dict[str, Any]
 
@@ -50,8 +51,16 @@ class Catalog:
             raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} occur more than once")
 
     @classmethod
-    def read(cls, path: Location | str) -> Catalog:
+    def read(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Catalog:
         """Read a catalog written by `write`, from disk or a bucket.
+
+        Parameters
+        ----------
+        path : Location or str
+            The catalog's file. Files of tiles may lie in its folder.
+        allow : sequence of str or Path
+            Further folders or addresses (s3://BUCKET/NAME) that files of tiles may lie below. `Tile.paths`
+            raises an error for all others.
 
         Raises
         ------
@@ -70,8 +79,8 @@ class Catalog:
             raise CatalogError(f"cannot read catalog {path}: {error.strerror or error}") from error
         try:
             items = _from_json(data) if path.suffix in JSON_SUFFIXES else _from_parquet(data)
-            folder = str(absolute(path).parent)
-            return cls(tuple(_tile(item, folder) for item in items))
+            folder, allowed = str(absolute(path).parent), AllowedFolders.of(path.parent, allow)
+            return cls(tuple(_tile(item, folder, allowed) for item in items))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CatalogError(
                 f"{path} is not a FlexRoad catalog: {error!r}; make one with `flexroad catalog`"
@@ -208,7 +217,7 @@ def _asset(layer: Layer, root: str) -> Item:
     }
 
 
-def _tile(item: Item, folder: str) -> Tile:
+def _tile(item: Item, folder: str, allowed: AllowedFolders) -> Tile:
     properties = item["properties"]
     cell, _, west, _, _, north = properties["proj:transform"][:6]
     height, width = properties["proj:shape"]
@@ -228,6 +237,7 @@ def _tile(item: Item, folder: str) -> Tile:
         # Older catalogs do not have this field.
         dataset=properties.get("flexroad:dataset") or "",
         nearby=nearby,
+        allowed=allowed,
     )
 
 

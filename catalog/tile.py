@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import compress
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
-from flexroad.catalog.storage.paths import Location, join, parse_location
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.trust import AllowedFolders, full_name, located
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true heights of road
@@ -112,6 +113,8 @@ class Tile:
     """Name of the source dataset in reports ("GeRoD"), or empty if unknown."""
     nearby: tuple[Layer, ...] = ()
     """Layers of which files lie within `REACH_M`, but none on the tile itself, in the order of `LAYERS`."""
+    allowed: AllowedFolders | None = field(default=None, compare=False, repr=False)
+    """Where its files may lie; None if the program itself has made the tile and has not read it."""
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:
@@ -123,8 +126,23 @@ class Tile:
         return next((layer for layer in self.layers if layer.name == name), None)
 
     def paths(self, layer: Layer) -> tuple[Location, ...]:
-        """Return the locations of the layer's files."""
-        return tuple(parse_location(join(self.root, file)) for file in layer.files)
+        """Return the locations of the layer's files.
+
+        Raises
+        ------
+        CatalogError
+            If a file lies outside the folders that the tile may read.
+        """
+        if self.allowed and (outside := self.outside(layer)):
+            raise self.allowed.refusal(f"tile {self.id}: {layer.name}", outside)
+        return tuple(located(full_name(self.root, file)) for file in layer.files)
+
+    def outside(self, layer: Layer) -> str | None:
+        """Return the full name of the first file of a layer that may not be read, None if there is none."""
+        if self.allowed is None:
+            return None
+        names = (full_name(self.root, file) for file in layer.files)
+        return next((name for name in names if not self.allowed.permits(name)), None)
 
     def renamed(self, rename: Callable[[str], str]) -> Tile:
         """Return the tile with other names of its files."""

@@ -34,6 +34,14 @@ def pytest_collection_modifyitems(config, items):
         items.sort(key=lambda item: item.path not in slow)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state_folder(tmp_path_factory):
+    """The folder of the user's key, so that tests leave none in the home folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def flexroad():
     """The command line, run in this process; fails on a traceback."""
@@ -96,6 +104,16 @@ def executor(request):
     if request.param == "serial":
         return SerialExecutor()
     return DaskExecutor(scheduler=request.getfixturevalue("cluster").scheduler_address)
+
+
+@pytest.fixture
+def web(tmp_path_factory, monkeypatch):
+    """A web server on loopback that records its requests."""
+    from tests.recording_server import recording
+
+    monkeypatch.setenv("GDAL_HTTP_MAX_RETRY", "0")
+    with recording(tmp_path_factory.mktemp("web")) as recorder:
+        yield recorder
 
 
 @pytest.fixture(scope="session")

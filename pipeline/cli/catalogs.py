@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexroad.pipeline.cli.command import Command
+from flexroad.pipeline.cli.command import Allow, Command
 from flexroad.pipeline.cli.run import next_run
 
 if TYPE_CHECKING:
@@ -186,13 +186,13 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
 
 
 @catalogs.command("check")
-def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")], allow: Allow = None) -> None:
     """Check a catalog: layers, missing files, and the shift between photo and heights."""
     from flexroad.catalog import Catalog
     from flexroad.pipeline.inspect.catalog import check
 
     faults = 0
-    for remark in check(Catalog.read(path)):
+    for remark in check(Catalog.read(path, allow or ())):
         typer.echo(f"warning: {remark.text}" if remark.fault else remark.text)
         faults += remark.fault
     if faults:

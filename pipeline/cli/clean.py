@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.cli.command import Allow
 from flexroad.pipeline.errors import ConfigError
 
 
@@ -18,6 +19,7 @@ def clean(
         list[str] | None,
         typer.Option(metavar="RUN", help="Another run of the same store that no longer exists; repeatable."),
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Delete what no run needs: unused artefacts, files of removed tiles and products, temporary files."""
     from flexroad.catalog.storage.paths import absolute, parse_location
@@ -31,7 +33,7 @@ def clean(
 
     location, forgotten = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
     with run_lock(location, say):
-        run = Run.open(location)
+        run = Run.open(location, allow or ())
         users = {str(user) for user in runs_using(run.store)}
         for user in forgotten:
             if str(user) not in users:
@@ -40,7 +42,7 @@ def clean(
                     f"--forget {user}: no run of the store {run.store}; its runs are: {choices}"
                 )
         files, sizes = Counter[str](), Counter[str]()
-        with exclusive(run, forgotten, say) as runs:
+        with exclusive(run, forgotten, say, allow or ()) as runs:
             garbage = find_garbage(runs)
             for file in garbage if dry_run else delete(garbage):
                 files[file.kind] += 1

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
 from flexroad.pipeline.cli.lifecycle import notify_invalid_command
+
+Allow = Annotated[
+    list[str] | None,
+    typer.Option(metavar="DIR|URL", help="Allow source files in this folder, too; repeatable."),
+]
 
 
 class Command(TyperCommand):

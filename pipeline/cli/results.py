@@ -8,12 +8,14 @@ from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.cli.command import Allow
 from flexroad.pipeline.errors import ConfigError
 
 
 def report(
     path: Annotated[Path, typer.Argument(metavar="RUN")],
     form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
+    allow: Allow = None,
 ) -> None:
     """Write RUN/report.<format>: the paper's main table for this run, worst tiles, height steps, failures."""
     from flexroad.catalog.storage.paths import read
@@ -22,7 +24,7 @@ def report(
 
     if form not in FORMATS:
         raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
-    written = write_report(Run.open(path), form)
+    written = write_report(Run.open(path, allow or ()), form)
     if form != "html":
         typer.echo(read(written).decode())
     typer.echo(f"written to {written}", err=True)
@@ -42,13 +44,15 @@ def tables(
         Path | None,
         typer.Option("--dsc3d-true", metavar="RUN", help="The same scenes, run with the true reference."),
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Write the paper's tables and claims next to the values of a run: Markdown, LaTeX, CSV, HTML."""
     from flexroad.pipeline.reproduce.tables import write_comparison
     from flexroad.pipeline.run.record import Run
 
-    runs = [Run.open(folder) if folder else None for folder in (true, dsc3d, dsc3d_true)]
-    for written in write_comparison(Run.open(path), runs[0], output, *runs[1:]):
+    folders = (true, dsc3d, dsc3d_true)
+    runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
+    for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
         typer.echo(str(written))
 
 
@@ -58,12 +62,13 @@ def figures(
     tile: Annotated[
         str | None, typer.Option(help="Tile of the maps; default: the one with the median road L2.")
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Draw the paper's figures from a run, as PDF and PNG with a page of captions."""
     from flexroad.pipeline.reproduce.figures import write_figures
     from flexroad.pipeline.run.record import Run
 
-    for note in write_figures(Run.open(path), output, tile):
+    for note in write_figures(Run.open(path, allow or ()), output, tile):
         typer.echo(f"note: {note}", err=True)
     typer.echo(f"figures in {output / 'figures.md'}")
 
@@ -74,10 +79,11 @@ def query(
     variant: Annotated[
         str | None, typer.Option(help="Variant of the surface; default: the exported one.")
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Print height, unit normal, tile and class at points, as CSV."""
     from flexroad.pipeline.inspect.points import query_csv
 
-    outside = query_csv(path, points, variant, sys.stdout)
+    outside = query_csv(path, points, variant, sys.stdout, allow or ())
     if outside:
         typer.echo(f"note: {outside} points lie on no finished tile; their columns are empty", err=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexroad.pipeline.cli.command import Allow
 from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Outcome, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.stdio import ignore_write_errors
 from flexroad.pipeline.errors import ClusterLost, ConfigError
@@ -65,10 +66,7 @@ def run(
     checksum: Annotated[
         bool, typer.Option(help="Detect changed sources by content, not by size and time.")
     ] = False,
-    allow: Annotated[
-        list[str] | None,
-        typer.Option(metavar="DIR|URL", help="Allow source files in this folder, too; repeatable."),
-    ] = None,
+    allow: Allow = None,
     verify: Verify = False,
     on_failure: OnFailure = None,
     prometheus: Prometheus = None,
@@ -77,7 +75,7 @@ def run(
     """Bring every tile up to date; after an interruption the same command resumes the run."""
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
-    from flexroad.catalog.storage.paths import absolute, normalise, parse_location
+    from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.graph import layers_read
     from flexroad.pipeline.run.record import Run
@@ -85,13 +83,11 @@ def run(
 
     path, catalog_path = parse_location(out), parse_location(catalog)
     root = parse_location(store) if store else None
-    # A catalog may always name files in its own folder.
-    allowed = [str(absolute(catalog_path).parent), *(normalise(text) for text in allow or ())]
 
     def read_catalog(settings: Config) -> tuple[Catalog, Catalog]:
         """Return the whole catalog and its selected tiles."""
-        whole = Catalog.read(catalog_path)
-        check_allowed(whole, catalog_path.parent, allowed, layers_read(settings))
+        whole = Catalog.read(catalog_path, allow or ())
+        check_allowed(whole, layers_read(settings))
         selected = whole.select(tile or (), bbox)
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
@@ -112,7 +108,7 @@ def run(
         partial_run = bool(tile) or bbox is not None
         with _locked(path, create=True):
             merged = merged_catalog(path, whole, selected) if partial_run else whole
-            opened = Run.create(path, settings, merged, root, checksum, allowed)
+            opened = Run.create(path, settings, merged, root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
             make_executor = partial(_executor, executor, workers, scheduler, settings.cluster, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
@@ -131,6 +127,7 @@ def rerun(
     scheduler: Scheduler = None,
     executor: ExecutorName = "dask",
     dashboard: Dashboard = False,
+    allow: Allow = None,
     verify: Verify = False,
     on_failure: OnFailure = None,
     prometheus: Prometheus = None,
@@ -152,10 +149,8 @@ def rerun(
         # The control points of a border are part of the fit.
         force |= {BORDER} if "fit" in force else frozenset()
         with _locked(location):
-            opened = Run.open(location)
-            if opened.allowed:
-                # Runs of older versions have no such list.
-                check_allowed(opened.catalog, location, opened.allowed, layers_read(opened.config))
+            opened = Run.open(location, allow or ())
+            check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
             make_executor = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
             _run_tiles(opened, make_executor, only, force, verify, outcome)
@@ -277,12 +272,13 @@ def status(
     geojson: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a map of the tile states, for QGIS.")
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Show the state of a run and the failures of its tiles."""
     from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.run.record import Run
 
-    opened = Run.open(parse_location(path))
+    opened = Run.open(parse_location(path), allow or ())
     if geojson is not None:
         from flexroad.pipeline.monitor.geojson import write_states
 

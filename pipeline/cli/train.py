@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.pipeline.cli.command import Allow
+
 
 def train(
     catalog: Annotated[Path, typer.Argument(metavar="CATALOG")],
@@ -42,9 +44,11 @@ def train(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the method's training; repeatable."),
     ] = None,
+    allow: Allow = None,
 ) -> None:
     """Train a segmenter on labelled tiles and validate it on others; write MODEL, MODEL.html, MODEL.json."""
     from flexroad.catalog import Catalog
+    from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import output_file
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
@@ -54,7 +58,8 @@ def train(
     from flexroad.tasks.errors import TaskError
 
     options = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
-    tiles, loaded_config = Catalog.read(catalog), load_config(config)
+    tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config)
+    check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)
     # Refused before the training and not after it.

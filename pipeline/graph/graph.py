@@ -17,8 +17,9 @@ node whose artefact is in the store is not computed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,18 @@ class TileGraph:
     fingerprint: str
     """Fingerprint of all requested results; the tile is done when its item has this fingerprint."""
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the source layers that its stages read."""
+        return _reads(node.options for node in self.nodes.values())
+
+    @property
+    def readable(self) -> Tile:
+        """The tile with only the layers that its stages read: files of others may lie anywhere."""
+        return replace(
+            self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in self.reads)
+        )
+
     def chain(self, variant: str) -> list[Node]:
         """Return the variant's nodes in the paper's order."""
         return [self.nodes[self.variants[variant][stage]] for stage in STAGE_NAMES]
@@ -141,6 +154,11 @@ class Pattern:
         halo_m = max(chain["load"].halo_m for chain in config.chains.values())
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 
+    @cached_property
+    def reads(self) -> frozenset[str]:
+        """Names of the source layers that any stage reads; the files of others are not even looked up."""
+        return frozenset(layer for step in self.steps for layer in step.reads)
+
     def graph(
         self, tile: Tile, checksum: bool = False, stat_file: Stat = stat, recorded: Recorded = ()
     ) -> TileGraph:
@@ -157,7 +175,8 @@ class Pattern:
         """
         own = tile.within(tile.grid.buffered(self.halo_m).bounds)
         sources = SourceFiles(tile, stat_file, checksum, recorded)
-        texts = [(layer.name, to_json(sources.entry(layer))) for layer in own.layers]
+        layers_read = [layer for layer in own.layers if layer.name in self.reads]
+        texts = [(layer.name, to_json(sources.entry(layer))) for layer in layers_read]
         names: list[str] = []
         nodes: dict[str, Node] = {}
         for step in self.steps:
@@ -255,7 +274,10 @@ def files_read(graph: TileGraph, node: Node) -> list[Location]:
 
 def layers_read(config: Config) -> frozenset[str]:
     """Return the names of the layers read by any stage of any variant."""
-    chosen = (options for chain in config.chains.values() for options in chain.values())
+    return _reads(options for chain in config.chains.values() for options in chain.values())
+
+
+def _reads(chosen: Iterable[Options]) -> frozenset[str]:
     return frozenset(name for options in chosen for name in getattr(stage_module(options), "READS", ()))
 
 
@@ -272,8 +294,9 @@ def own_files_missing(graph: TileGraph) -> list[str]:
     missing = [path for path, file in graph.file_stats.items() if file is None]
     if not missing:
         return []
-    tile = graph.around
-    listed = {str(path) for layer in tile.all_layers for path in tile.paths(layer)}
-    on_tile = (layer.reaching(tile.grid.bounds) for layer in tile.layers)
+    tile, reads = graph.around, graph.reads
+    read = [layer for layer in tile.all_layers if layer.name in reads]
+    listed = {str(path) for layer in read for path in tile.paths(layer)}
+    on_tile = (layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in reads)
     own = {str(path) for layer in on_tile if layer for path in tile.paths(layer)}
     return [path for path in missing if path in own or path not in listed]

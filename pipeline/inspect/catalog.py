@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, Tile
+from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short
 from flexroad.catalog.storage.paths import Location, StatCache
 from flexroad.tasks import load
@@ -31,7 +32,14 @@ class Finding:
 
 
 def check(catalog: Catalog) -> Iterator[Finding]:
-    """Yield the contents and the faults of a catalog, the fast checks first."""
+    """Yield the contents and the faults of a catalog, the fast checks first.
+
+    Raises
+    ------
+    CatalogError
+        If a tile names a file that the catalog may not read (`Catalog.read`).
+    """
+    check_allowed(catalog)
     tiles = catalog.tiles
     sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
     systems = sorted({short(tile.grid.crs) for tile in tiles})

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -53,7 +53,9 @@ class Ground:
     variant: str
 
     @classmethod
-    def open(cls, path: Location | str, variant: str | None = None) -> Ground:
+    def open(
+        cls, path: Location | str, variant: str | None = None, allow: Sequence[str | Path] = ()
+    ) -> Ground:
         """Open a run.
 
         Raises
@@ -61,7 +63,7 @@ class Ground:
         ConfigError
             If the folder is no run, has no such variant, or no tile is done.
         """
-        run = Run.open(parse_location(path))
+        run = Run.open(parse_location(path), allow)
         variant = variant or run.config.export.variants[0]
         if variant not in run.config.chains:
             raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
@@ -116,8 +118,15 @@ class Ground:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
 
 
-def query_csv(run: Location, csv: Path, variant: str | None, out: TextIO) -> int:
+def query_csv(
+    run: Location, csv: Path, variant: str | None, out: TextIO, allow: Sequence[str | Path] = ()
+) -> int:
     """Read a CSV of points and write it with the added columns height_m, nx, ny, nz, tile and class.
+
+    Parameters
+    ----------
+    allow : sequence of str or Path
+        See `Run.open`.
 
     Returns
     -------
@@ -137,7 +146,7 @@ def query_csv(run: Location, csv: Path, variant: str | None, out: TextIO) -> int
         raise ConfigError(f"{csv}: no column {error}; it needs easting and northing (m)") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{csv}: not readable as a table of points: {error}") from error
-    answer = Ground.open(run, variant).at(easting, northing)
+    answer = Ground.open(run, variant, allow).at(easting, northing)
     table["height_m"] = answer.height
     for i, name in enumerate(("nx", "ny", "nz")):
         table[name] = answer.normal[:, i]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +41,8 @@ class RunView:
     """The opened run folder."""
     variant: str
     """The variant whose surfaces are used."""
+    allow: tuple[str | Path, ...] = ()
+    """Further folders that the sources of the run may lie below."""
 
     def __repr__(self) -> str:
         counts = self.tiles["state"].value_counts()
@@ -299,14 +302,14 @@ class RunView:
         >>> float(abs(tile.surface - tile.reference).where(tile.road).mean().round(1))
         0.0
         """
-        return open_tile(self.run.path, tile_id, self.variant)
+        return open_tile(self.run.path, tile_id, self.variant, self.allow)
 
     def _at(self, x: ArrayLike, y: ArrayLike) -> tuple[tuple[int, ...], Answer]:
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         return easting.shape, Ground(self.run, self.variant).at(easting.ravel(), northing.ravel())
 
 
-def open_run(path: str | Path, variant: str | None = None) -> RunView:
+def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str | Path] = ()) -> RunView:
     """Open a run, finished or in progress.
 
     Parameters
@@ -315,13 +318,17 @@ def open_run(path: str | Path, variant: str | None = None) -> RunView:
         The folder given to ``flexroad run --out``, or its address in object storage (``s3://...``).
     variant : str, optional
         The variant whose surfaces are used; by default the first one exported.
+    allow : sequence of str or Path
+        Further folders that the sources of the run may lie below. Needed for runs that another user, or
+        the same user on another machine, has made from files outside the run's own folder.
 
     Raises
     ------
     ConfigError
         If the folder is no run, or has no such variant.
     CatalogError
-        If its catalog is damaged.
+        If its catalog is damaged. Methods of the view also raise it if a source lies outside the allowed
+        folders.
 
     Examples
     --------
@@ -331,8 +338,8 @@ def open_run(path: str | Path, variant: str | None = None) -> RunView:
     config nightly, variant flexroad
     2 tiles: 1 done, 1 pending
     """
-    run = Run.open(parse_location(path))
+    run = Run.open(parse_location(path), allow)
     variant = variant or run.config.export.variants[0]
     if variant not in run.config.chains:
         raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-    return RunView(run, variant)
+    return RunView(run, variant, tuple(allow))

@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexroad.catalog.storage.paths import Location, parse_location
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
 HEIGHTS = {"units": "m"}
 
 
-def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> xr.Dataset:
+def open_tile(
+    run: Location | str, tile_id: str, variant: str | None = None, allow: Sequence[str | Path] = ()
+) -> xr.Dataset:
     """Return the input rasters, masks and fitted surface of a tile, on the tile's core.
 
     Parameters
@@ -33,6 +37,8 @@ def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> 
         Id of a tile of the run's catalog.
     variant : str, optional
         The variant of filter and surface; by default the first one exported.
+    allow : sequence of str or Path
+        Further folders that the sources of the run may lie below (`Run.open`).
 
     Returns
     -------
@@ -47,12 +53,12 @@ def open_tile(run: Location | str, tile_id: str, variant: str | None = None) -> 
     ConfigError
         If the folder is no run, the variant is unknown or a stage fails on the tile.
     CatalogError
-        If the catalog has no such tile.
+        If the catalog has no such tile, or names a file outside the allowed folders.
     """
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
 
-    opened = Run.open(parse_location(run))
+    opened = Run.open(parse_location(run), allow)
     variant = variant or opened.config.export.variants[0]
     if variant not in opened.config.chains:
         raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")

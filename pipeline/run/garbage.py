@@ -48,7 +48,9 @@ class Garbage:
 
 
 @contextlib.contextmanager
-def exclusive(run: Run, without: Sequence[Location], notify: Callable[[str], None]) -> Iterator[list[Run]]:
+def exclusive(
+    run: Run, without: Sequence[Location], notify: Callable[[str], None], allow: Sequence[str] = ()
+) -> Iterator[list[Run]]:
     """Lock all other runs of this run's store; a context manager that gives all runs, this one first.
 
     Parameters
@@ -59,6 +61,8 @@ def exclusive(run: Run, without: Sequence[Location], notify: Callable[[str], Non
         Runs to ignore because they no longer exist.
     notify : callable
         Receives one line when the lock of a dead process is taken over.
+    allow : sequence of str
+        See `Run.open`.
 
     Raises
     ------
@@ -73,7 +77,7 @@ def exclusive(run: Run, without: Sequence[Location], notify: Callable[[str], Non
                 raise ConfigError(f"{path} uses the store {run.store}, but is missing; {remedy}")
             stack.enter_context(run_lock(path, notify))
             try:
-                runs.append(Run.open(path))
+                runs.append(Run.open(path, allow))
             except (CatalogError, ConfigError) as error:
                 raise ConfigError(
                     f"{path} uses the store {run.store}, but cannot be read ({error}); {remedy}"

@@ -26,6 +26,7 @@ from typing import Any
 import yaml
 
 from flexroad.catalog import Catalog, Tile
+from flexroad.catalog.allowlist import needed
 from flexroad.catalog.storage.paths import (
     Location,
     StatCache,
@@ -43,6 +44,7 @@ from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import Pattern, TileGraph
 from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
+from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store.artefacts import check_writable
@@ -67,7 +69,7 @@ class Run:
     versions: dict[str, str]
     """Versions of Python and of the packages in `PACKAGES`."""
     allowed: tuple[str, ...] = ()
-    """Folders and addresses outside the catalog's folder that sources may be read from."""
+    """Folders and addresses that sources may be read from, as sealed when the run was made."""
     exported: tuple[str, ...] = ()
     """Variants exported by this or an earlier configuration of the run."""
 
@@ -79,9 +81,11 @@ class Run:
         catalog: Catalog,
         store: Location | None = None,
         checksum: bool = False,
-        allowed: Sequence[str] = (),
     ) -> Run:
         """Create a run folder, or update an existing one with a new configuration or catalog.
+
+        The run may read what the catalog may read (`Catalog.read`), or, if the program itself has just made
+        the catalog, the folders of its files.
 
         Raises
         ------
@@ -97,7 +101,7 @@ class Run:
         store = store or (parse_location(old["store"]) if old and old["shared_store"] else path / "store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
-        run = cls(path, config, catalog, store, origin, checksum, versions(), tuple(allowed), exported)
+        run = cls(path, config, catalog, store, origin, checksum, versions(), folders_of(catalog), exported)
         try:
             for folder in (path, store):
                 check_writable(folder)
@@ -110,8 +114,15 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, path: Location | str) -> Run:
+    def open(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Run:
         """Open an existing run with its current configuration and catalog.
+
+        Parameters
+        ----------
+        path : Location or str
+        allow : sequence of str or Path
+            Folders and addresses that sources may lie below, besides the run's own folder and those that the
+            user allowed when the run was made (`flexroad.pipeline.run.seal`).
 
         Raises
         ------
@@ -128,7 +139,9 @@ class Run:
             )
         store = parse_location(record["store"]) if record["shared_store"] else path / "store"
         config = _config(path / "config.yaml").model_copy(update={"name": record["config"]})
-        catalog = Catalog.read(path / "catalog.parquet")
+        listed = record.get("allowed", [])
+        allowed = tuple(listed) if sealed(listed, record.get("seal")) else ()
+        catalog = Catalog.read(path / "catalog.parquet", (*allowed, *allow))
         origin = (record["origin"][0], record["origin"][1])
         return cls(
             path,
@@ -138,7 +151,7 @@ class Run:
             origin,
             record["checksum"],
             record["versions"],
-            tuple(record.get("allowed", ())),
+            allowed,
             _exported(record, config),
         )
 
@@ -176,6 +189,7 @@ class Run:
             "checksum": self.checksum,
             "versions": self.versions,
             "allowed": list(self.allowed),
+            "seal": seal(self.allowed),
             "exported": list(self.exported),
         }
         write(self.path / "run.json", json.dumps(record, indent=1).encode())
@@ -200,6 +214,18 @@ def check_models(config: Config) -> None:
                     arguments = f"--method {values['method']} --labels mask -o {path}"
                     remedy = f"make it with `flexroad train CATALOG {arguments}`"
                 raise ConfigError(f"{config.name}: {stage}: {path} does not exist; {remedy}")
+
+
+def folders_of(catalog: Catalog) -> tuple[str, ...]:
+    """Return the folders that the tiles of a catalog may read."""
+    given = {tile.allowed for tile in catalog.tiles if tile.allowed}
+    made = Catalog(tuple(tile for tile in catalog.tiles if tile.allowed is None))
+    roots = [
+        folder
+        for root in sorted({tile.root for tile in made.tiles})
+        for folder in (root, *needed(made, root))
+    ]
+    return tuple(dict.fromkeys([*(folder for allowed in given for folder in allowed.folders), *roots]))
 
 
 def versions() -> dict[str, str]:

@@ -110,7 +110,7 @@ class Evaluator:
             if node.border:
                 return node.border(self.graph.around, inputs)
             framed = {"frame": Frame(*frame)} if frame else {}
-            return node.function(*(inputs or [self.graph.tile]), node.options, **framed)
+            return node.function(*(inputs or [self.graph.readable]), node.options, **framed)
         finally:
             # Also after an error: a file that is being replaced may be unreadable.
             for file in files_read(self.graph, node):

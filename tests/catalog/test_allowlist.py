@@ -1,5 +1,6 @@
-"""Files of a catalog must lie in its folder or in a folder that the operator allows."""
+"""Files of a catalog must lie in its folder or in a folder that the user allows."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import pytest
@@ -7,11 +8,17 @@ import pytest
 from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed, needed
 from flexroad.catalog.tile import LAYERS
+from flexroad.catalog.trust import AllowedFolders
 
 
 def catalog(*files, root) -> Catalog:
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
     return Catalog((Tile("one", grid, (Layer("dsm", files),), str(root), datetime(2020, 5, 1, tzinfo=UTC)),))
+
+
+def check(made, folder, allow=(), layers=LAYERS):
+    allowed = AllowedFolders.of(folder, allow)
+    check_allowed(Catalog(tuple(replace(tile, allowed=allowed) for tile in made.tiles)), layers)
 
 
 @pytest.mark.parametrize(
@@ -20,7 +27,6 @@ def catalog(*files, root) -> Catalog:
         ("../dsm/a.tif", "{}"),
         ("a/../../b/../dsm/a.tif", "{}"),
         ("/etc/passwd", "/etc"),
-        ("/vsicurl/http://169.254.169.254/latest/a.tif", "/vsicurl/http:/169.254.169.254/latest"),
         ("s3://bucket/dsm/a.tif", "s3://bucket/dsm"),
         ("s3:/bucket/my dsm/a.tif", "'s3://bucket/my dsm'"),
     ],
@@ -30,27 +36,38 @@ def test_file_outside_folder_raises_error_with_option(tmp_path, file, allow):
     tile_catalog = catalog("dsm/in.tif", file, root=home)
     option = f"--allow {allow.format(tmp_path / 'dsm')}"
     with pytest.raises(CatalogError, match="^tile one: dsm names ") as caught:
-        check_allowed(tile_catalog, home)
+        check(tile_catalog, home)
     assert str(caught.value).endswith(f"to allow it, add {option}")
     (folder,) = needed(tile_catalog, home)
     assert folder in option
-    check_allowed(tile_catalog, home, [folder])
-    check_allowed(tile_catalog, home, [folder + "/"])
+    check(tile_catalog, home, [folder])
+    check(tile_catalog, home, [folder + "/"])
     with pytest.raises(CatalogError):
-        check_allowed(tile_catalog, home, [folder + "-more"])
+        check(tile_catalog, home, [folder + "-more"])
 
 
-@pytest.mark.parametrize("file", ["https://host/a.tif", "file:///etc/passwd", "ftp://host/a", "HTTP:/host/a"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "https://host/a.tif",
+        "file:///etc/passwd",
+        "ftp://host/a",
+        "HTTP:/host/a",
+        "/vsicurl/http://169.254.169.254/latest/a.tif",
+        "/vsis3/bucket/a.tif",
+        "/vsistdin/",
+    ],
+)
 def test_other_addresses_are_never_allowed(tmp_path, file):
     for tile_catalog in (catalog(file, root=tmp_path), catalog("a.tif", root=file)):
         with pytest.raises(CatalogError, match="fetch it first"):
-            check_allowed(tile_catalog, tmp_path, ["/", file])
+            check(tile_catalog, tmp_path, ["/", file])
 
 
 def test_root_in_catalog_does_not_allow_files(tmp_path):
     """The root of tiles is read from the catalog and must not be trusted."""
     with pytest.raises(CatalogError, match="--allow /etc"):
-        check_allowed(catalog("passwd", root="/etc"), tmp_path)
+        check(catalog("passwd", root="/etc"), tmp_path)
 
 
 def test_folder_of_links_is_allowed(tmp_path):
@@ -58,19 +75,19 @@ def test_folder_of_links_is_allowed(tmp_path):
     data.mkdir()
     home.mkdir()
     (home / "dsm").symlink_to(data)
-    check_allowed(catalog("dsm/a.tif", root=home), home)
+    check(catalog("dsm/a.tif", root=home), home)
     # The catalog's folder may be given by either name.
     (tmp_path / "alias").symlink_to(home)
-    check_allowed(catalog("dsm/a.tif", root=home), tmp_path / "alias")
-    check_allowed(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
+    check(catalog("dsm/a.tif", root=home), tmp_path / "alias")
+    check(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
 
 
 @pytest.mark.slow
 def test_catalog_in_bucket_allows_only_its_folder(bucket):
-    check_allowed(catalog("dsm/a.tif", root=bucket), bucket)
+    check(catalog("dsm/a.tif", root=bucket), bucket)
     for file in ("../a.tif", "../../other/a.tif", "/data/a.tif", f"{bucket}-more/a.tif"):
         with pytest.raises(CatalogError, match="--allow"):
-            check_allowed(catalog(file, root=bucket), bucket)
+            check(catalog(file, root=bucket), bucket)
 
 
 def test_needed_returns_few_folders(tmp_path):
@@ -87,7 +104,29 @@ def test_needed_returns_few_folders(tmp_path):
 def test_layers_not_read_are_not_checked(tmp_path):
     tile_catalog = catalog("/elsewhere/a.tif", root=tmp_path)
     others = set(LAYERS) - {"dsm"}
-    check_allowed(tile_catalog, tmp_path, layers=others)
+    check(tile_catalog, tmp_path, layers=others)
     assert needed(tile_catalog, tmp_path, others) == ()
     with pytest.raises(CatalogError, match="--allow /elsewhere"):
-        check_allowed(tile_catalog, tmp_path, layers={"dsm"})
+        check(tile_catalog, tmp_path, layers={"dsm"})
+
+
+def test_paths_of_a_read_catalog_are_checked(tmp_path):
+    """`Tile.paths` is the gate: whoever reads a catalog gets no location outside its folder."""
+    path = tmp_path / "home" / "catalog.json"
+    catalog("dsm/in.tif", "/elsewhere/out.tif", root=path.parent).write(path)
+    (tile,) = Catalog.read(path).tiles
+    with pytest.raises(CatalogError, match="tile one: dsm names /elsewhere/out.tif.* --allow /elsewhere"):
+        tile.paths(tile.layers[0])
+    (tile,) = Catalog.read(path, ["/elsewhere"]).tiles
+    assert [str(file) for file in tile.paths(tile.layers[0])] == [
+        f"{path.parent}/dsm/in.tif",
+        "/elsewhere/out.tif",
+    ]
+
+
+def test_relative_root_does_not_become_a_prefix_of_gdal(tmp_path, monkeypatch):
+    path = tmp_path / "catalog.json"
+    catalog("a.tif", root="GTIFF_DIR:1:").write(path, movable=False)
+    monkeypatch.chdir(tmp_path)
+    (tile,) = Catalog.read(path).tiles
+    assert tile.paths(tile.layers[0]) == (tmp_path / "GTIFF_DIR:1:" / "a.tif",)

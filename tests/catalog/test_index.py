@@ -193,6 +193,7 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
 
     from flexroad.catalog.index import _full_item, _tile, item
+    from flexroad.catalog.trust import AllowedFolders
 
     whole = with_extents(tile(295750, tmp_path, layers=LAYERS))
     tiles = (tile(295500, tmp_path), whole, tile(296000, tmp_path, layers=()))
@@ -200,5 +201,7 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     table = pq.read_table(tmp_path / "c.parquet")
     items = [_full_item(), *(item(tile) for tile in tiles)]
     assert table.equals(parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks())
-    expected = tuple(_tile(row, str(tmp_path)) for row in stac_table_to_items(table))
+    expected = tuple(
+        _tile(row, str(tmp_path), AllowedFolders.of(tmp_path)) for row in stac_table_to_items(table)
+    )
     assert Catalog.read(tmp_path / "c.parquet").tiles == expected

@@ -161,7 +161,7 @@ def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey
     flexroad("rerun", tmp_path / "run", "--executor", "serial")
     record = tmp_path / "run" / "run.json"
     record.write_text(record.read_text().replace(str(tmp_path / "dtm"), str(tmp_path / "other")))
-    assert option in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
+    assert f"--allow {tmp_path}\n" in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
 
 
 def test_clean_dry_run_lists_files_that_clean_deletes(flexroad, nightly, survey, tmp_path):

@@ -149,9 +149,9 @@ def test_changed_source_changes_fingerprints_by_time_or_checksum(survey):
     assert changed(by_time, missing) == list(STAGE_NAMES)
 
 
-def test_changed_layer_changes_only_stages_that_read_it(survey, tmp_path, monkeypatch):
+def test_changed_layer_changes_only_stages_that_read_it(survey, monkeypatch):
     (tile, *_) = Catalog.read(survey).tiles
-    photo = tmp_path / "dop.tif"
+    photo = survey.parent / "dop.tif"
     photo.write_bytes(b"old")
     tile = replace(tile, layers=(*tile.layers, Layer("dop", (str(photo),))))
 
@@ -203,15 +203,27 @@ def test_neighbours_files_count_only_with_a_halo(survey):
 def test_graph_without_halo_holds_only_the_files_of_its_tile(survey):
     tile = Catalog.read(survey).tiles[0]
     graph = tile_graph(tile, compose(PAPER, "x"))
-    own = {str(tile.paths(layer)[0]) for layer in tile.layers}
-    assert set(graph.file_stats) == own
+    # No stage reads the roads.
+    read = [layer for layer in tile.layers if layer.name != "roads"]
+    assert set(graph.file_stats) == {str(tile.paths(layer)[0]) for layer in read}
     assert [[name, *(file for file, *_ in files)] for name, files, *_ in graph.sources] == [
-        [layer.name, layer.files[0]] for layer in tile.layers
+        [layer.name, layer.files[0]] for layer in read
     ]
+
     assert graph.tile == tile.within(tile.grid.bounds)
     wide = tile_graph(tile, compose(HALO, "x"))
     assert wide.tile == tile
-    assert len(wide.file_stats) > len(own)
+    assert len(wide.file_stats) > len(read)
+
+
+def test_files_of_layers_that_no_stage_reads_may_lie_anywhere(survey):
+    (tile, *_) = Catalog.read(survey).tiles
+    tile = replace(tile, layers=(*tile.layers, Layer("dop", ("/elsewhere/dop.tif",))))
+    graph = tile_graph(tile, compose(PAPER, "x"))
+    assert "dop" not in {layer.name for layer in graph.readable.layers}
+    assert own_files_missing(replace(graph, file_stats={"/missing": None})) == ["/missing"]
+    node = graph.nodes[graph.variants["flexroad"]["load"]]
+    assert node.function(graph.readable, node.options).dop is None
 
 
 def test_largest_halo_of_the_variants_counts(survey):

@@ -525,7 +525,7 @@ def test_run_catalog_with_files_outside_needs_allow(night, flexroad, made_survey
     assert f"tile {original.tiles[0].id}: dsm names {made_survey}/dsm/" in line
     assert not out.exists()
     option = line.partition("add ")[2].split()
-    assert option == ["--allow", f"{made_survey}/dsm"]
+    assert option == ["--allow", str(made_survey)]
     assert night("--allow", made_survey, catalog=moved).code == 0
     pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
     assert "4 cached" in flexroad("rerun", out, "--executor", "serial").out

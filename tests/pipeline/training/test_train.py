@@ -133,7 +133,7 @@ def test_labelled_reads_vector_labels(land, tmp_path):
         path
     )
     bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
-    drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))))
+    drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))), allowed=None)
     tiles = LabelledTiles(TrainOptions("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
     _, road = tiles.labelled(drawn)
     assert road[-30:-20].all()

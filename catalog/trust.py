@@ -1,0 +1,96 @@
+"""Where the files of a catalog may lie: below its own folder or below a folder that the user allows.
+
+A catalog may come from anyone, and its files are read with the user's rights. `Catalog.read` gives each tile
+its `AllowedFolders`, and `Tile.paths`, the only way to the locations of a tile's files, asks them: a command
+that reads a catalog cannot forget the check. Tiles that the program itself has just made have none.
+
+Names are compared as written, after ``..`` is resolved. Links are not followed: a folder of links to data
+elsewhere can be used. GDAL's virtual file systems (``/vsicurl/``) and web addresses are never allowed.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
+
+ADDRESS = re.compile(r"(?!s3:)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
+
+
+@dataclass(frozen=True)
+class AllowedFolders:
+    """The folders below which the files of a catalog may lie."""
+
+    home: str
+    """The catalog's own folder, for messages."""
+    folders: tuple[str, ...]
+    """Folders on disk and addresses ``s3://BUCKET/NAME``, without ``..``; empty: no file may be read."""
+
+    @classmethod
+    def of(cls, home: Location | str, more: Sequence[str | Path] = ()) -> AllowedFolders:
+        """Return the catalog's own folder and further ones."""
+        # The folder as given, and with links resolved.
+        own = (normalise(str(home)), normalise(str(absolute(parse_location(home)))))
+        return cls(str(home), tuple(dict.fromkeys((*own, *(normalise(str(folder)) for folder in more)))))
+
+    @cached_property
+    def _prefixes(self) -> tuple[str, ...]:
+        return tuple(folder.rstrip("/") + "/" for folder in self.folders)
+
+    def permits(self, name: str) -> bool:
+        """Return whether a file may be read.
+
+        Parameters
+        ----------
+        name : str
+            Full path or address.
+        """
+        return _permitted(name, self._prefixes)
+
+    def refusal(self, subject: str, name: str, folders: Sequence[str] = ()) -> CatalogError:
+        """Return the error that a file may not be read, with the options that allow it.
+
+        Parameters
+        ----------
+        subject : str
+            What names the file: ``tile 1: dsm``.
+        name : str
+            Full path or address.
+        folders : sequence of str
+            The folders to allow; by default that of the file.
+        """
+        if ADDRESS.match(name):
+            return CatalogError(
+                f"{subject} names {name}; only files on disk and in s3:// are read: fetch it first"
+            )
+        name = normalise(name)
+        options = " ".join(
+            f"--allow {shlex.quote(folder)}" for folder in folders or [posixpath.dirname(name)]
+        )
+        return CatalogError(
+            f"{subject} names {name}, outside the catalog's folder {self.home}; to allow it, add {options}"
+        )
+
+
+def full_name(root: str, file: str) -> str:
+    """Return the full path or address of a tile's file."""
+    return next((text for text in (file, root) if ADDRESS.match(text)), None) or join(root, file)
+
+
+def located(name: str) -> Location:
+    """Return a file as an absolute location; GDAL takes ``GTIFF_DIR:1:a.tif`` for more than a name."""
+    location = parse_location(name)
+    return location.absolute() if isinstance(location, Path) else location
+
+
+# Neighbouring tiles list the same files.
+@lru_cache(maxsize=65536)
+def _permitted(name: str, prefixes: tuple[str, ...]) -> bool:
+    return not ADDRESS.match(name) and normalise(name).startswith(prefixes)

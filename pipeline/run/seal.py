@@ -1,0 +1,72 @@
+"""The seal of a run's allowed folders: shows that this user gave them, on this machine.
+
+``RUN/run.json`` holds the folders that the user allowed when the run was made. A run folder may come from
+anyone, like a catalog, and whoever wrote it could have written any list. So the list is sealed with a secret
+key of the user, and a list without the right seal allows nothing. The key is made on first use and lies in
+``$XDG_STATE_HOME/flexroad/key``, by default ``~/.local/state/flexroad/key``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import hmac
+import json
+import os
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+KEY_BYTES = 32
+
+
+def seal(allowed: Sequence[str]) -> str:
+    """Return the seal of a list of folders; empty if the user has no key and none can be written."""
+    key = _key() or _new_key()
+    return _digest(key, allowed) if key else ""
+
+
+def sealed(allowed: object, text: object) -> bool:
+    """Return whether a text is the seal of a list of folders."""
+    key = _key()
+    if not key or not isinstance(allowed, list) or not isinstance(text, str):
+        return False
+    return hmac.compare_digest(_digest(key, allowed).encode(), text.encode())
+
+
+def _digest(key: bytes, allowed: Sequence[str]) -> str:
+    return hmac.new(key, json.dumps(list(allowed)).encode(), hashlib.sha256).hexdigest()
+
+
+def _path() -> Path:
+    state = os.environ.get("XDG_STATE_HOME") or Path(os.environ.get("HOME") or "/", ".local", "state")
+    return Path(state, "flexroad", "key")
+
+
+def _key() -> bytes:
+    """Return the user's key, empty if there is none."""
+    try:
+        key = _path().read_bytes()
+    except OSError:
+        return b""
+    return key if len(key) == KEY_BYTES else b""
+
+
+def _new_key() -> bytes:
+    """Write a new key unless another process has just written one; return the key, empty if that fails."""
+    path = _path()
+    temporary = path.with_name(f".key.{secrets.token_hex(8)}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(secrets.token_bytes(KEY_BYTES))
+        # Unlike a rename, this keeps the key that another process has written meanwhile.
+        with contextlib.suppress(FileExistsError):
+            os.link(temporary, path)
+    except OSError:
+        return b""
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+    return _key()

@@ -1,0 +1,81 @@
+"""Commands that read a catalog or a run from anyone ask for nothing outside its folder."""
+
+import json
+import shutil
+
+import pytest
+
+import flexroad as library
+from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.inspect.tile import open_tile
+
+
+@pytest.fixture
+def tampered(survey):
+    """Write the survey's catalog again with another name for each DSM file; return the catalog."""
+
+    def write(name):
+        path = survey.with_name("untrusted.json")
+        Catalog.read(survey).write(path, movable=False)
+        content = json.loads(path.read_text())
+        for feature in content["features"]:
+            feature["assets"]["dsm"]["flexroad:files"] = [name]
+            feature["assets"]["dsm"]["flexroad:extents"] = None
+        path.write_text(json.dumps(content))
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("name", ["/vsicurl/{url}/a.tif", "{url}/a.tif", "/vsicurl?url={url}/a.tif"])
+def test_catalog_with_address_is_refused_by_all_commands(flexroad, tampered, web, tmp_path, name):
+    catalog = tampered(name.format(url=web.url))
+    options = ("--method", "pixels", "--labels", "mask", "-o", tmp_path / "model")
+    for words in (
+        ("catalog", "check", catalog, "--allow", "/"),
+        ("train", catalog, *options, "--allow", "/"),
+        ("run", "--config", "paper", "--catalog", catalog, "--out", tmp_path / "run", "--allow", "/"),
+    ):
+        said = flexroad(*words).expected(2)
+        assert said.err.count("fetch it first") == len(said.err.splitlines()) == 1
+    assert web.requests == []
+
+
+def test_catalog_with_file_outside_needs_allow_for_all_commands(flexroad, tampered, survey, tmp_path):
+    outside = tmp_path / "elsewhere" / "dsm.tif"
+    outside.parent.mkdir()
+    shutil.copy(next((survey.parent / "dsm").glob("*.tif")), outside)
+    catalog, option = tampered(str(outside)), ("--allow", str(outside.parent))
+    options = ("--method", "pixels", "--labels", "mask", "-o", tmp_path / "model")
+    for words in (("catalog", "check", catalog), ("train", catalog, *options)):
+        said = flexroad(*words).expected(2)
+        assert f"dsm names {outside}, outside" in said.err
+        assert " ".join(option) in said.err
+    assert "missing" not in flexroad("catalog", "check", catalog, *option).out
+
+
+def test_run_from_another_user_needs_allow(flexroad, survey, quick_config, tmp_path, monkeypatch):
+    run, points = tmp_path / "run", tmp_path / "points.csv"
+    flexroad(
+        "run", "--config", quick_config, "--catalog", survey, "--out", run, "--executor", "serial"
+    ).expected(0)
+    tile = Catalog.read(survey).tiles[0]
+    points.write_text(f"easting,northing\n{tile.grid.west + 9},{tile.grid.south + 9}\n")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
+    option = ("--allow", str(survey.parent))
+    for words in (
+        ("rerun", run, "--executor", "serial"),
+        ("report", run, "--format", "html"),
+        ("query", run, "--points", points),
+        ("status", run),
+    ):
+        assert "--allow" in flexroad(*words).expected(2).err, words
+        flexroad(*words, *option).expected(0)
+    with pytest.raises(CatalogError, match="--allow"):
+        open_tile(run, tile.id)
+    view = library.open_run(run)
+    with pytest.raises(CatalogError, match="--allow"):
+        view.height(tile.grid.west + 9, tile.grid.south + 9)
+    allowed = library.open_run(run, allow=[survey.parent])
+    assert allowed.tile(tile.id).dsm.notnull().any()
+    assert allowed.height(tile.grid.west + 9, tile.grid.south + 9) > 0
