@@ -1,13 +1,14 @@
 """The head on DINOv2 and its file: a linear map and its metadata.
 
-The file is safetensors: the arrays ``weight`` and ``bias``, and `About` as JSON in its metadata.
+The file is safetensors: the arrays ``weight`` and ``bias``, and `About` as JSON in its metadata. It may come
+from others: sizes are checked before arrays are read, and values before they are used.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,18 @@ from pydantic import Field, ValidationError
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
-from flexroad.tasks.segment.dinov2.backbone import Backbone, missing_extra
+from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, missing_extra
 from flexroad.tasks.segment.dinov2.windows import Predict
 
 KEY = "flexroad"
 """Key of `About` in the file's metadata."""
 REMEDY = "train one: `flexroad train CATALOG --method dinov2 --labels mask -o MODEL.safetensors`"
+
+MOST_BYTES = 2**28
+"""Largest file (bytes); a head for one class and 40 layers of the largest DINOv2 has 240 KiB."""
+Text = Annotated[str, Field(max_length=1000)]
+Mean = Annotated[float, Field(ge=0, le=1)]
+Deviation = Annotated[float, Field(gt=0, le=1)]
 
 
 class About(Options):
@@ -28,18 +35,22 @@ class About(Options):
 
     kind: Literal["linear head on DINOv2 patch tokens"] = "linear head on DINOv2 patch tokens"
     version: Literal[1] = 1
-    backbone: str = Field(description="hub name, or folder on the machine where the head was trained")
-    model_type: str = Field(description="dinov2 or dinov2_with_registers")
+    backbone: Text = Field(description="hub name, or folder on the machine where the head was trained")
+    model_type: Text = Field(description="dinov2 or dinov2_with_registers")
     registers: int = Field(ge=0, description="number of register tokens")
-    weights: str = Field(description="hash of the backbone's weights, see `Backbone.weights`")
-    hidden_size: int = Field(gt=0, description="length of a token")
-    layers: int = Field(gt=0, description="number of last layers whose tokens are concatenated")
-    window_px: int = Field(gt=0, description="side of the windows in training (pixels)")
-    gsd_m: float = Field(gt=0, description="ground sampling distance in training (m)")
-    mean: tuple[float, float, float] = Field(description="subtracted from red, green and blue (0 to 1)")
-    std: tuple[float, float, float] = Field(description="divisor of red, green and blue after that")
-    classes: tuple[str, ...] = Field(
-        description="class of each weight row; sigmoid(logit) is its probability"
+    weights: Text = Field(description="hash of the backbone's weights, see `Backbone.weights`")
+    hidden_size: int = Field(gt=0, le=2**16, description="length of a token")
+    layers: int = Field(gt=0, le=40, description="number of last layers whose tokens are concatenated")
+    window_px: int = Field(
+        ge=28, le=2044, multiple_of=PATCH, description="side of the windows in training (pixels)"
+    )
+    gsd_m: float = Field(ge=0.02, le=5, description="ground sampling distance in training (m)")
+    mean: tuple[Mean, Mean, Mean] = Field(description="subtracted from red, green and blue (0 to 1)")
+    std: tuple[Deviation, Deviation, Deviation] = Field(
+        description="divisor of red, green and blue after that"
+    )
+    classes: tuple[Text, ...] = Field(
+        max_length=1000, description="class of each weight row; sigmoid(logit) is its probability"
     )
     threshold: float = Field(gt=0, lt=1, description="probability from which a pixel is road")
     trained: dict[str, str | int | float] = Field(description="provenance: data, labels, options, metrics")
@@ -79,25 +90,43 @@ def read_head(path: Path) -> Head:
     if not path.is_file():
         raise TaskError(f"no head for DINOv2 at {path}; {REMEDY}", str(path))
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
         with safe_open(path, framework="numpy") as file:
             about = About.model_validate_json((file.metadata() or {}).get(KEY, "{}"))
-            head = Head(file.get_tensor("weight"), file.get_tensor("bias"), about)
-    except (SafetensorError, ValidationError, OSError) as error:
-        cause = error.errors()[0]["loc"] if isinstance(error, ValidationError) else error
-        reason = f"its metadata lack {'.'.join(map(str, cause))}" if isinstance(cause, tuple) else cause
+            if "road" not in about.classes:
+                raise ValueError("road is not one of its classes")
+            shape = len(about.classes), about.layers * about.hidden_size
+            return Head(_array(file, "weight", shape), _array(file, "bias", shape[:1]), about)
+    except (SafetensorError, ValueError, OSError) as error:
         raise TaskError(
-            f"{path} is not a head for DINOv2, or is damaged ({reason}); {REMEDY}", str(path)
+            f"{path} is not a head for DINOv2, or is damaged ({_reason(error)}); {REMEDY}", str(path)
         ) from error
-    if "road" not in about.classes or head.weight.shape != (
-        len(about.classes),
-        about.layers * about.hidden_size,
-    ):
-        raise TaskError(
-            f"{path}: a weight of shape {head.weight.shape} does not fit classes {about.classes} and "
-            f"{about.layers} layers of {about.hidden_size}; {REMEDY}",
-            str(path),
-        )
-    return head
+
+
+def _array(file: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an array of a file, checked.
+
+    Raises
+    ------
+    ValueError
+        If its shape or type is another, or a value is not finite.
+    """
+    part = file.get_slice(name)
+    found, kind = tuple(part.get_shape()), part.get_dtype()
+    if found != shape or kind != "F32":
+        raise ValueError(f"its {name} is {kind} of shape {found}, not F32 of {shape}")
+    values: NDArray[np.float32] = file.get_tensor(name)
+    if not np.isfinite(values).all():
+        raise ValueError(f"its {name} has values that are not numbers")
+    return values
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"its metadata, {'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return " ".join(str(error).split())[:200]
 
 
 def check(head: Head, backbone: Backbone) -> None:

@@ -20,7 +20,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.segment.pixels.features import features, read_tile_photo
-from flexroad.tasks.segment.pixels.model import About, Model, require
+from flexroad.tasks.segment.pixels.model import About, encode, require
+from flexroad.tasks.segment.pixels.trees import MOST_LEAVES, MOST_TREES
 from flexroad.tasks.segment.training_types import Progress, Round, Sample, Trained
 from flexroad.tasks.types import Bools, Floats
 
@@ -37,7 +38,7 @@ class Options(options.Options):
     cells: int = Field(
         12000, ge=100, description="greatest number of cells drawn per tile, half of them road"
     )
-    rounds: int = Field(200, ge=1, le=5000, description="greatest number of trees")
+    rounds: int = Field(200, ge=1, le=MOST_TREES, description="greatest number of trees")
     patience: int = Field(
         50, ge=1, description="stop after this many rounds without a better IoU on the held-out strips"
     )
@@ -45,7 +46,7 @@ class Options(options.Options):
     learning_rate: float = Field(
         0.1, gt=0, le=1, description="learning rate: factor on the values of each tree"
     )
-    leaves: int = Field(15, ge=2, le=255, description="greatest number of leaves per tree")
+    leaves: int = Field(15, ge=2, le=MOST_LEAVES, description="greatest number of leaves per tree")
     leaf_cells: int = Field(100, ge=1, description="least number of cells in a leaf")
     smooth: float = Field(5.0, ge=0, description="L2 penalty on leaf values")
     share: float = Field(0.3, gt=0, le=1, description="fraction of the features that each split chooses from")
@@ -127,7 +128,7 @@ def train(
         "rounds": rounds,
         "options": options.model_dump_json(),
     }
-    return Trained(_model(classifier, train_cells, threshold, facts).encode(), ".skops", history)
+    return Trained(_model(classifier, train_cells, threshold, facts), ".skops", history)
 
 
 def _cross_validate(train: _Cells, validation: _Cells, options: Options) -> tuple[int, float, float]:
@@ -212,7 +213,7 @@ def _fit(train: _Cells, validation: _Cells, rounds: int, options: Options) -> An
     )
 
 
-def _model(classifier: Any, train: _Cells, threshold: float, facts: dict[str, str | int | float]) -> Model:
+def _model(classifier: Any, train: _Cells, threshold: float, facts: dict[str, str | int | float]) -> bytes:
     from sklearn import __version__
 
     about = About(
@@ -223,7 +224,7 @@ def _model(classifier: Any, train: _Cells, threshold: float, facts: dict[str, st
         scikit_learn=__version__,
         trained=facts,
     )
-    return Model(classifier, about)
+    return encode(about, classifier)
 
 
 def _draw(samples: Sequence[Sample], options: Options, name: str) -> _Cells:
