@@ -5,6 +5,7 @@
 
 import importlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,7 +46,7 @@ def check(module: str, function: str, copies: Iterator[bytes], path: Path) -> No
         folder.mkdir()
         for beside in path.parent.iterdir():
             if beside.is_file() and beside != path:
-                (folder / beside.name).symlink_to(beside)
+                shutil.copy(beside, folder)
         files.append(folder / path.name)
         files[-1].write_bytes(copy)
     done = subprocess.run(

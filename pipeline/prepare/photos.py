@@ -156,6 +156,9 @@ def _files(images: Iterable[Path]) -> list[Path]:
         )
         if not inside:
             raise ConfigError(f"{path} has no photographs ({', '.join(SUFFIXES)})")
+        strange = next((file for file in inside if not file.is_file()), None)
+        if strange is not None:
+            raise ConfigError(f"{strange} is not a file; leave it out")
         files.update(dict.fromkeys(inside))
     return list(files)
 

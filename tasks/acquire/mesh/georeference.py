@@ -19,6 +19,10 @@ Offset = tuple[float, float, float]
 
 LOCAL_BELOW = 10_000.0
 """If all plan coordinates are smaller than this, they are taken as local, not as coordinates of a CRS."""
+FARTHEST = 1e9
+"""Largest offset, in any unit."""
+MOST_CHARACTERS = 2**20
+"""Longest sidecar file that is read."""
 SEARCHED_FOLDERS = 3
 """Number of folders searched for a sidecar file: the mesh's own and those above it."""
 
@@ -44,6 +48,12 @@ class Georeference:
         TaskError
             If the CRS is missing or invalid, or the vertices are local and there is no offset.
         """
+        if self.offset is not None and not all(abs(axis) <= FARTHEST for axis in self.offset):
+            raise TaskError(
+                f"{path} has the offset {self.offset}, which is no place; give --offset EASTING NORTHING "
+                "HEIGHT",
+                file=str(path),
+            )
         local = self.offset is None and bool(np.nanmax(np.abs(vertices[:, :2])) < LOCAL_BELOW)
         if self.crs is None or local:
             missing = "georeference" if local else "CRS"
@@ -85,10 +95,10 @@ def read_sidecar(path: Path) -> Georeference:
 
 def _deepscenario(path: Path) -> Georeference:
     try:
-        reference = json.loads(path.read_text(encoding="utf-8"))["reference_utm"]
+        reference = json.loads(_text(path))["reference_utm"]
         (zone, half), (east, north, up) = reference["zone"], map(float, reference["offset"])
         return Georeference(_utm(int(zone), str(half)), (east, north, up))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise TaskError(
             f'{path} has no reference_utm with a zone like [17, "N"] and an offset of three numbers: '
             f"{error}; give --crs and --offset",
@@ -97,7 +107,7 @@ def _deepscenario(path: Path) -> Georeference:
 
 
 def _odm(path: Path) -> Georeference:
-    head, _, rest = path.read_text(encoding="utf-8", errors="replace").strip().partition("\n")
+    head, _, rest = _text(path).strip().partition("\n")
     zone = re.fullmatch(r"WGS84 UTM (\d{1,2})\s?([NS])", head.strip(), re.IGNORECASE)
     try:
         east, north, *_ = (float(number) for number in rest.partition("\n")[0].split())
@@ -109,12 +119,17 @@ def _odm(path: Path) -> Georeference:
     return Georeference(_utm(int(zone[1]), zone[2]) if zone else head.strip(), (east, north, 0.0))
 
 
+def _text(path: Path) -> str:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.read(MOST_CHARACTERS)
+
+
 def _prj(folder: Path, stem: str) -> Georeference:
     own = folder / f"{stem}.prj"
-    files = [own] if own.is_file() else sorted(folder.glob("*.prj"))
+    files = [own] if own.is_file() else sorted(file for file in folder.glob("*.prj") if file.is_file())
     if len(files) != 1:
         return Georeference()
-    return Georeference(files[0].read_text(encoding="utf-8", errors="replace").strip())
+    return Georeference(_text(files[0]).strip())
 
 
 def _utm(zone: int, half: str) -> str:

@@ -7,6 +7,8 @@ gives a note, and edges with more or fewer than two faces are not checked.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,16 +16,27 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks import memory
+from flexroad.tasks.acquire.images import bounded
+from flexroad.tasks.acquire.mesh import gltf
+from flexroad.tasks.acquire.mesh.beside import FACTOR, Beside
 from flexroad.tasks.acquire.mesh.georeference import Georeference, Offset, read_sidecar
 from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 from flexroad.tasks.acquire.mesh.textures import Textures
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 UPRIGHT = 2.0
 """Limit of side area to plan area; above it the upward axis of the mesh is wrong."""
 AXES = "xyz"
+FARTHEST = 1e9
+"""Largest coordinate, in any unit: beyond it are no places on Earth, but damaged numbers."""
+MOST_REPEATS = 1e6
+"""Largest texture coordinate: how often a texture is repeated across a mesh."""
+FACE_BYTES = 200
+"""Memory that a face takes with its corners, colours and copies (bytes)."""
+SMALLER = "divide the mesh, or use a coarser one"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +86,12 @@ def read_mesh(
     TaskError
         If the mesh cannot be read, has no georeference, or lacks colours that are needed.
     """
-    scene = _scene(path)
-    images = Textures(path) if colours else None
-    parts = [
-        _part(path, scene.geometry[name], matrix, images)
-        for matrix, name in (scene.graph[node] for node in sorted(scene.graph.nodes_geometry))
-        if len(getattr(scene.geometry[name], "faces", ()))
-    ]
+    resolver = Beside(path)
+    with _errors(path, resolver):
+        scene = _scene(path, resolver)
+        if colours and resolver.refused is not None:
+            raise resolver.refused
+        parts = list(_parts(path, scene, Textures(path) if colours else None))
     if not parts:
         raise TaskError(
             f"{path} has no faces; export a mesh, or use its points: prepare points", file=str(path)
@@ -87,6 +99,7 @@ def read_mesh(
     vertices = _z_up(np.concatenate([part.vertices for part in parts]), up or _usual_up(path))
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([p.faces + first for p, first in zip(parts, counts, strict=False)])
+    vertices, faces = _used(path, vertices, faces)
     notes = _check(path, vertices, faces)
     given = Georeference(crs, offset)
     georeference = given.with_fallback(_in_scene(scene)).with_fallback(read_sidecar(path))
@@ -94,28 +107,63 @@ def read_mesh(
     return TexturedMesh(crs, placed, faces.astype(np.int32), *_colours(parts), notes)
 
 
-def _scene(path: Path) -> Any:
+@contextlib.contextmanager
+def _errors(path: Path, resolver: Beside) -> Iterator[None]:
+    """Context manager that turns the errors of trimesh into a `TaskError`."""
+    try:
+        with bounded(), np.errstate(all="ignore"):
+            yield
+    except TaskError:
+        raise
+    # For a broken file, its readers raise exceptions of many types.
+    except Exception as error:
+        if resolver.refused is not None:
+            raise resolver.refused from error
+        reason = " ".join(str(error).split())[:200]
+        raise TaskError(
+            f"{path} cannot be read as a mesh: {type(error).__name__}: {reason}; export it again",
+            file=str(path),
+        ) from error
+
+
+def _scene(path: Path, resolver: Beside) -> Any:
     import trimesh
 
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise TaskError(
             f"{path} is not a mesh of a supported format ({', '.join(SUFFIXES)}); convert it", file=str(path)
         )
     if not path.is_file():
-        raise TaskError(f"{path} does not exist", file=str(path))
-    try:
-        return trimesh.load_scene(path, process=False)
-    # For a broken file, its readers raise exceptions of many types.
-    except Exception as error:
-        raise TaskError(
-            f"{path} cannot be read as a mesh: {type(error).__name__}: {error}; export it again",
-            file=str(path),
-        ) from error
+        raise TaskError(f"{path} does not exist, or is not a file", file=str(path))
+    size = path.stat().st_size
+    memory.check(FACTOR * size, f"{path}, {size:,} bytes,", SMALLER, str(path))
+    if suffix in (".glb", ".gltf"):
+        elements = gltf.elements(path)
+        memory.check(FACE_BYTES * elements, f"{path} with {elements:,} elements", SMALLER, str(path))
+    with path.open("rb") as file:
+        return trimesh.load_scene(file, file_type=suffix[1:], resolver=resolver, process=False)
+
+
+def _parts(path: Path, scene: Any, images: Textures | None) -> Iterator[_Part]:
+    """Yield the geometries of a scene; one may be placed many times."""
+    placed = [scene.graph[node] for node in sorted(scene.graph.nodes_geometry)]
+    count = sum(len(getattr(scene.geometry[name], "faces", ())) for _, name in placed)
+    memory.check(FACE_BYTES * count, f"{path} with {count:,} faces", SMALLER, str(path))
+    for matrix, name in placed:
+        if len(getattr(scene.geometry[name], "faces", ())):
+            yield _part(path, scene.geometry[name], matrix, images)
 
 
 def _part(path: Path, mesh: Any, matrix: Floats, images: Textures | None) -> _Part:
     vertices = np.asarray(mesh.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise TaskError(
+            f"{path} has faces with corners {faces.min()} to {faces.max()}, but {len(vertices)} vertices; "
+            "export it again",
+            file=str(path),
+        )
     if images is None:
         return _Part(vertices, faces, None, None, None)
     visual, corners = mesh.visual, (len(faces), 3, 3)
@@ -127,7 +175,7 @@ def _part(path: Path, mesh: Any, matrix: Floats, images: Textures | None) -> _Pa
     image = images.texture(visual)
     uv = getattr(visual, "uv", None)
     if image is not None and uv is not None:
-        return _Part(vertices, faces, np.asarray(uv, np.float32)[faces], image, None)
+        return _Part(vertices, faces, _uv(path, uv, faces), image, None)
     if image is not None:
         raise TaskError(
             f"{path} has a texture but no texture coordinates; export it with UVs, or make no orthophoto: "
@@ -142,6 +190,17 @@ def _part(path: Path, mesh: Any, matrix: Floats, images: Textures | None) -> _Pa
             file=str(path),
         )
     return _Part(vertices, faces, None, None, np.broadcast_to(plain, corners))
+
+
+def _uv(path: Path, uv: Any, faces: NDArray[np.int64]) -> NDArray[np.float32]:
+    corners: NDArray[np.float32] = np.asarray(uv, np.float32)[faces]
+    if corners.shape != (len(faces), 3, 2) or not (np.abs(corners) <= MOST_REPEATS).all():
+        raise TaskError(
+            f"{path} has texture coordinates that are not numbers, or beyond {MOST_REPEATS:g}; export it "
+            "again, or make no orthophoto: --no-dop",
+            file=str(path),
+        )
+    return corners
 
 
 def _colours(
@@ -189,12 +248,24 @@ def _z_up(vertices: Floats, up: str) -> Floats:
     return vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
 
 
+def _used(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the mesh without the vertices that no face uses, if one of these is not a place."""
+    valid: Bools = np.asarray((np.abs(vertices) <= FARTHEST).all(axis=1))
+    if valid.all():
+        return vertices, faces
+    used, indices = np.unique(faces, return_inverse=True)
+    if not valid[used].all():
+        far = vertices[used][~valid[used]][0]
+        raise TaskError(
+            f"{path} has faces with missing or non-finite corners, or beyond {FARTHEST:g}: one at "
+            f"{', '.join(f'{axis:g}' for axis in far)}; remove it, or export the mesh again",
+            file=str(path),
+        )
+    return vertices[used], indices.reshape(faces.shape)
+
+
 def _check(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[str, ...]:
     """Raise `TaskError` if the mesh cannot be used; return notes on harmless defects."""
-    if faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices[np.unique(faces)]).all():
-        raise TaskError(
-            f"{path} has faces with missing or non-finite corners; export it again", file=str(path)
-        )
     local = vertices - vertices[faces[0, 0]]
     a, b, c = (local[faces[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)

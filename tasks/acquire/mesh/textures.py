@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks import memory
+from flexroad.tasks.acquire.images import check_pixels, image_errors
+from flexroad.tasks.acquire.mesh.beside import beside
 from flexroad.tasks.errors import TaskError
+
+REMEDY = "export it again, or make no orthophoto: --no-dop"
+HELD, DECODING = 3, 9
+"""Bytes per texel that a texture takes, and takes more while it is decoded."""
 
 
 class Textures:
@@ -32,7 +39,8 @@ class Textures:
             return None
         key = file if isinstance(file, Path) else id(file)
         if key not in self._decoded:
-            self._decoded[key] = _decode(self.path, file)
+            held = HELD * sum(image.size // 3 for image in self._decoded.values())
+            self._decoded[key] = _decode(self.path, file, held)
         return self._decoded[key]
 
     def plain_colour(self, visual: Any) -> NDArray[np.uint8] | None:
@@ -61,7 +69,7 @@ def _texture_files(path: Path) -> dict[str, Path]:
                 if words[:1] == ["end_header"]:
                     break
                 if words[:2] == ["comment", "TextureFile"] and len(words) == 3:
-                    return {"": path.parent / words[2]}
+                    return {"": beside(path, words[2])}
     return {}
 
 
@@ -70,7 +78,7 @@ def _of_mtl(path: Path) -> dict[str, Path]:
         library = next((line[6:].strip() for line in file if line.startswith("mtllib")), None)
     if library is None:
         return {}
-    mtl = path.parent / library
+    mtl = beside(path, library)
     if not mtl.is_file():
         raise TaskError(
             f"{path} needs the material file {library}, which is not beside it; put it there, or make no "
@@ -83,30 +91,23 @@ def _of_mtl(path: Path) -> dict[str, Path]:
         if key.lower() == "newmtl":
             material = value.strip()
         elif key.lower() == "map_kd":
-            files[material] = path.parent / value.strip().replace("\\", "/")
+            files[material] = beside(path, value.strip().replace("\\", "/"))
     return files
 
 
-def _decode(path: Path, source: Any) -> NDArray[np.uint8]:
-    """Return a texture as ``(h, w, 3)``, from a file or an open image."""
+def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
+    """Return a texture, ``(h, w, 3)``, from a file or an open image; others take ``held`` bytes."""
     from PIL import Image
 
-    name = f"{source} of {path}" if isinstance(source, Path) else f"in {path}"
+    name = f"the texture {source} of {path}" if isinstance(source, Path) else f"the texture in {path}"
     if isinstance(source, Path) and not source.is_file():
         raise TaskError(
             f"{path} needs the texture {source}, which does not exist; put it there, or make no orthophoto: "
             "--no-dop",
             file=str(path),
         )
-    # Texture atlases of 16,384 x 16,384 texels exceed the default limit of Pillow.
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
+    with image_errors(f"{name} cannot be read", REMEDY, path):
         image = Image.open(source) if isinstance(source, Path) else source
+        check_pixels(image, name, REMEDY, path)
+        memory.check(held + DECODING * image.width * image.height, name, "use smaller textures", str(path))
         return np.asarray(image.convert("RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise TaskError(
-            f"the texture {name} cannot be read: {error}; export it again, or make no orthophoto: --no-dop",
-            file=str(path),
-        ) from error
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit

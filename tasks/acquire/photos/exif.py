@@ -17,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 from pyproj import Transformer
 
 from flexroad.catalog.crs import in_plan, plan_unit, utm_of
+from flexroad.tasks import memory
+from flexroad.tasks.acquire.images import check_pixels, image_errors
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
@@ -28,8 +30,14 @@ GNSS_M = (3.0, 5.0)
 """Accuracy in plan and height of a receiver without corrections, if the file has none (m)."""
 RTK_M = {50: (0.03, 0.06), 34: (0.5, 1.0)}
 """The same by DJI's RtkFlag: 50 is a fixed solution, 34 a float solution."""
+BYTES = 12
+"""Memory that a photograph takes per pixel while it is matched: four copies in colour."""
 FAR_M = 1000.0
 """Photographs farther than this from all others belong to another place (m)."""
+HIGHEST_M = 100_000.0
+"""Greatest altitude of a camera, above or below the datum (m)."""
+LONGEST = 100
+"""Greatest focal length, in sides or diagonals of the sensor; a longer one is taken as unknown."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 """Diagonal of 35 mm film."""
 WIDEST = 3 / 2
@@ -103,30 +111,29 @@ def read_shot(path: Path) -> Shot:
     TaskError
         If the file is not an image or has no GNSS position.
     """
-    try:
-        with Image.open(path) as image:
-            exif, (width, height) = image.getexif(), image.size
-            xmp = _xmp(image.info.get("xmp", b""))
-            # A truncated file is only detected when its pixels are read.
-            image.draft("L", (width // 8, height // 8))
-            image.load()
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise TaskError(
-            f"{path} cannot be read as a photograph: {error}; leave it out", file=str(path)
-        ) from error
-    gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
-    detail = exif.get_ifd(ExifTags.IFD.Exif)
+    remedy = "leave it out, or make it smaller"
+    with image_errors(f"{path} cannot be read as a photograph", remedy, path), Image.open(path) as image:
+        check_pixels(image, str(path), remedy, path)
+        memory.check(BYTES * image.width * image.height, str(path), remedy, str(path))
+        exif, (width, height) = image.getexif(), image.size
+        xmp = _xmp(image.info.get("xmp", b""))
+        # A truncated file is only detected when its pixels are read.
+        image.draft("L", (width // 8, height // 8))
+        image.load()
+        gps = dict(exif.get_ifd(ExifTags.IFD.GPSInfo))
+        detail = exif.get_ifd(ExifTags.IFD.Exif)
     try:
         longitude, latitude, altitude, heights = _from_xmp(xmp) or _from_exif(gps)
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        accuracy = _accuracy(xmp, gps)
+        focal = _focal(xmp, detail.get(ExifTags.Base.FocalLengthIn35mmFilm), width, height)
+    except (ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
         raise TaskError(
-            f"{path} has no GNSS position in its EXIF or XMP tags; leave it out, "
-            "or write positions into the files (exiftool -GPSLatitude=...)",
+            f"{path} has no GNSS position in its EXIF or XMP tags, or numbers that cannot be read; leave it "
+            "out, or write positions into the files (exiftool -GPSLatitude=...)",
             file=str(path),
         ) from error
     names = (exif.get(tag, "") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-    camera = " ".join(str(name).strip("\0 ") for name in names).strip()
-    focal = _focal(xmp, detail.get(ExifTags.Base.FocalLengthIn35mmFilm), width, height)
+    camera = " ".join(" ".join(str(name).strip("\0 ").split()) for name in names).strip()[:100]
     return Shot(
         path=path,
         width=width,
@@ -134,7 +141,7 @@ def read_shot(path: Path) -> Shot:
         longitude=longitude,
         latitude=latitude,
         altitude=altitude,
-        accuracy=_accuracy(xmp, gps),
+        accuracy=accuracy,
         heights=heights,
         camera=camera,
         focal_px=focal,
@@ -239,7 +246,7 @@ def _validated(
 ) -> tuple[float, float, float, str]:
     # Receivers without a fix write zeros; NaN fails the comparisons below, too.
     has_fix = (longitude, latitude) != (0, 0)
-    if not (has_fix and abs(longitude) <= 180 and abs(latitude) <= 90 and math.isfinite(altitude)):
+    if not (has_fix and abs(longitude) <= 180 and abs(latitude) <= 90 and abs(altitude) <= HIGHEST_M):
         raise ValueError(f"{longitude}, {latitude}, {altitude} is not a position")
     return longitude, latitude, altitude, heights
 
@@ -254,11 +261,11 @@ def _accuracy(xmp: Mapping[str, str], gps: Mapping[int, Any]) -> tuple[float, fl
     if all(f"RtkStd{axis}" in xmp for axis in ("Lon", "Lat", "Hgt")):
         east, north, up = (float(xmp[f"RtkStd{axis}"]) for axis in ("Lon", "Lat", "Hgt"))
         # A drone without a solution writes zeros.
-        if min(east, north, up) > 0:
+        if min(east, north, up) > 0 and max(east, north, up) <= FAR_M:
             return max(east, north), up
     typical = RTK_M.get(int(xmp.get("RtkFlag", "0") or 0), GNSS_M)
     written = float(gps.get(ExifTags.GPS.GPSHPositioningError, math.nan))
-    return (written, written * typical[1] / typical[0]) if written > 0 else typical
+    return (written, written * typical[1] / typical[0]) if 0 < written <= FAR_M else typical
 
 
 def _focal(xmp: Mapping[str, str], film_mm: Any, width: int, height: int) -> float | None:
@@ -266,11 +273,11 @@ def _focal(xmp: Mapping[str, str], film_mm: Any, width: int, height: int) -> flo
 
     The equivalent compares diagonals of whole sensors (CIPA DCG-001); wide photographs are cropped in height.
     """
-    if float(xmp.get("CalibratedFocalLength") or 0) > 0:
-        return float(xmp["CalibratedFocalLength"])
-    if not film_mm or not float(film_mm) > 0:
-        return None
     longer, shorter = max(width, height), min(width, height)
+    if 0 < float(xmp.get("CalibratedFocalLength") or 0) <= LONGEST * longer:
+        return float(xmp["CalibratedFocalLength"])
+    if not film_mm or not 0 < float(film_mm) <= LONGEST * FILM_DIAGONAL_MM:
+        return None
     return float(film_mm) / FILM_DIAGONAL_MM * math.hypot(longer, max(shorter, longer / WIDEST))
 
 

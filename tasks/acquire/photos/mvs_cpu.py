@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks import options as base
+from flexroad.tasks.acquire import images as images  # sets OpenCV's limit
 from flexroad.tasks.acquire.photos.sfm import Reconstruction, View, colmap
 from flexroad.tasks.types import Bools, Floats
 
@@ -195,8 +196,12 @@ def _read(view: View, size: int) -> NDArray[np.uint8]:
 
     from flexroad.tasks.errors import TaskError
 
-    # The poses are those of the sensor, so the orientation tag is ignored.
-    image = cv2.imread(str(view.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        # The poses are those of the sensor, so the orientation tag is ignored.
+        image = cv2.imread(str(view.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        # More pixels than the limit of `images`.
+        image = None
     if image is None:
         raise TaskError(f"{view.path} can no longer be read", file=str(view.path))
     scale = _scale(view, size)

@@ -1,3 +1,4 @@
+import os
 import sys
 from dataclasses import replace
 
@@ -72,7 +73,7 @@ def test_coarsened_cells_are_at_least_four_stereo_pixels(requested, expected):
     assert coarser.step_m == max(expected)
 
 
-@pytest.mark.parametrize("invalid", ["gps", "pycolmap", "empty", "missing"])
+@pytest.mark.parametrize("invalid", ["gps", "pycolmap", "empty", "missing", "pipe"])
 def test_prepare_photos_invalid_input_leaves_no_folder(tmp_path, monkeypatch, invalid):
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -80,6 +81,8 @@ def test_prepare_photos_invalid_input_leaves_no_folder(tmp_path, monkeypatch, in
     for number in range(0 if invalid == "empty" else 3):
         tags = Image.Exif() if invalid == "gps" else make_photos.exif(centre + number)
         Image.new("RGB", (64, 48)).save(folder / f"{number}.jpg", exif=tags)
+    if invalid == "pipe":
+        os.mkfifo(folder / "9.jpg")
     if invalid == "pycolmap":
         monkeypatch.setitem(sys.modules, "pycolmap", None)
     messages = {
@@ -87,6 +90,7 @@ def test_prepare_photos_invalid_input_leaves_no_folder(tmp_path, monkeypatch, in
         "pycolmap": "pip install",
         "empty": "has no photographs",
         "missing": "does not exist",
+        "pipe": "9.jpg is not a file",
     }
     with pytest.raises((TaskError, ConfigError), match=messages[invalid]):
         prepare([folder / "nowhere" if invalid == "missing" else folder], tmp_path / "out", PrepareOptions())

@@ -1,16 +1,19 @@
 import io
+import subprocess
+import sys
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFile
 from pyproj import Transformer
 
-from flexroad.tasks import TaskError
+from flexroad.tasks import TaskError, memory
+from flexroad.tasks.acquire import images
 from flexroad.tasks.acquire.photos.exif import place_photos, read_control, read_shot
-from tests import make_photos
+from tests import fuzz, make_photos
 
 XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -180,3 +183,54 @@ def test_read_control_invalid_row_is_named(three, tmp_path, row):
     table.write_text(f"image,x_px,y_px,easting,northing,height\n0.jpg,1,2,3,4,5\n{row}\n")
     with pytest.raises(TaskError, match=r"control\.csv, row 2: .*columns are image,x_px"):
         read_control(table, place_photos(three))
+
+
+def test_read_shot_too_many_pixels_is_an_error_before_they_are_read(tmp_path, monkeypatch):
+    paths = [write(tmp_path / f"a.{s}", make_photos.exif(CENTRE), (640, 480)) for s in ("png", "jpg")]
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda _: pytest.fail("it was decoded"))
+    for path in paths:
+        monkeypatch.setattr(images, "MOST_PIXELS", 640 * 480 - 2)
+        with pytest.raises(TaskError, match=r"a\.... (has|cannot be read).* pixels.*leave it out"):
+            read_shot(path)
+        monkeypatch.setattr(images, "MOST_PIXELS", 640 * 480)
+        monkeypatch.setattr(memory, "limit", lambda: 10**6)
+        with pytest.raises(TaskError, match=r"would need about .* of memory.*make it smaller"):
+            read_shot(path)
+
+
+def test_opencv_has_the_same_limit():
+    code = "import flexroad.tasks.acquire.photos.mvs_cpu, os; print(os.environ['OPENCV_IO_MAX_IMAGE_PIXELS'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) == images.MOST_PIXELS == 400_000_000
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"RtkStdLon": "x", "RtkStdLat": "1", "RtkStdHgt": "1"},
+        {"RtkFlag": "1e3"},
+        {"CalibratedFocalLength": "3000 px"},
+    ],
+)
+def test_read_shot_tag_that_is_no_number_is_an_error(tmp_path, tags):
+    place = {"GpsLongitude": "8", "GpsLatitude": "50", "AbsoluteAltitude": "100"}
+    with pytest.raises(TaskError, match="numbers that cannot be read; leave it out"):
+        read_shot(write(tmp_path / "a.jpg", **place, **tags))
+
+
+def test_read_shot_extreme_numbers_are_not_used(tmp_path):
+    place = {"GpsLongitude": "8", "GpsLatitude": "50", "AbsoluteAltitude": "100"}
+    odd = {"RtkStdLon": "inf", "RtkStdLat": "1", "RtkStdHgt": "1", "CalibratedFocalLength": "1e300"}
+    shot = read_shot(write(tmp_path / "a.jpg", **place, **odd))
+    assert (shot.accuracy, shot.focal_px) == ((3, 5), None)
+    with pytest.raises(TaskError, match="has no GNSS position"):
+        read_shot(write(tmp_path / "b.jpg", **place | {"AbsoluteAltitude": "1e300"}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_read_shot_damaged_at_random_raises_or_reads(tmp_path, suffix):
+    path = write(tmp_path / f"a.{suffix}", make_photos.exif(CENTRE))
+    fuzz.check(
+        "flexroad.tasks.acquire.photos.exif", "read_shot", fuzz.damaged(path.read_bytes(), 200, 1), path
+    )

@@ -1,0 +1,80 @@
+"""Photographs and textures: decoded only if their pixels are few enough, whatever their file claims."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flexroad.tasks.errors import TaskError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+MOST_PIXELS = 400_000_000
+"""Largest photograph or texture (pixels), 1.1 GiB as RGB: sensors of drones have up to 150 million pixels,
+atlases of 16,384 x 16,384 texels 268 million. A PNG of 2 MB may have 2,500 million."""
+# OpenCV reads its limit when it is imported first.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
+
+
+@contextlib.contextmanager
+def bounded() -> Iterator[None]:
+    """Context manager in which Pillow opens images up to `MOST_PIXELS`, without a warning."""
+    from PIL import Image
+
+    # Pillow refuses twice its limit, and warns from once.
+    before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MOST_PIXELS // 2
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
+
+
+@contextlib.contextmanager
+def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
+    """Context manager that bounds images, and turns the errors of reading one into a `TaskError`.
+
+    Parameters
+    ----------
+    failure : str
+        Beginning of the message: the image, and that it cannot be read.
+    remedy : str
+        What the user can do.
+    file : Path
+        The file at fault.
+
+    Raises
+    ------
+    TaskError
+        If the image is damaged or has too many pixels.
+    """
+    try:
+        with bounded():
+            yield
+    except TaskError:
+        raise
+    except Exception as error:  # Pillow raises many types for damaged files
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise TaskError(f"{failure}: {reason}; {remedy}", file=str(file)) from error
+
+
+def check_pixels(image: Image, name: str, remedy: str, file: Path) -> None:
+    """Check the size of an open image before its pixels are read.
+
+    Raises
+    ------
+    TaskError
+        If it has more than `MOST_PIXELS`, see `image_errors` for the parameters.
+    """
+    if image.width * image.height > MOST_PIXELS:
+        raise TaskError(
+            f"{name} has {image.width:,} x {image.height:,} pixels, more than {MOST_PIXELS / 1e6:.0f} "
+            f"million; {remedy}",
+            file=str(file),
+        )
