@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.point_clouds import chunks
-from flexroad.catalog.storage.paths import output_file
+from flexroad.catalog.storage.outputs import output_file
 
 Floats = NDArray[np.float64]
 

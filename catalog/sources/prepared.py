@@ -26,7 +26,7 @@ from rasterio.errors import CRSError, RasterioIOError
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
-from flexroad.catalog.storage.paths import output_file
+from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "reference")

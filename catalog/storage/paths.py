@@ -18,10 +18,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
-from uuid import uuid4
+
+from flexroad.catalog.storage.outputs import atomic_path
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -273,53 +273,6 @@ def write(where: Location, data: bytes) -> None:
     with atomic_path(where) as temporary:
         where.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
-
-
-@contextlib.contextmanager
-def atomic_path(where: Path) -> Iterator[Path]:
-    """Yield a temporary file beside ``where``; rename it to ``where`` at the end of the block.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written, or ``where`` is no regular file (`output_file`); names ``where``. No
-        temporary file is left.
-    """
-    target = output_file(where)
-    temporary = target.with_name(f".{target.name}.{uuid4().hex}.tmp")
-    try:
-        yield temporary
-        temporary.replace(target)
-    except OSError as error:
-        # The error of a full disk has no file name, that of a failed rename has the temporary one.
-        number = error.errno or errno.EIO
-        raise OSError(number, error.strerror or str(error), str(where)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def output_file(where: Path) -> Path:
-    """Return the file that is written for a name: the name itself, or the file that a link points to.
-
-    Raises
-    ------
-    OSError
-        If something else than a regular file has that name: a rename would replace a device, a pipe or a
-        socket by a file.
-    """
-    try:
-        target = where.resolve() if where.is_symlink() else where
-        mode = target.stat().st_mode
-    except FileNotFoundError:
-        return target
-    except RuntimeError as error:
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(where)) from error
-    if S_ISREG(mode):
-        return target
-    if S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(where))
-    raise OSError(errno.EINVAL, "is a device, pipe or socket and is not replaced", str(where))
 
 
 def remove(where: Location) -> None:

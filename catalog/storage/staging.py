@@ -12,7 +12,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flexroad.catalog.storage.paths import Location, atomic_path, read, write
+from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.catalog.storage.paths import Location, read, write
 
 PUT_S = 60.0
 """Shortest time between two uploads (s)."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.headers.vectors import opened, with_roads
 from flexroad.catalog.sources import prepared
-from flexroad.catalog.storage.paths import output_file
+from flexroad.catalog.storage.outputs import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor

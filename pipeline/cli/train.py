@@ -49,7 +49,7 @@ def train(
     """Train a segmenter on labelled tiles and validate it on others; write MODEL, MODEL.html, MODEL.json."""
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
-    from flexroad.catalog.storage.paths import output_file
+    from flexroad.catalog.storage.outputs import output_file
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
     from flexroad.pipeline.report.training import summary, write_model

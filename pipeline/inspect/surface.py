@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds, Grid
-from flexroad.catalog.storage.paths import atomic_path
+from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import sample, types
 from flexroad.tasks.errors import TaskError

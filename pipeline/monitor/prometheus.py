@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from flexroad.catalog.storage.paths import atomic_path
+from flexroad.catalog.storage.outputs import atomic_path
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry

@@ -27,7 +27,7 @@ from rasterio.windows import Window
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
-from flexroad.catalog.storage.paths import output_file
+from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Orthophoto

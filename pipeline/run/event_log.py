@@ -16,7 +16,8 @@ import json
 from dataclasses import asdict
 from typing import IO, Any
 
-from flexroad.catalog.storage.paths import Location, is_remote, output_file
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.worker.profiling import utc_now
 from flexroad.pipeline.worker.tile import TileResult

@@ -69,7 +69,7 @@ def published(folder, roads, **options):
             writer.write(layer, GRID, np.zeros(GRID.shape))
         has_mask = add_roads(writer, PrepareOptions(roads=roads, **options))
         dataset = writer.publish()
-    (tile,) = Catalog.read(dataset.catalog).tiles
+    (tile,) = Catalog.read(dataset.catalog, [roads.parent]).tiles
     assert has_mask == (tile.layer("road_mask") is not None)
     return tile, dataset.notes
 
