@@ -257,8 +257,10 @@ def fetch(where: UPath, folder: Path) -> Path:
     return folder / where.name
 
 
-def write(where: Location, data: bytes) -> None:
+def write(where: Location, data: bytes, flushed: bool = False) -> None:
     """Write a file atomically: to a temporary file that is then renamed, or in a bucket by one request.
+
+    With ``flushed`` the content is on the disk before the file has its name.
 
     Raises
     ------
@@ -273,6 +275,24 @@ def write(where: Location, data: bytes) -> None:
     with atomic_path(where) as temporary:
         where.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
+        if flushed:
+            flush(temporary)
+
+
+def flush(where: Location) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk; nothing in a bucket.
+
+    Raises
+    ------
+    OSError
+        If the disk does not take them.
+    """
+    if isinstance(where, Path):
+        opened = os.open(where, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def remove(where: Location) -> None:

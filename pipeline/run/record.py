@@ -172,7 +172,8 @@ class Run:
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""
-        return TileJob(graph, str(absolute(self.path)), str(absolute(self.store)), self.origin, force)
+        run, store = str(absolute(self.path)), str(absolute(self.store))
+        return TileJob(graph, run, store, self.origin, force, self.config.cluster.flush)
 
     def folder(self, tile_id: str) -> TileProducts:
         """Return the folder of a tile's products."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -52,21 +53,36 @@ class TileProducts:
         except (OSError, KeyError, TypeError, AttributeError):
             return False
 
-    def finish(self, item: dict[str, Any], products: Mapping[str, bytes]) -> None:
+    def finish(self, item: dict[str, Any], products: Mapping[str, bytes], flushed: bool = False) -> None:
         """Write the products, then the item that marks the tile as done.
 
         An existing item is removed first, so that a tile with old and new products never counts as done.
+        With ``flushed`` all of them are on the disk at the end, the products before the item.
         """
         paths.remove(self.path / "item.json")
         for name, data in products.items():
             paths.write(self.path / name, data)
-        paths.write(self.path / "item.json", json.dumps(item, indent=1, allow_nan=False).encode())
+        # Together they take hardly longer than one.
+        for name in products if flushed else ():
+            paths.flush(self.path / name)
+        self._mark("item.json", item, flushed)
         paths.remove(self.path / "failed.json")
 
-    def fail(self, failure: dict[str, Any]) -> None:
-        """Write failed.json and remove the item, so that the tile no longer counts as done."""
+    def fail(self, failure: dict[str, Any], flushed: bool = False) -> None:
+        """Write failed.json and remove the item, so that the tile no longer counts as done.
+
+        With ``flushed`` the file is on the disk at the end.
+        """
         paths.remove(self.path / "item.json")
-        paths.write(self.path / "failed.json", json.dumps(failure, indent=1, allow_nan=False).encode())
+        self._mark("failed.json", failure, flushed)
+
+    def _mark(self, name: str, content: dict[str, Any], flushed: bool) -> None:
+        paths.write(self.path / name, json.dumps(content, indent=1, allow_nan=False).encode(), flushed)
+        if flushed:
+            # The tile's folder may be new. Some network shares cannot flush folders.
+            for folder in (self.path, self.path.parent):
+                with contextlib.suppress(OSError):
+                    paths.flush(folder)
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:

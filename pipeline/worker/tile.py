@@ -49,6 +49,8 @@ class TileJob:
     """Origin of the run: whole-metre (easting, northing) that mesh translations are relative to."""
     force: frozenset[str] = frozenset()
     """Stages to compute even if their results are in the store."""
+    flushed: bool = False
+    """Whether products and marker are on the disk before the tile counts as done or failed."""
 
     @property
     def key(self) -> str:
@@ -149,7 +151,7 @@ def record_failure(
     marker = None
     # If the marker cannot be written (disk full), the returned record still has the failure.
     with contextlib.suppress(OSError):
-        job.folder.fail(to_failed(entry))
+        job.folder.fail(to_failed(entry), job.flushed)
         marker = marker_stat(job.folder, "failed")
     return replace(entry, marker=marker)
 
@@ -209,7 +211,7 @@ def _finish(job: TileJob, evaluator: Evaluator, rows: list[MetricsRow], notes: t
         files = products(job.graph, evaluator, job.origin)
         seconds = round(_seconds(evaluator), 4)
         written = _item(job.graph, rows, files, notes, seconds)
-        job.folder.finish(written, {name: data for name, (data, _) in files.items()})
+        job.folder.finish(written, {name: data for name, (data, _) in files.items()}, job.flushed)
     span.computed += 1
     span.bytes += sum(len(data) for data, _ in files.values())
     return from_item(written, marker_stat(job.folder, "done"))

@@ -459,8 +459,8 @@ def test_run_clock_set_back_midway_is_cached_next_time(night, before_tile, monke
             monkeypatch.setattr(f"flexroad.pipeline.{module}.utc_now", lambda: frozen)
         monkeypatch.setattr(paths, "write", write_with_old_time)
 
-    def write_with_old_time(location, data) -> None:
-        write(location, data)
+    def write_with_old_time(location, data, flushed=False) -> None:
+        write(location, data, flushed)
         os.utime(location, (now() - 5 * DAY_S,) * 2)
 
     before_tile(2, set_back)

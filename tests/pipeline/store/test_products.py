@@ -1,0 +1,70 @@
+"""Products and markers are on the disk before a tile counts as done or failed."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.store.products import TileProducts
+from tests.conftest import QUICK
+
+
+@pytest.fixture
+def events(monkeypatch) -> list[tuple[str, str]]:
+    """What is flushed and what is renamed, in this order."""
+    events: list[tuple[str, str]] = []
+    fsync, replace = os.fsync, Path.replace
+
+    def flushed(file):
+        name = Path(f"/proc/self/fd/{file}").readlink().name
+        # A temporary file is .NAME.<32 digits>.tmp.
+        events.append(("flush", name[1:-37] if name.endswith(".tmp") else name))
+        fsync(file)
+
+    def renamed(path, target):
+        events.append(("name", Path(target).name))
+        return replace(path, target)
+
+    monkeypatch.setattr(os, "fsync", flushed)
+    monkeypatch.setattr(Path, "replace", renamed)
+    return events
+
+
+def test_finish_flushes_products_then_item_then_folders(tmp_path, events):
+    folder = TileProducts.of(tmp_path, "a")
+    folder.finish({"id": "a"}, {"a.glb": b"mesh", "a.tif": b"heights"}, flushed=True)
+    products = [(event, name) for event in ("name", "flush") for name in ("a.glb", "a.tif")]
+    marker = [("flush", "item.json"), ("name", "item.json")]
+    assert events == [*products, *marker, ("flush", "a"), ("flush", "tiles")]
+
+
+def test_fail_flushes_marker_then_folders(tmp_path, events):
+    TileProducts.of(tmp_path, "a").fail({"tile": "a"}, flushed=True)
+    assert events == [("flush", "failed.json"), ("name", "failed.json"), ("flush", "a"), ("flush", "tiles")]
+
+
+def test_finish_on_share_that_cannot_flush_folders_completes(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def files_only(file):
+        if Path(f"/proc/self/fd/{file}").readlink().is_dir():
+            raise OSError(22, "Invalid argument")
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    folder = TileProducts.of(tmp_path, "a")
+    folder.finish({"id": "a"}, {}, flushed=True)
+    assert (folder.path / "item.json").exists()
+
+
+@pytest.mark.parametrize("flush", [True, False])
+def test_run_flushes_tiles_unless_cluster_says_not(flush, made_survey, tmp_path, events):
+    tiles = Catalog.read(made_survey / "catalog.parquet").tiles[:1]
+    config = compose({**QUICK, "cluster": {"flush": flush}}, "quick")
+    run_tiles(Run.create(tmp_path / "run", config, Catalog(tiles)), SerialExecutor())
+    assert (("flush", "item.json") in events) == flush
