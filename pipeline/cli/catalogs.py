@@ -10,6 +10,7 @@ import typer
 
 from flexroad.pipeline.cli.command import Allow, Command
 from flexroad.pipeline.cli.run import next_run
+from flexroad.pipeline.cli.stdio import echo
 
 if TYPE_CHECKING:
     from flexroad.catalog.tiling import TilingResult
@@ -138,11 +139,11 @@ def _write_catalog(result: TilingResult, output: Path) -> None:
     from flexroad.catalog import Catalog
 
     for note in result.notes:
-        typer.echo(f"note: {note}", err=True)
+        echo(f"note: {note}", err=True)
     catalog = Catalog(result.tiles)
     catalog.write(output)
-    typer.echo(f"{len(catalog.tiles)} tiles in {output}")
-    typer.echo(f"next: {next_run(output)}")
+    echo(f"{len(catalog.tiles)} tiles in {output}")
+    echo(f"next: {next_run(output)}")
 
 
 @catalogs.command("synthetic")
@@ -166,8 +167,8 @@ def catalog_synthetic(
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
-    typer.echo(f"{len(Catalog.read(path).tiles)} tiles in {path}")
-    typer.echo(f"next: {next_run(path)}")
+    echo(f"{len(Catalog.read(path).tiles)} tiles in {path}")
+    echo(f"next: {next_run(path)}")
 
 
 @catalogs.command("show")
@@ -180,9 +181,9 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
         layers = " ".join(f"{layer.name}({len(layer.files)})" for layer in tile.layers)
         date = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
         size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
-        typer.echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
+        echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.tiles})
-    typer.echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
+    echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
 
 
 @catalogs.command("check")
@@ -193,7 +194,7 @@ def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")], allo
 
     faults = 0
     for remark in check(Catalog.read(path, allow or ())):
-        typer.echo(f"warning: {remark.text}" if remark.fault else remark.text)
+        echo(f"warning: {remark.text}" if remark.fault else remark.text)
         faults += remark.fault
     if faults:
         raise typer.Exit(1)

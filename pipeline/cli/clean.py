@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 
@@ -29,7 +30,7 @@ def clean(
     from flexroad.pipeline.run.store_users import runs_using, unregister
 
     def say(line: str) -> None:
-        typer.echo(f"note: {line}", err=True)
+        echo(f"note: {line}", err=True)
 
     location, forgotten = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
     with run_lock(location, say):
@@ -48,11 +49,11 @@ def clean(
                 files[file.kind] += 1
                 sizes[file.kind] += file.size
                 if dry_run:
-                    typer.echo(str(file.path))
+                    echo(str(file.path))
             for user in () if dry_run else forgotten:
                 unregister(run.store, user)
     for kind, meaning in MEANING.items():
         if files[kind]:
-            typer.echo(f"{meaning}: {files[kind]} files, {sizes[kind] / 1e6:.1f} MB")
+            echo(f"{meaning}: {files[kind]} files, {sizes[kind] / 1e6:.1f} MB")
     verb = "would free" if dry_run else "freed"
-    typer.echo(f"{verb} {files.total()} files, {sizes.total() / 1e6:.1f} MB")
+    echo(f"{verb} {files.total()} files, {sizes.total() / 1e6:.1f} MB")

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.cli.stdio import echo, echo_document
+
 configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
 
 
@@ -22,7 +24,7 @@ def config_show(
 
     if name is None:
         for shipped_name, path in shipped().items():
-            typer.echo(f"{shipped_name:10} {path.read_text().splitlines()[0].lstrip('# ')}")
+            echo(f"{shipped_name:10} {path.read_text().splitlines()[0].lstrip('# ')}")
         return
     config = load_config(name)
     chains = {
@@ -30,7 +32,7 @@ def config_show(
         for variant, chain in config.chains.items()
     }
     sections = {key: getattr(config, key).model_dump(mode="json") for key in ("export", "cluster")}
-    typer.echo(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
+    echo_document(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
 
 
 @configs.command("template")
@@ -38,7 +40,7 @@ def config_template() -> None:
     """Print a configuration with every option, its default and its meaning."""
     from flexroad.pipeline.config.schema import template
 
-    typer.echo(template(), nl=False)
+    echo_document(template())
 
 
 @configs.command("schema")
@@ -48,4 +50,4 @@ def config_schema() -> None:
 
     from flexroad.pipeline.config.schema import schema
 
-    typer.echo(json.dumps(schema(), indent=1))
+    echo_document(json.dumps(schema(), indent=1))

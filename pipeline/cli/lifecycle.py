@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
+from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def format_summary(summary: Summary) -> str:
 
 def warn(line: str, kind: str = "warning") -> None:
     """Print a line to standard error."""
-    typer.echo(f"{kind}: {line}", err=True)
+    echo(f"{kind}: {line}", err=True)
 
 
 @contextlib.contextmanager

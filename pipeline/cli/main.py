@@ -16,6 +16,7 @@ from flexroad.pipeline.cli.configs import configs
 from flexroad.pipeline.cli.prepare import prepare
 from flexroad.pipeline.cli.results import figures, query, report, tables
 from flexroad.pipeline.cli.run import rerun, run, status
+from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.cli.train import train
 from flexroad.pipeline.errors import ConfigError
 
@@ -40,10 +41,10 @@ def main() -> None:
         app()
     except (CatalogError, ConfigError) as error:
         for line in str(error).splitlines():
-            print(f"error: {line}", file=sys.stderr)  # noqa: T201
+            echo(f"error: {line}", err=True)
         sys.exit(2)
     except OSError as error:
-        print(f"error: {error}; check the path and the disk, then repeat the command", file=sys.stderr)  # noqa: T201
+        echo(f"error: {error}; check the path and the disk, then repeat the command", err=True)
         sys.exit(2)
     finally:
         for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -61,5 +62,5 @@ def _root(
     if version:
         import importlib.metadata
 
-        typer.echo(importlib.metadata.version("flexroad"))
+        echo(importlib.metadata.version("flexroad"))
         raise typer.Exit

@@ -14,6 +14,7 @@ import typer
 
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.run import next_run
+from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.prepare.options import PrepareOptions
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def _executor(workers: int | None) -> Executor:
 
 
 def _log(line: str) -> None:
-    typer.echo(line, err=True)
+    echo(line, err=True)
 
 
 def _run(make: Callable[[], PreparedDataset]) -> None:
@@ -133,12 +134,12 @@ def _run(make: Callable[[], PreparedDataset]) -> None:
     except TaskError as error:
         raise ConfigError(str(error)) from error
     except KeyboardInterrupt:
-        typer.echo("interrupted; nothing was written", err=True)
+        echo("interrupted; nothing was written", err=True)
         raise typer.Exit(130) from None
     for note in dataset.notes:
-        typer.echo(f"note: {note}", err=True)
-    typer.echo(f"{dataset.tiles} tile{'s' * (dataset.tiles != 1)} in {dataset.catalog}")
-    typer.echo(f"next: {next_run(dataset.catalog)}")
+        echo(f"note: {note}", err=True)
+    echo(f"{dataset.tiles} tile{'s' * (dataset.tiles != 1)} in {dataset.catalog}")
+    echo(f"next: {next_run(dataset.catalog)}")
 
 
 @prepare.command("points", cls=Command)

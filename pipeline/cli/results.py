@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli.stdio import echo, echo_document
 from flexroad.pipeline.errors import ConfigError
 
 
@@ -26,8 +27,8 @@ def report(
         raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
     written = write_report(Run.open(path, allow or ()), form)
     if form != "html":
-        typer.echo(read(written).decode())
-    typer.echo(f"written to {written}", err=True)
+        echo_document(read(written).decode())
+    echo(f"written to {written}", err=True)
 
 
 def tables(
@@ -53,7 +54,7 @@ def tables(
     folders = (true, dsc3d, dsc3d_true)
     runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
     for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
-        typer.echo(str(written))
+        echo(str(written))
 
 
 def figures(
@@ -69,8 +70,8 @@ def figures(
     from flexroad.pipeline.run.record import Run
 
     for note in write_figures(Run.open(path, allow or ()), output, tile):
-        typer.echo(f"note: {note}", err=True)
-    typer.echo(f"figures in {output / 'figures.md'}")
+        echo(f"note: {note}", err=True)
+    echo(f"figures in {output / 'figures.md'}")
 
 
 def query(
@@ -86,4 +87,4 @@ def query(
 
     outside = query_csv(path, points, variant, sys.stdout, allow or ())
     if outside:
-        typer.echo(f"note: {outside} points lie on no finished tile; their columns are empty", err=True)
+        echo(f"note: {outside} points lie on no finished tile; their columns are empty", err=True)

@@ -13,7 +13,7 @@ import typer
 
 from flexroad.pipeline.cli.command import Allow
 from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Outcome, format_summary, report_outcome, warn
-from flexroad.pipeline.cli.stdio import ignore_write_errors
+from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def run(
         settings = load_config(config)
         graphs = tile_graphs(read_catalog(settings)[1], settings, checksum)
         for line in plan(graphs, root or path / "store", path):
-            typer.echo(line)
+            echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         settings = load_config(config)
@@ -204,8 +204,8 @@ def _run_tiles(
 
     folder = shlex.quote(str(run.path))
     console = Console(stderr=True)
-    executor = make_executor(partial(console.print, markup=False, highlight=False, soft_wrap=True))
     display = ProgressDisplay(sum(map(only, run.catalog.tiles)), console)
+    executor = make_executor(display.say)
     if outcome.textfile is not None:
         outcome.textfile.total = len(run.catalog.tiles)
 
@@ -227,13 +227,13 @@ def _run_tiles(
     finally:
         _write_map(run)
     outcome.exit_code, outcome.text = summary.exit_code, format_summary(summary)
-    typer.echo(f"{outcome.text}; results in {run.path}")
+    echo(f"{outcome.text}; results in {run.path}")
     if set(display.status) == {"cached"}:
-        typer.echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
+        echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
     if summary.failed:
-        typer.echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
+        echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
     elif not summary.exit_code:
-        typer.echo(f"next: flexroad report {folder} --format html")
+        echo(f"next: flexroad report {folder} --format html")
 
 
 def _write_map(run: Run) -> None:
@@ -249,7 +249,7 @@ def _write_map(run: Run) -> None:
 def _exit(outcome: Outcome) -> None:
     """End the command with its exit code; print the reason if no summary was printed."""
     if outcome.exit_code and outcome.summary is None:
-        typer.echo(outcome.text if outcome.exit_code == 130 else f"error: {outcome.text}", err=True)
+        echo(outcome.text if outcome.exit_code == 130 else f"error: {outcome.text}", err=True)
     raise typer.Exit(outcome.exit_code)
 
 
@@ -283,7 +283,7 @@ def status(
         from flexroad.pipeline.monitor.geojson import write_states
 
         write_states(opened, parse_location(geojson))
-        typer.echo(str(geojson))
+        echo(str(geojson))
         return
     _print_status(opened, as_json)
 
@@ -303,11 +303,11 @@ def _print_status(run: Run, as_json: bool) -> None:
             {key: value for key, value in failure.items() if key != "trace"} for failure in values["failures"]
         ]
         values["at_work"] = {"host": alive.host, "pid": alive.pid, "since": alive.since} if alive else None
-        typer.echo(json.dumps(values, indent=1))
+        echo_document(json.dumps(values, indent=1))
         return
     state, pace = progress(run, alive) if alive else (summary(run), "")
-    typer.echo(format_summary(state))
+    echo(format_summary(state))
     if lock_owner:
-        typer.echo(describe_owner(lock_owner) + pace)
+        echo(describe_owner(lock_owner) + pace)
     for failure in state.failures:
-        typer.echo(f"  {failure.notice}")
+        echo(f"  {failure.notice}")

@@ -1,4 +1,8 @@
-"""Standard output and error of a run, whose write errors are ignored: a full log disk must not stop it."""
+"""Standard output and error: lines without control characters; streams that ignore write errors.
+
+All commands print with `echo` and `echo_document`. File names, ids, tags and messages come from files, and a
+terminal would obey the control characters in them.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,21 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from typing import IO, Any
+
+import typer
+
+from flexroad.catalog.text import printable
+
+
+def echo(line: str, err: bool = False) -> None:
+    """Print one line to standard output or error; characters that cannot be printed are escaped."""
+    typer.echo(printable(line), err=err)
+
+
+def echo_document(text: str) -> None:
+    """Print a text of several lines to standard output."""
+    for line in text.removesuffix("\n").split("\n"):
+        echo(line)
 
 
 class LenientStream:
@@ -31,7 +50,10 @@ class LenientStream:
 
 @contextlib.contextmanager
 def ignore_write_errors() -> Iterator[None]:
-    """Ignore write errors of this process's standard output and error, which may be None."""
+    """Ignore write errors of this process's standard output and error, which may be None.
+
+    A full disk of the log must not stop a run.
+    """
     with (
         contextlib.redirect_stdout(sys.stdout and LenientStream(sys.stdout)),
         contextlib.redirect_stderr(sys.stderr and LenientStream(sys.stderr)),

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli.stdio import echo
 
 
 def train(
@@ -66,15 +67,15 @@ def train(
     for suffix in ("", ".html", ".json"):
         output_file(output.with_name(output.name + suffix))
     try:
-        outcome = train(tiles, loaded_config, options, lambda line: typer.echo(line, err=True))
+        outcome = train(tiles, loaded_config, options, lambda line: echo(line, err=True))
         model, page, _ = write_model(outcome, output)
     except TaskError as error:
         raise ConfigError(str(error)) from error
     for note in outcome.notes:
-        typer.echo(f"note: {note}", err=True)
-    typer.echo(f"{model}: {summary(outcome)}")
-    typer.echo(f"report: {page}")
-    typer.echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
+        echo(f"note: {note}", err=True)
+    echo(f"{model}: {summary(outcome)}")
+    echo(f"report: {page}")
+    echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
 
 
 def _settings(assignments: list[str]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from flexroad.catalog.text import printable
 from flexroad.pipeline.worker.tile import TileResult
 
 PLAIN_EVERY_S = 10.0
@@ -68,12 +69,12 @@ class ProgressDisplay:
         self.status[result.status] += 1
         self.stages.update(result.computed)
         for failure in result.failures:
-            self._print(f"failed {failure.notice}")
+            self.say(f"failed {failure.notice}")
         self.progress.update(self.bar, advance=1)
         self.counts_line.plain = f"  {self.counts()}"
         if not self.live and time.monotonic() - self.last_line > PLAIN_EVERY_S:
             self.last_line = time.monotonic()
-            self._print(self.line())
+            self.say(self.line())
 
     def counts(self) -> str:
         """Return the counts of tiles by status and of computed results by stage."""
@@ -88,6 +89,7 @@ class ProgressDisplay:
         left = spent / tried * (self.total - tried) if tried else float("nan")
         return f"{tried}/{self.total} tiles, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
 
-    def _print(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Print one line; characters that cannot be printed are escaped."""
         # File names may contain markup characters, and paths must not be wrapped.
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)

@@ -13,11 +13,14 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
+from flexroad.catalog.text import printable
 from flexroad.pipeline.report import quality
 from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as text, with its interval if it has one."""
+MARKUP = re.compile(r"[\\`*<>|~$]|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
+"""Characters that are markup in Markdown at this place: not, for example, ``_`` within a word."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +35,13 @@ class TilePictures:
 
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
-    parts = [f"# {content.title}", content.state + ".", content.reference]
+    parts = [f"# {_marked(content.title)}", content.state + ".", _marked(content.reference)]
     for title, table, line in _sections(content):
         parts += [f"## {title}", *([line] if line else []), markdown(table)]
     versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
-    parts += ["## Configuration", f"```yaml\n{content.config}```", f"Versions: {versions}."]
+    fence = "`" * max(3, 1 + max(map(len, re.findall("`+", content.config)), default=0))
+    config = _without_controls(content.config)
+    parts += ["## Configuration", f"{fence}yaml\n{config}{fence}", f"Versions: {versions}."]
     return "\n\n".join(parts) + "\n"
 
 
@@ -56,7 +61,9 @@ def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
 def template(name: str, *folders: Path) -> jinja2.Template:
     """Return a template from the given folders or this one, with filters for tables and pictures."""
     loader = jinja2.FileSystemLoader([*folders, Path(__file__).parent])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, finalize=_without_controls
+    )
     environment.filters["table"] = _html
     environment.filters["inline"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
     return environment.get_template(name)
@@ -92,7 +99,7 @@ def _cell(value: object, column: str) -> str:
         return "–"
     if isinstance(value, Real):
         return f"{value:,.0f}" if isinstance(value, Integral) or column == "T" else f"{value:.3f}"
-    return str(value)
+    return printable(str(value))
 
 
 def _cells(table: pd.DataFrame) -> list[list[str]]:
@@ -103,11 +110,23 @@ def _cells(table: pd.DataFrame) -> list[list[str]]:
     ]
 
 
+def _without_controls(value: object) -> object:
+    """Return a text with escapes for control characters but line breaks; anything else as it is."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "\n".join(map(printable, value.split("\n")))
+
+
+def _marked(text: str) -> str:
+    """Return a text in Markdown that shows as it is."""
+    return MARKUP.sub(r"\\\g<0>", printable(text))
+
+
 def markdown(table: pd.DataFrame) -> str:
     """Return a table as Markdown text."""
     numeric = are_numbers(table)
     lines = [list(table.columns), ["---:" if number else "---" for number in numeric], *_cells(table)]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(map(_marked, line)) + " |" for line in lines)
 
 
 def _html(table: pd.DataFrame) -> Markup:

@@ -1,0 +1,29 @@
+"""Text from files for display: without control characters, in one line."""
+
+from __future__ import annotations
+
+import reprlib
+
+MAX_SHOWN = 160
+"""Longest text of a value in a message."""
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
+
+
+def printable(text: str) -> str:
+    r"""Return a text with escapes (``\x1b``, ``\u202e``) for characters that cannot be printed.
+
+    These are control characters, line breaks, reversals of the direction and lone surrogates. A file name or
+    a tag may have them, and a terminal would obey them.
+    """
+    return text if text.isprintable() else "".join(map(_escaped, text))
+
+
+def shown(value: object) -> str:
+    """Return a value from a file in a short form, for messages."""
+    text = printable(_REPR.repr(value))
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+def _escaped(character: str) -> str:
+    return character if character.isprintable() else ascii(character)[1:-1]
