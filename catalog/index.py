@@ -24,6 +24,7 @@ import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
+from flexroad.catalog import ids
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.storage import paths
@@ -45,10 +46,7 @@ class Catalog:
     tiles: tuple[Tile, ...]
 
     def __post_init__(self) -> None:
-        ids = [tile.id for tile in self.tiles]
-        doubled = sorted({i for i in ids if ids.count(i) > 1}) if len(set(ids)) < len(ids) else []
-        if doubled:
-            raise CatalogError(f"tile ids must be unique, but {', '.join(doubled[:5])} occur more than once")
+        ids.check([tile.id for tile in self.tiles])
 
     @classmethod
     def read(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Catalog:

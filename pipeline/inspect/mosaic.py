@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid, Tile
 from flexroad.catalog.crs import same
 from flexroad.catalog.grid import LATTICE_TOLERANCE
+from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import absolute, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.lazy import lazy_raster
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.products import safe_name
 from flexroad.tasks.export import cog
 from flexroad.tasks.io.raster import opened
 

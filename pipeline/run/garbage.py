@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, absolute, exists, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
@@ -23,7 +24,6 @@ from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
-from flexroad.pipeline.store.products import safe_name
 from flexroad.pipeline.store.records import DONE, FAILED
 from flexroad.pipeline.worker.exports import SUFFIXES
 

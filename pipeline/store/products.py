@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import TileGraph
@@ -90,12 +91,6 @@ class TileProducts:
         except (OSError, ValueError):
             return None
         return content if isinstance(content, dict) else None
-
-
-def safe_name(tile_id: str) -> str:
-    """Return the name of a tile's folder and files: its id, changed if it is not a valid file name."""
-    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
-    return safe if safe and safe == tile_id else f"{safe}-{hashlib.sha256(tile_id.encode()).hexdigest()[:8]}"
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:

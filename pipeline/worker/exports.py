@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.graph.graph import TileGraph
-from flexroad.pipeline.store.products import safe_name
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
