@@ -9,30 +9,28 @@ from __future__ import annotations
 
 import difflib
 import json
-import struct
-import tempfile
+import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from sys import intern
 from typing import Any
 
-import numpy as np
-import shapely
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from flexroad.catalog import ids
+from flexroad.catalog import geoparquet, ids
+from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.geoparquet import Item, Unreadable
 from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
-from flexroad.catalog.tile import LAYERS, Layer, Tile, by_cover
+from flexroad.catalog.text import printable
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import AllowedFolders
-
-Item = dict[str, Any]
 
 STAC_VERSION = "1.1.0"
 PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
@@ -48,9 +46,16 @@ class Catalog:
     def __post_init__(self) -> None:
         ids.check([tile.id for tile in self.tiles])
 
+    @cached_property
+    def usable(self) -> tuple[Tile, ...]:
+        """The tiles without a `Tile.fault`; only these have a position."""
+        return tuple(tile for tile in self.tiles if not tile.fault)
+
     @classmethod
     def read(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Catalog:
         """Read a catalog written by `write`, from disk or a bucket.
+
+        Tiles of entries that cannot be used have a `Tile.fault`.
 
         Parameters
         ----------
@@ -63,7 +68,7 @@ class Catalog:
         Raises
         ------
         CatalogError
-            If the file is missing or is not a catalog; names the file.
+            If the file is missing or is not a catalog, or if no entry can be used; names the file.
         """
         path = _location(path)
         try:
@@ -75,14 +80,20 @@ class Catalog:
             raise CatalogError(f"catalog {path} is a folder; name its file, as in {example}") from error
         except OSError as error:
             raise CatalogError(f"cannot read catalog {path}: {error.strerror or error}") from error
+        is_json = path.suffix in JSON_SUFFIXES
         try:
-            items = _from_json(data) if path.suffix in JSON_SUFFIXES else _from_parquet(data)
-            folder, allowed = str(absolute(path).parent), AllowedFolders.of(path.parent, allow)
-            return cls(tuple(_tile(item, folder, allowed) for item in items))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CatalogError(
-                f"{path} is not a FlexRoad catalog: {error!r}; make one with `flexroad catalog`"
-            ) from error
+            entries: Iterable[Any] = _from_json(data) if is_json else geoparquet.entries(data)
+        except Exception as error:
+            # Damaged files raise any error in the readers of JSON and Parquet.
+            reason = printable(" ".join(str(error).split()))[:200] or type(error).__name__
+            raise _not_a_catalog(path, reason) from error
+        kind = "feature" if is_json else "row"
+        allowed = AllowedFolders.of(path.parent, allow)
+        tiles = TileReader(str(absolute(path).parent), allowed, kind, path.name).tiles(entries)
+        catalog = cls(tiles)
+        if tiles and not catalog.usable:
+            raise _not_a_catalog(path, f"no entry can be used: {tiles[0].fault}")
+        return catalog
 
     def write(self, path: Location | str, movable: bool = True) -> None:
         """Write the catalog.
@@ -133,7 +144,7 @@ class Catalog:
                 raise CatalogError(f"no tile {tile_id!r} in the catalog; did you mean {', '.join(near)}?")
         tiles = [tile for tile in self.tiles if not ids or tile.id in set(ids)]
         if bbox is not None:
-            tiles = [tile for tile in tiles if overlap(tile.grid.bounds, bbox)]
+            tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]
             if not tiles:
                 raise CatalogError(f"no tile touches --bbox {' '.join(f'{v:g}' for v in bbox)}")
         return Catalog(tuple(tiles))
@@ -144,6 +155,10 @@ def _location(path: Location | str) -> Location:
         return parse_location(path)
     except OSError as error:
         raise CatalogError(f"catalog {path}: {error.strerror or error}") from error
+
+
+def _not_a_catalog(path: Location, reason: str) -> CatalogError:
+    return CatalogError(f"{path} is not a FlexRoad catalog: {reason}; make one with `flexroad catalog`")
 
 
 def _rooted(tile: Tile, root: Location) -> Tile:
@@ -172,35 +187,52 @@ def item(tile: Tile, root: str = "") -> Item:
     root : str
         Folder that file names are relative to; empty: the folder of the file that the item is written to.
     """
-    grid = tile.grid
-    west, south, east, north = grid.bounds
-    to_wgs84 = _to_wgs84(grid.crs)
-    ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
-    corners = [list(to_wgs84.transform(*corner)) for corner in ring]
-    xs, ys = [c[0] for c in corners], [c[1] for c in corners]
-    is_code = grid.crs.upper().startswith("EPSG:")
+    properties: Item = {
+        "datetime": tile.datetime.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
+        **_placed(tile.grid, known=not tile.fault),
+        "flexroad:stratum": tile.stratum,
+        "flexroad:dataset": tile.dataset,
+        "flexroad:datetime_assumed": tile.datetime_assumed,
+        "flexroad:root": root,
+    }
     return {
         "type": "Feature",
         "stac_version": STAC_VERSION,
         "stac_extensions": [PROJECTION],
         "id": tile.id,
-        "geometry": {"type": "Polygon", "coordinates": [corners]},
-        "bbox": [min(xs), min(ys), max(xs), max(ys)],
-        "properties": {
-            "datetime": tile.datetime.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
-            "proj:code": grid.crs if is_code else None,
-            "proj:wkt2": None if is_code else grid.crs,
-            "proj:bbox": list(grid.bounds),
-            "proj:shape": [grid.height, grid.width],
-            "proj:transform": [grid.cell, 0.0, west, 0.0, -grid.cell, north],
-            "flexroad:stratum": tile.stratum,
-            "flexroad:dataset": tile.dataset,
-            "flexroad:datetime_assumed": tile.datetime_assumed,
-            "flexroad:root": root,
-        },
+        **(_outline(tile.grid) if not tile.fault else {"geometry": None}),
+        "properties": properties | ({"flexroad:fault": tile.fault} if tile.fault else {}),
         "assets": {layer.name: _asset(layer, root) for layer in tile.all_layers},
         "links": [],
     }
+
+
+def _outline(grid: Grid) -> Item:
+    """Return geometry and bbox in degrees; no bbox if the grid lies where they are not defined."""
+    west, south, east, north = grid.bounds
+    to_wgs84 = _to_wgs84(grid.crs)
+    ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
+    corners = [list(to_wgs84.transform(*corner)) for corner in ring]
+    xs, ys = [c[0] for c in corners], [c[1] for c in corners]
+    if not all(map(math.isfinite, xs + ys)):
+        return {"geometry": None}
+    return {
+        "geometry": {"type": "Polygon", "coordinates": [corners]},
+        "bbox": [min(xs), min(ys), max(xs), max(ys)],
+    }
+
+
+def _placed(grid: Grid, known: bool) -> Item:
+    """Return the fields of the projection extension, None if the grid is not known."""
+    is_code = grid.crs.upper().startswith("EPSG:")
+    fields = {
+        "proj:code": grid.crs if is_code else None,
+        "proj:wkt2": None if is_code else grid.crs,
+        "proj:bbox": list(grid.bounds),
+        "proj:shape": [grid.height, grid.width],
+        "proj:transform": [grid.cell, 0.0, grid.west, 0.0, -grid.cell, grid.north],
+    }
+    return fields if known else dict.fromkeys(fields)
 
 
 def _asset(layer: Layer, root: str) -> Item:
@@ -215,117 +247,29 @@ def _asset(layer: Layer, root: str) -> Item:
     }
 
 
-def _tile(item: Item, folder: str, allowed: AllowedFolders) -> Tile:
-    properties = item["properties"]
-    cell, _, west, _, _, north = properties["proj:transform"][:6]
-    height, width = properties["proj:shape"]
-    crs = properties.get("proj:code") or properties["proj:wkt2"]
-    assets = item["assets"]
-    # JSON may hold whole numbers; fingerprints are of the text of numbers.
-    grid = Grid(crs, float(west), float(north), float(cell), int(width), int(height))
-    layers, nearby = by_cover([_layer(name, assets[name]) for name in LAYERS if assets.get(name)], grid)
-    return Tile(
-        id=item["id"],
-        grid=grid,
-        layers=layers,
-        root=properties["flexroad:root"] or folder,
-        datetime=_datetime(properties["datetime"]),
-        datetime_assumed=bool(properties["flexroad:datetime_assumed"]),
-        stratum=properties["flexroad:stratum"],
-        # Older catalogs do not have this field.
-        dataset=properties.get("flexroad:dataset") or "",
-        nearby=nearby,
-        allowed=allowed,
-    )
-
-
-def _layer(name: str, asset: Item) -> Layer:
-    # Older catalogs do not have this field.
-    edges = asset.get("flexroad:extents")
-    return Layer(
-        name=name,
-        # Neighbouring tiles list the same files.
-        files=tuple(map(intern, asset["flexroad:files"])),
-        values=tuple(asset["flexroad:values"]),
-        crs=asset.get("flexroad:crs"),
-        extents=() if edges is None else _extents(np.asarray(edges, np.float64).tobytes()),
-    )
-
-
-@lru_cache(maxsize=16)
-def _extents(edges: bytes) -> tuple[Bounds, ...]:
-    """Return the extents of a layer's files; cached, because a tile's layers often have the same ones."""
-    return tuple(struct.iter_unpack("=4d", edges))
-
-
-def _datetime(value: str | datetime) -> datetime:
-    return value if isinstance(value, datetime) else datetime.fromisoformat(value)
-
-
-def _from_json(data: bytes) -> Iterable[Item]:
-    features: list[Item] = json.loads(data)["features"]
+def _from_json(data: bytes) -> list[Any]:
+    content = json.loads(data, object_pairs_hook=_unique)
+    features = content.get("features") if isinstance(content, dict) else None
+    if not isinstance(features, list):
+        raise ValueError("it has no list of features")
     return features
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> Item:
+    """Return an object of JSON; a name that it has twice gets a value that no field accepts."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = Counter(name for name, _ in pairs)
+        found |= {name: Unreadable("given twice") for name, count in names.items() if count > 1}
+    return found
 
 
 def _to_json(items: list[Item]) -> bytes:
     return json.dumps({"type": "FeatureCollection", "features": items}, indent=1).encode()
 
 
-def _from_parquet(data: bytes) -> Iterable[Item]:
-    """Return the fields of each item that `_tile` needs; reading whole items is many times slower."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
-    paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
-    columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
-    plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
-    plain += [
-        name for name in columns if name.endswith((".flexroad:files", ".flexroad:values", ".flexroad:crs"))
-    ]
-    # Reader threads may still be alive when a short process ends, and would abort it.
-    rows = file.read(plain, use_threads=False).to_pylist()
-    extents = [name for name in columns if name.endswith(".flexroad:extents")]
-    if extents:
-        _add_extents(rows, file.read(extents, use_threads=False)["assets"].combine_chunks())
-    return ({"id": row["id"], "assets": row["assets"], "properties": row} for row in rows)
-
-
-def _add_extents(rows: list[Item], assets: Any) -> None:
-    """Add the extents to the rows' assets as arrays; as lists of numbers they take several times as long."""
-    for field in assets.type:
-        column = assets.field(field.name).field("flexroad:extents")
-        ends, edges = column.offsets.to_numpy().tolist(), column.values.to_numpy()
-        for row, begin, end in zip(rows, ends[:-1], ends[1:], strict=True):
-            if begin < end:
-                row["assets"][field.name]["flexroad:extents"] = edges[begin:end]
-
-
 def _to_parquet(items: list[Item]) -> bytes:
-    """Return the items in the layout of stac-geoparquet; its own conversion is many times slower."""
-    import pyarrow as pa
-    from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
-
-    # Columns are inferred from the item. An item with all fields gives every catalog the same schema.
-    schema = parse_stac_items_to_arrow([_full_item()]).read_all().schema
-    with tempfile.TemporaryDirectory() as folder:
-        # `to_parquet` writes only to files.
-        file = Path(folder) / "catalog.parquet"
-        to_parquet(pa.Table.from_pylist([_row(item) for item in items], schema), file)
-        return file.read_bytes()
-
-
-def _row(item: Item) -> Item:
-    """Return an item as a table row: properties as columns, the outline as WKB."""
-    row: Item = {name: value for name, value in item.items() if name != "properties"} | item["properties"]
-    (ring,) = item["geometry"]["coordinates"]
-    corners = ("xmin", "ymin", "xmax", "ymax")
-    row |= {
-        "geometry": shapely.to_wkb(shapely.Polygon(ring)),
-        "bbox": dict(zip(corners, item["bbox"], strict=True)),
-        "datetime": _datetime(item["properties"]["datetime"]),
-    }
-    return row
+    return geoparquet.table_bytes(items, _full_item())
 
 
 def _full_item() -> Item:
@@ -333,5 +277,5 @@ def _full_item() -> Item:
     layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832", ((0.0, 0.0, 1.0, 1.0),)) for name in LAYERS)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
-    whole["properties"]["proj:wkt2"] = ""
+    whole["properties"] |= {"proj:wkt2": "", "flexroad:fault": ""}
     return whole

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import compress
 
 from flexroad.catalog.errors import CatalogError
@@ -113,6 +113,9 @@ class Tile:
     """Name of the source dataset in reports ("GeRoD"), or empty if unknown."""
     nearby: tuple[Layer, ...] = ()
     """Layers of which files lie within `REACH_M`, but none on the tile itself, in the order of `LAYERS`."""
+    fault: str = ""
+    """Why the tile's entry in a catalog cannot be used, or empty. `load` then fails with this message; the
+    tile has no layers, and its grid and date mean nothing (`faulty`)."""
     allowed: AllowedFolders | None = field(default=None, compare=False, repr=False)
     """Where its files may lie; None if the program itself has made the tile and has not read it."""
 
@@ -190,17 +193,24 @@ class Tile:
         return replace(self, grid=grid, layers=layers, nearby=())
 
 
+def faulty(tile_id: str, fault: str, root: str) -> Tile:
+    """Return a tile whose entry in a catalog cannot be used; ``fault`` is the reason and the remedy."""
+    return Tile(
+        tile_id, Grid("", 0.0, 0.0, 1.0, 1, 1), (), root, datetime(1970, 1, 1, tzinfo=UTC), fault=fault
+    )
+
+
 def by_cover(layers: Sequence[Layer], grid: Grid) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
     """Return the layers that cover a tile, at least in part, and those that are only nearby.
 
     Layers of unknown extents count as covering. So do roads, which are wider than the lines in their files.
     """
     bounds, tolerance = grid.bounds, LATTICE_TOLERANCE * grid.cell
-    nearby = tuple(
-        layer
-        for layer in layers
-        if layer.extents
-        and layer.name != "roads"
-        and not any(overlap(extent, bounds, tolerance) for extent in layer.extents)
-    )
+    # The layers of a tile often share their extents.
+    distinct = {id(layer.extents): layer.extents for layer in layers}
+    beside = {
+        key: bool(extents) and not any(overlap(extent, bounds, tolerance) for extent in extents)
+        for key, extents in distinct.items()
+    }
+    nearby = tuple(layer for layer in layers if layer.name != "roads" and beside[id(layer.extents)])
     return tuple(layer for layer in layers if layer not in nearby) if nearby else tuple(layers), nearby

@@ -87,9 +87,12 @@ def load(tile: Tile, options: Options) -> TileData:
     Raises
     ------
     TaskError
-        If a file that the tile needs is missing or broken, a file is in another CRS, the layers differ in
+        If the tile's entry in the catalog cannot be used (`Tile.fault`), a file that the tile needs is
+        missing or broken, a file is in another CRS, the layers differ in
         their unit of height, the tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
     """
+    if tile.fault:
+        raise TaskError(tile.fault)
     for name in ("dsm", "dtm"):
         if tile.layer(name) is None:
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")

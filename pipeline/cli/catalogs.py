@@ -178,11 +178,14 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
 
     catalog = Catalog.read(path)
     for tile in catalog.tiles:
+        if tile.fault:
+            echo(f"{tile.id}  {tile.fault}")
+            continue
         layers = " ".join(f"{layer.name}({len(layer.files)})" for layer in tile.layers)
         date = f"{tile.datetime:%Y-%m-%d}{' (assumed)' if tile.datetime_assumed else ''}"
         size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
         echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
-    systems = sorted({tile.grid.crs for tile in catalog.tiles})
+    systems = sorted({tile.grid.crs for tile in catalog.usable})
     echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
 
 

@@ -156,17 +156,18 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
         farther than catalogs list files.
     """
     joined = [chain["fit"] for chain in config.chains.values() if has_borders(chain["fit"])]
-    if not joined:
+    tiles = catalog.usable
+    if not joined or not tiles:
         return
-    size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in catalog.tiles))
+    size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in tiles))
     _check_acting(joined, size_m)
-    lattices = [_lattice(tile.grid) for tile in catalog.tiles]
+    lattices = [_lattice(tile.grid) for tile in tiles]
     if len(set(lattices)) <= 1:
         return
-    boxes = shapely.box(*np.array([tile.grid.bounds for tile in catalog.tiles]).T)
+    boxes = shapely.box(*np.array([tile.grid.bounds for tile in tiles]).T)
     first, second = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     for a, b in zip(first, second, strict=True):
-        one, other = catalog.tiles[a], catalog.tiles[b]
+        one, other = tiles[a], tiles[b]
         if lattices[a] != lattices[b] and one.grid.crs == other.grid.crs:
             raise ConfigError(
                 f"tiles {one.id} ({_size(one.grid)}) and {other.id} ({_size(other.grid)}) meet, but are not "

@@ -34,7 +34,7 @@ def assembled(run: Run, variant: str, bounds: Bounds | None) -> Surface:
             f"{run.path}: the tiles of {variant} have no common surface; fit.method smoothing_spline makes "
             "one. The heights of single tiles are in open_run(...).height"
         )
-    tiles = [tile for tile in run.catalog.tiles if bounds is None or overlap(tile.grid.bounds, bounds)]
+    tiles = [tile for tile in run.catalog.usable if bounds is None or overlap(tile.grid.bounds, bounds)]
     done = [status.graph for status in peek_statuses(run, tiles) if status.done]
     if not done:
         raise ConfigError(

@@ -18,8 +18,8 @@ from flexroad.tasks.roads import coregistration
 
 MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
-MAX_MISSING_SHOWN = 5
-"""Number of missing files that are named."""
+MAX_SHOWN = 5
+"""Number of missing files, and of entries that cannot be used, that are named."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,16 @@ def check(catalog: Catalog) -> Iterator[Finding]:
         If a tile names a file that the catalog may not read (`Catalog.read`).
     """
     check_allowed(catalog)
-    tiles = catalog.tiles
+    tiles = catalog.usable
     sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
     systems = sorted({short(tile.grid.crs) for tile in tiles})
     yield Finding(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
     counts = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
+    faults = [tile for tile in catalog.tiles if tile.fault]
+    for tile in faults[:MAX_SHOWN]:
+        yield Finding(f"{tile.id}: {tile.fault}", fault=True)
+    if len(faults) > MAX_SHOWN:
+        yield Finding(f"{len(faults) - MAX_SHOWN} more entries cannot be used", fault=True)
     yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in counts.items() if count))
     for name in ("dsm", "dtm"):
         if counts[name] < len(tiles):
@@ -63,10 +68,10 @@ def _missing(tiles: Sequence[Tile]) -> Iterator[Finding]:
             files.update(tile.paths(on_tile) if on_tile else ())
     stat = StatCache()
     missing = [(path, count) for path, count in files.items() if stat(path) is None]
-    for path, count in missing[:MAX_MISSING_SHOWN]:
+    for path, count in missing[:MAX_SHOWN]:
         yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
-    if len(missing) > MAX_MISSING_SHOWN:
-        yield Finding(f"missing: {len(missing) - MAX_MISSING_SHOWN} more files", fault=True)
+    if len(missing) > MAX_SHOWN:
+        yield Finding(f"missing: {len(missing) - MAX_SHOWN} more files", fault=True)
 
 
 def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:

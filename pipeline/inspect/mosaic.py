@@ -75,7 +75,7 @@ class Mosaic:
         ConfigError
             If the bounds are empty, or tiles have different cell sizes or lattices.
         """
-        tiles = run.catalog.tiles
+        tiles = run.catalog.usable
         grid = _grid(tiles, bounds)
         near = [tile for tile in tiles if _meet(tile.grid, grid)]
         statuses = peek_statuses(run, near)

@@ -94,7 +94,7 @@ class Ground:
 
     def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileGraph, NDArray[np.intp]]]:
         """Yield the graph of each finished tile that has points, with the indices of the points."""
-        tiles = self.run.catalog.tiles
+        tiles = self.run.catalog.usable
         tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
         point, number = tree.query(points(easting, northing), predicate="intersects")
         if not point.size:

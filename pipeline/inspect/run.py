@@ -61,7 +61,8 @@ class RunView:
         -------
         geopandas.GeoDataFrame
             One row per tile: ``id``; ``state``, which is ``done``, ``failed`` or ``pending`` (not computed,
-            or its sources or options have changed); ``geometry``, its outline in the CRS of the tiles.
+            or its sources or options have changed); ``geometry``, its outline in the CRS of the tiles (none
+            if its entry in the catalog cannot be used).
 
         Examples
         --------
@@ -79,11 +80,11 @@ class RunView:
             "done" if status.done else "failed" if status.failed else "pending"
             for status in peek_statuses(self.run, tiles)
         ]
-        bounds = np.array([tile.grid.bounds for tile in tiles]).reshape(-1, 4)
+        placed = self.run.catalog.usable
         return geopandas.GeoDataFrame(
             {"id": [tile.id for tile in tiles], "state": states},
-            geometry=shapely.box(*bounds.T),
-            crs=tiles[0].grid.crs if tiles else None,
+            geometry=[None if tile.fault else shapely.box(*tile.grid.bounds) for tile in tiles],
+            crs=placed[0].grid.crs if placed else None,
         )
 
     @property

@@ -43,17 +43,18 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     """Return the outlines of tiles in longitude and latitude, an ``(n,)`` array of shapely polygons.
 
     Polygons are anticlockwise; coordinates are rounded to 1e-7 degrees (about 1 cm). Tiles of one CRS are
-    transformed together.
+    transformed together. Tiles without a known position (`Tile.fault`) have None.
     """
     from geopandas import GeoSeries
-    from shapely import box, transform
+    from shapely import box, is_valid, transform
 
-    shapes = np.array([box(*tile.grid.bounds) for tile in tiles], object)
+    shapes = np.array([None if tile.fault else box(*tile.grid.bounds) for tile in tiles], object)
     crs_of_tile = np.array([tile.grid.crs for tile in tiles], object)
-    for crs in set(crs_of_tile):
+    for crs in set(crs_of_tile[shapes != None]):  # noqa: E711 (of each shape)
         selected = crs_of_tile == crs
         shapes[selected] = GeoSeries(shapes[selected], crs=crs).to_crs("EPSG:4326")
-    return transform(shapes, lambda degrees: degrees.round(7))
+    # Beyond the range of a CRS coordinates are infinite.
+    return np.where(is_valid(shapes), transform(shapes, lambda degrees: degrees.round(7)), None)
 
 
 def _row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:

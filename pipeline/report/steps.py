@@ -56,7 +56,7 @@ def edge_steps(run: Run, most: int = MOST) -> EdgeSteps:
     most : int
         Largest number of tiles compared with their neighbours.
     """
-    tiles = run.catalog.tiles
+    tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)
     pairs = list(_pairs(tiles, every))
     wanted = {tile.id: tile for pair in pairs for tile in pair}

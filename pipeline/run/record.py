@@ -90,10 +90,12 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder or the store cannot be written, a model is missing, or tiles that meet cannot have
-            one surface (`check_tiles`).
+            If the folder or the store cannot be written, a model is missing, no tile can be used, or tiles
+            that meet cannot have one surface (`check_tiles`).
         """
         check_models(config)
+        if not catalog.usable:
+            raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
         check_tiles(config, catalog)
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
@@ -241,7 +243,7 @@ def versions() -> dict[str, str]:
 
 
 def _origin(catalog: Catalog) -> tuple[float, float]:
-    corners = [tile.grid.origin for tile in catalog.tiles]
+    corners = [tile.grid.origin for tile in catalog.usable]
     return min(east for east, _ in corners), min(north for _, north in corners)
 
 

@@ -102,9 +102,11 @@ def plan_run(
     ConfigError
         If each of several tiles lacks a file.
     """
-    todo, states, new, changed, incomplete = array("L"), list[TileState](), 0, 0, 0
+    todo, states, new, changed = array("L"), list[TileState](), 0, 0
+    incomplete, last_incomplete = 0, None
     for position, status in enumerate(tile_statuses(run, database, from_markers=verify)):
-        incomplete += bool(own_files_missing(status.graph))
+        if own_files_missing(status.graph):
+            incomplete, last_incomplete = incomplete + 1, status.graph
         selected = only(run.catalog.tiles[position])
         if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
             status = replace(status, up_to_date=False)
@@ -119,9 +121,9 @@ def plan_run(
         elif selected:
             todo.append(position)
         states.append(state)
-    if incomplete == len(run.catalog.tiles) > 1:
+    if last_incomplete and incomplete == len(run.catalog.usable) > 1:
         # One error for the run: if each tile failed by itself, all existing results would be lost.
-        raise ConfigError(_all_incomplete(run, status.graph))
+        raise ConfigError(_all_incomplete(run, last_incomplete))
     database.flush()
     ids = (tile.id for tile in run.catalog.tiles)
     vanished = database.set_states(zip(ids, states, strict=True))
@@ -132,8 +134,8 @@ def _all_incomplete(run: Run, graph: TileGraph) -> str:
     """Return the error message of a run in which each tile lacks a file."""
     path = own_files_missing(graph)[0]
     return (
-        f"each of the {len(run.catalog.tiles)} tiles lacks a file, for example tile {graph.tile.id}: {path}; "
-        "is the disk with the survey mounted?"
+        f"each of the {len(run.catalog.usable)} tiles lacks a file, "
+        f"for example tile {graph.tile.id}: {path}; is the disk with the survey mounted?"
     )
 
 

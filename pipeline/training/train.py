@@ -262,7 +262,7 @@ def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], 
 
 def _labelled(catalog: Catalog, tiles: LabelledTiles, notes: list[str]) -> Iterator[Block]:
     """Yield the tiles with labels, a single tile in two parts; add a note for each that cannot be read."""
-    single = len(catalog.tiles) == 1
+    single = len(catalog.usable) == 1
     for tile in catalog.tiles:
         if tiles.options.method == "dinov2" and tile.layer("dop") is None:
             continue

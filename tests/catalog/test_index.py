@@ -192,7 +192,8 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     """stac-geoparquet's own conversion is many times slower; it is the oracle here."""
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, stac_table_to_items
 
-    from flexroad.catalog.index import _full_item, _tile, item
+    from flexroad.catalog.entries import TileReader
+    from flexroad.catalog.index import _full_item, item
     from flexroad.catalog.trust import AllowedFolders
 
     whole = with_extents(tile(295750, tmp_path, layers=LAYERS))
@@ -201,7 +202,7 @@ def test_parquet_rows_equal_those_of_stac_geoparquet(tmp_path):
     table = pq.read_table(tmp_path / "c.parquet")
     items = [_full_item(), *(item(tile) for tile in tiles)]
     assert table.equals(parse_stac_items_to_arrow(items).read_all().slice(1).combine_chunks())
-    expected = tuple(
-        _tile(row, str(tmp_path), AllowedFolders.of(tmp_path)) for row in stac_table_to_items(table)
-    )
+    allowed = AllowedFolders.of(tmp_path)
+    expected = TileReader(str(tmp_path), allowed, "row", "c.parquet").tiles(stac_table_to_items(table))
     assert Catalog.read(tmp_path / "c.parquet").tiles == expected
+    assert not any(tile.fault for tile in expected)

@@ -1,0 +1,118 @@
+"""Catalogs as GeoParquet, in the layout of stac-geoparquet: reading and writing of rows."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import shapely
+
+Item = dict[str, Any]
+
+
+class Unreadable:
+    """A value that cannot be read: no field of an entry accepts it."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+    def __repr__(self) -> str:
+        return f"<{self.reason}>"
+
+
+def entries(data: bytes) -> Iterator[Item]:
+    """Yield the fields of each item that make a tile; reading whole items is many times slower.
+
+    Raises
+    ------
+    Exception
+        Any error of pyarrow, if the data are not a table.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
+    columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
+    plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
+    plain += [
+        name for name in columns if name.endswith((".flexroad:files", ".flexroad:values", ".flexroad:crs"))
+    ]
+    # Reader threads may still be alive when a short process ends, and would abort it.
+    rows = _values(file.read(plain, use_threads=False))
+    extents = [name for name in columns if name.endswith(".flexroad:extents")]
+    if extents:
+        _add_extents(rows, file.read(extents, use_threads=False)["assets"].combine_chunks())
+    return ({**_top(row), "properties": row} for row in rows)
+
+
+def _top(row: Item) -> Item:
+    return {name: row[name] for name in ("id", "assets") if name in row}
+
+
+def _values(table: Any) -> list[Item]:
+    try:
+        rows: list[Item] = table.to_pylist()
+    except Exception:
+        # Dates out of range, or text that is not UTF-8: only the entries that have them are lost.
+        columns = {name: table[name] for name in table.column_names}
+        return [{name: _value(columns[name], n) for name in columns} for n in range(table.num_rows)]
+    return rows
+
+
+def _value(column: Any, number: int) -> Any:
+    try:
+        return column[number].as_py()
+    except Exception as error:
+        return Unreadable(str(error))
+
+
+def _add_extents(rows: list[Item], assets: Any) -> None:
+    """Add the extents to the rows' assets as arrays; as lists of numbers they take several times as long."""
+    for field in assets.type:
+        column = assets.field(field.name).field("flexroad:extents")
+        try:
+            ends, edges = column.offsets.to_numpy().tolist(), column.values.to_numpy()
+            found = [edges[a:b] if a < b else None for a, b in pairwise(ends)]
+        except Exception:
+            # Not lists of numbers, or with gaps.
+            found = [_value(column, number) for number in range(len(column))]
+        for row, extents in zip(rows, found, strict=True):
+            assets_of_row = row.get("assets")
+            asset = assets_of_row.get(field.name) if isinstance(assets_of_row, dict) else None
+            if extents is not None and isinstance(asset, dict):
+                asset["flexroad:extents"] = extents
+
+
+def table_bytes(items: list[Item], full: Item) -> bytes:
+    """Return a table of items; stac-geoparquet's own conversion is many times slower.
+
+    Parameters
+    ----------
+    full : Item
+        An item with all fields: columns are inferred from it, so that every catalog has the same schema.
+    """
+    import pyarrow as pa
+    from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
+
+    schema = parse_stac_items_to_arrow([full]).read_all().schema
+    with tempfile.TemporaryDirectory() as folder:
+        # `to_parquet` writes only to files.
+        file = Path(folder) / "catalog.parquet"
+        to_parquet(pa.Table.from_pylist([row(item) for item in items], schema), file)
+        return file.read_bytes()
+
+
+def row(item: Item) -> Item:
+    """Return an item as a table row: properties as columns, the outline as WKB."""
+    values: Item = {name: value for name, value in item.items() if name != "properties"} | item["properties"]
+    values["datetime"] = datetime.fromisoformat(item["properties"]["datetime"])
+    if item["geometry"]:
+        (ring,) = item["geometry"]["coordinates"]
+        values["geometry"] = shapely.to_wkb(shapely.Polygon(ring))
+        values["bbox"] = dict(zip(("xmin", "ymin", "xmax", "ymax"), item["bbox"], strict=True))
+    return values
