@@ -15,6 +15,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.headers.point_clouds import chunks
 from flexroad.catalog.storage.outputs import output_file
 
@@ -47,7 +48,7 @@ def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
         If the cloud cannot be read; names the file.
     """
     if target.exists() and target.stat().st_mtime_ns >= cloud.stat().st_mtime_ns:
-        with rasterio.open(target) as raster:
+        with open_raster(target) as raster:
             return bool(np.isfinite(raster.read(1)).any())
     west, south, east, north = square
     width, height = math.ceil((east - west) / CELL_M), math.ceil((north - south) / CELL_M)

@@ -179,7 +179,8 @@ def _source(tile: Tile, name: str) -> Source | None:
         return None
     needed = (layer.reaching(tile.grid.bounds) or layer).files
     paths = zip(layer.files, tile.paths(layer), strict=True)
-    return Source(name, tuple(path for file, path in paths if file in needed or stat(path)), layer.crs)
+    files = tuple(path for file, path in paths if file in needed or stat(path))
+    return Source(name, files, layer.crs, allowed=tile.allowed)
 
 
 def _optional(source: Source | None) -> Source | None:
@@ -215,7 +216,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
     absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs, together)
+            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs, together, tile.allowed)
         except Unreadable as error:
             broken.append(error)
             continue

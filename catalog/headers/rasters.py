@@ -18,7 +18,10 @@ from rasterio.warp import transform_bounds
 from flexroad.catalog.crs import in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import gdal_options
+from flexroad.catalog.trust import AllowedFolders
 
 GDAL = {
     # Do not list the folder for every file (it may hold 10,000); side-car files are still opened.
@@ -62,7 +65,9 @@ class _Skip(Exception):
     """A file that is left out; the message is the reason."""
 
 
-def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[RasterFile], list[str]]:
+def scan(
+    root: Path, layer: str, pattern: str, crs: str | None, allow: Sequence[str] = ()
+) -> tuple[list[RasterFile], list[str]]:
     """Open each file of a layer once.
 
     Parameters
@@ -75,6 +80,8 @@ def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[Ra
         Glob pattern relative to ``root``.
     crs : str, optional
         CRS of files without one.
+    allow : sequence of str
+        Folders besides ``root`` that the files named by a VRT may lie below.
 
     Returns
     -------
@@ -88,14 +95,14 @@ def scan(root: Path, layer: str, pattern: str, crs: str | None) -> tuple[list[Ra
     CatalogError
         If no file matches or can be used, or a file has no CRS and ``crs`` is None.
     """
-    files, notes = opened(root, layer, matching(root, layer, pattern), crs)
+    files, notes = opened(root, layer, matching(root, layer, pattern), crs, allow)
     if not files:
         raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {root}; {notes[0]}")
     return files, notes
 
 
 def opened(
-    root: Path, layer: str, paths: Iterable[Path], crs: str | None
+    root: Path, layer: str, paths: Iterable[Path], crs: str | None, allow: Sequence[str] = ()
 ) -> tuple[list[RasterFile], list[str]]:
     """Open files of a layer, each once; return the usable ones, and notes on skipped files.
 
@@ -105,11 +112,12 @@ def opened(
         If a file has no CRS and ``crs`` is None.
     """
     files: list[RasterFile] = []
+    allowed = AllowedFolders.of(root, allow)
     skipped: dict[str, list[str]] = defaultdict(list)
     with quiet():
         for path in paths:
             try:
-                files.append(_open(root, path, crs))
+                files.append(_open(root, path, crs, allowed))
             except _Skip as reason:
                 skipped[str(reason)].append(_name(root, path))
     return files, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
@@ -150,12 +158,14 @@ def _name(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
-def _open(root: Path, path: Path, crs: str | None) -> RasterFile:
+def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders) -> RasterFile:
     try:
-        with rasterio.open(path) as src:
+        with open_raster(path, allowed) as src:
             wkt = src.crs.to_wkt() if src.crs else ""
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
+    except Refused as error:
+        raise _Skip(f"it {error}") from error
     except (RasterioError, OSError) as error:
         raise _Skip("not a raster that GDAL can read") from error
     if transform.is_identity:

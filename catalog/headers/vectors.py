@@ -1,4 +1,4 @@
-"""Vector files of roads, in any format that GDAL reads, and the tiles that they reach."""
+"""Vector files of roads, and the tiles that they reach."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from pyproj.exceptions import ProjError
 from flexroad.catalog.crs import transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.rasters import matching
+from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 MARGIN_M = 1.0
@@ -67,13 +69,16 @@ def opened(path: Path, crs: str | None) -> VectorFile:
     import pyogrio
 
     try:
-        names = [name for name, kind in pyogrio.list_layers(path) if kind is not None]
-        infos = [pyogrio.read_info(path, layer=name) for name in names]
+        file = vector_name(path)
+        names = [name for name, kind in pyogrio.list_layers(file) if kind is not None]
+        infos = [pyogrio.read_info(file, layer=name) for name in names]
         # The bounds of an OSM file are known only after reading all of it.
         no_bounds = any(info["driver"] == "OSM" for info in infos)
         if not no_bounds:
-            infos = [pyogrio.read_info(path, layer=name, force_total_bounds=True) for name in names]
-    except (RuntimeError, ValueError) as error:
+            infos = [pyogrio.read_info(file, layer=name, force_total_bounds=True) for name in names]
+    except Refused as error:
+        raise CatalogError(f"--roads {path} {error}") from error
+    except (RuntimeError, ValueError, OSError) as error:
         raise CatalogError(f"--roads {path} is not a vector file: {error}") from error
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")

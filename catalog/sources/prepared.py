@@ -26,6 +26,7 @@ from rasterio.errors import CRSError, RasterioIOError
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
+from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
@@ -189,10 +190,10 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
 
 def _read(path: Path) -> _File:
     try:
-        with rasterio.open(path) as dataset:
+        with open_raster(path) as dataset:
             tags, transform, crs = dataset.tags(), dataset.transform, dataset.crs
             width, height = dataset.width, dataset.height
-    except RasterioIOError as error:
+    except (RasterioIOError, OSError) as error:
         raise CatalogError(f"{path} is not a GeoTIFF: {error}") from error
     missing = [tag for tag in (TILE_TAG, LAYER_TAG) if not tags.get(tag)]
     if missing or crs is None:

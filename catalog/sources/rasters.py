@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +23,7 @@ def index(
     date: datetime | None = None,
     crs: str | None = None,
     min_cover: float = 0.25,
+    allow: Sequence[str] = (),
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
 
@@ -43,6 +44,8 @@ def index(
         CRS of files without one.
     min_cover : float
         Tiles of which the DSM files cover less than this share (0 to 1) are left out.
+    allow : sequence of str
+        Folders besides ``root`` that the files named by a VRT may lie below.
 
     Raises
     ------
@@ -53,7 +56,9 @@ def index(
     root = root.resolve()
     _check(root, patterns)
     scanned = {
-        name: scan(root, name, patterns[name], crs) for name in LAYERS if name in patterns and name != "roads"
+        name: scan(root, name, patterns[name], crs, allow)
+        for name in LAYERS
+        if name in patterns and name != "roads"
     }
     notes = [note for _, skipped in scanned.values() for note in skipped]
     indexed = cut(

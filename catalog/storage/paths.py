@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 
@@ -133,7 +134,9 @@ def gdal_options() -> dict[str, str]:
 
 
 def stat(where: Location) -> FileStat | None:
-    """Return a file's size and version, or None if it does not exist.
+    """Return a file's size and version, or None if there is no such file.
+
+    Links are followed. Folders, pipes, sockets and devices are no files: reading one may never end.
 
     Raises
     ------
@@ -143,7 +146,9 @@ def stat(where: Location) -> FileStat | None:
     if isinstance(where, Path):
         try:
             stats = where.stat()
-        except OSError:
+        except (OSError, ValueError):
+            return None
+        if not S_ISREG(stats.st_mode):
             return None
         return FileStat(stats.st_size, stats.st_mtime_ns)
     try:
@@ -236,6 +241,9 @@ def read(where: Location) -> bytes:
         If the file cannot be read, FileNotFoundError if it does not exist; names the file.
     """
     if isinstance(where, Path):
+        if not where.is_file() and not where.is_dir() and where.exists():
+            # To open a pipe would wait for a writer.
+            raise OSError(errno.EINVAL, "not a regular file", str(where))
         return where.read_bytes()
     with named(where):
         data: bytes = where.fs.cat_file(where.path, max_concurrency=1)

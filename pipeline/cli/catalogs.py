@@ -51,6 +51,7 @@ def catalog_rasters(
     min_cover: MinCover = 0.25,
     date: Date = None,
     crs: Annotated[str | None, typer.Option(help="CRS of files without one: EPSG:25832.")] = None,
+    allow: Allow = None,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
     from flexroad.catalog.sources import rasters
@@ -72,6 +73,7 @@ def catalog_rasters(
         date=date,
         crs=crs,
         min_cover=min_cover,
+        allow=allow or (),
     )
     _write_catalog(result, output)
 

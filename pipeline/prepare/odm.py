@@ -19,6 +19,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
+from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
@@ -169,9 +170,9 @@ def _filter_ground(writer: RasterWriter, options: to_rasters.Options) -> None:
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     try:
-        with rasterio.open(path) as source:
+        with open_raster(path) as source:
             yield source
-    except RasterioError as error:
+    except (RasterioError, OSError) as error:
         raise CatalogError(f"{path} cannot be read as a raster: {error}; run OpenDroneMap again") from error
 
 

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 import shapely
 from rasterio.errors import RasterioError
 from rasterio.warp import Resampling, reproject
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
+from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.vectors import VectorFile, opened
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
@@ -121,7 +122,7 @@ def _mesh(path: Path, grid: Grid) -> Bools:
 def _raster(path: Path, grid: Grid) -> Bools | None:
     """Return the mask if the file is a raster, else None."""
     try:
-        with rasterio.open(path) as source:
+        with open_raster(path) as source:
             if source.count == 0 or source.crs is None:
                 return None
             mask = np.zeros(grid.shape, np.uint8)
@@ -134,7 +135,7 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
                 dst_crs=grid.crs,
                 resampling=Resampling.nearest,
             )
-    except RasterioError:
+    except (RasterioError, OSError):
         return None
     road: Bools = mask != 0
     return road
@@ -169,13 +170,14 @@ def _read(path: Path, layer: str | None, where: str | None) -> Any:
     from pyogrio.errors import DataLayerError, DataSourceError
 
     try:
-        names = list(list_layers(path)[:, 0])
+        file = vector_name(path)
+        names = list(list_layers(file)[:, 0])
         if layer is None and len(names) > 1:
             raise ConfigError(f"{path} has several layers: {', '.join(names)}; select one with --roads-layer")
         if layer is not None and layer not in names:
             raise ConfigError(f"{path} has no layer {layer!r}; its layers: {', '.join(names)}")
-        features = geopandas.read_file(path, layer=layer or names[0], where=where)
-    except (DataSourceError, DataLayerError, ValueError) as error:
+        features = geopandas.read_file(file, layer=layer or names[0], where=where)
+    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
             f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"
         ) from error

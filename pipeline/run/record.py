@@ -31,6 +31,7 @@ from flexroad.catalog.storage.paths import (
     Location,
     StatCache,
     absolute,
+    exists,
     is_remote,
     parse_location,
     read,
@@ -257,6 +258,8 @@ def _config(path: Location) -> Config:
     if file is not None and not file.size:
         # An empty file would be valid: a configuration with all defaults.
         raise ConfigError(f"{path} is empty, as after a power failure; `flexroad run` writes it again")
+    if file is None and exists(path):
+        raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
     if isinstance(path, Path):
         return load_config(path)
     return compose(yaml.safe_load(read(path)), str(path))

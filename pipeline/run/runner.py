@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from flexroad.catalog import Tile
+from flexroad.catalog.storage.paths import exists, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import check_tiles
@@ -133,9 +134,14 @@ def plan_run(
 def _all_incomplete(run: Run, graph: TileGraph) -> str:
     """Return the error message of a run in which each tile lacks a file."""
     path = own_files_missing(graph)[0]
+    remedy = (
+        "it is not a regular file; replace it by one"
+        if exists(parse_location(path))
+        else "is the disk with the survey mounted?"
+    )
     return (
         f"each of the {len(run.catalog.usable)} tiles lacks a file, "
-        f"for example tile {graph.tile.id}: {path}; is the disk with the survey mounted?"
+        f"for example tile {graph.tile.id}: {path}; {remedy}"
     )
 
 

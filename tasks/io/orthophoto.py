@@ -60,7 +60,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
     with quiet():
         for path in source.paths:
             try:
-                part = _read(path, f"{source.name} {path.name}", grid, gsd_m, source.crs)
+                part = _read(path, source, grid, gsd_m)
             except Unreadable as error:
                 broken.append(error)
                 continue
@@ -103,11 +103,12 @@ def _reached(lattice: RasterGrid, grid: Grid) -> Bools:
 
 
 def _read(
-    path: Location, name: str, grid: Grid, gsd_m: float | None, crs: str | None
+    path: Location, source: Source, grid: Grid, gsd_m: float | None
 ) -> tuple[Orthophoto, RasterGrid] | None:
     """Return a file's pixels over the grid, and the file's lattice; None if it does not overlap the grid."""
-    with opened(path, name) as src:
-        lattice = place(src, path, name, grid, grid, crs)
+    name = f"{source.name} {path.name}"
+    with opened(path, name, source.allowed) as src:
+        lattice = place(src, path, name, grid, grid, source.crs)
         if lattice is None or lattice.window_for(grid) is None:
             return None
         depth = _depth(src, path, name)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from affine import Affine
 from rasterio.enums import MaskFlags, Resampling
 from rasterio.errors import RasterioError
@@ -19,7 +17,10 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.storage.paths import Location, gdal_name, is_remote, sidecars, stat
+from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.storage.paths import Location, is_remote, stat
+from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
@@ -148,6 +149,7 @@ def read_window(
     core: Grid,
     crs: str | None,
     resampling: Resampling = Resampling.average,
+    allowed: AllowedFolders | None = None,
 ) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
 
@@ -168,6 +170,8 @@ def read_window(
         CRS of a file without one.
     resampling : Resampling
         How several cells are read as one: ``average`` of heights, ``mode`` of classes.
+    allowed : AllowedFolders, optional
+        Where the files that a VRT names may lie; None: anywhere on disk.
 
     Returns
     -------
@@ -181,7 +185,7 @@ def read_window(
     TaskError
         If it is rotated or in another CRS than the grid.
     """
-    with opened(path, name) as src:
+    with opened(path, name, allowed) as src:
         lattice = place(src, path, name, grid, core, crs)
         slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:
@@ -194,15 +198,19 @@ def read_window(
 
 
 @contextmanager
-def opened(path: Location, name: str) -> Iterator[Any]:
+def opened(path: Location, name: str, allowed: AllowedFolders | None = None) -> Iterator[Any]:
     """Open a raster; errors inside the block become `Unreadable` or, for a file in a bucket, `TaskError`.
 
     For a file in a bucket the cause may be the file or the storage. So the tile fails and can be run again;
     the file is not left out.
     """
     try:
-        with _sidecar_env(path, name), rasterio.open(gdal_name(path)) as src:
+        with open_raster(path, allowed) as src:
             yield src
+    except FileNotFoundError as error:
+        raise _missing(path, name) from error
+    except Refused as error:
+        raise Unreadable(f"{name} {error}", str(path)) from error
     except (RasterioError, OSError) as error:
         if not is_remote(path) and stat(path) is None:
             raise _missing(path, name) from error
@@ -210,16 +218,6 @@ def opened(path: Location, name: str) -> Iterator[Any]:
         if is_remote(path):
             raise TaskError(f"{name} cannot be read: {reason}; run again, or repair it", str(path)) from error
         raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
-
-
-def _sidecar_env(path: Location, name: str) -> AbstractContextManager[Any]:
-    """Stop GDAL from searching side-car files of a file in a bucket that has none."""
-    if isinstance(path, Path):
-        return nullcontext()
-    names = sidecars(path)
-    if path.name not in names:
-        raise _missing(path, name)
-    return nullcontext() if names - {path.name} else rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
 
 
 def _missing(path: Location, name: str) -> Unreadable:

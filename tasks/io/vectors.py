@@ -25,7 +25,9 @@ from pyproj.exceptions import ProjError
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.storage.paths import FileStat, Location, fetch, stat
+from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.tasks.errors import TaskError
 
 if TYPE_CHECKING:
@@ -88,6 +90,8 @@ def read_near(request: Query, bounds: Bounds) -> Any:
     except OSError as error:
         raise _error(request, f"cannot be read: {error.strerror}; run again") from error
     if version is None:
+        if exists(request.path):
+            raise _error(request, "is not a regular file; replace it by one")
         raise _error(request, "cannot be opened (no such file); put it back, or build the catalog again")
     tables = []
     for layer in _layers(request, version):
@@ -134,12 +138,13 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
         raise _error(request, f"cannot be read as vectors: {error}") from error
 
 
-def _file(request: Query, version: FileStat) -> Path:
-    """Return the path of the file, or of a local copy if it is in a bucket."""
-    if isinstance(request.path, Path):
-        return request.path
+def _file(request: Query, version: FileStat) -> str:
+    """Return GDAL's name of the file, or of a local copy if it is in a bucket."""
     try:
-        return _copied(request.path, version).path
+        local = request.path if isinstance(request.path, Path) else _copied(request.path, version).path
+        return vector_name(local)
+    except Refused as error:
+        raise _error(request, str(error)) from error
     except OSError as error:
         raise _error(request, f"cannot be read: {error.strerror}; run again") from error
 
@@ -196,7 +201,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     return _unpacked(table[valid], request.columns)
 
 
-def _read(request: Query, file: Path, layer: _Layer, bbox: Bounds | None) -> Any:
+def _read(request: Query, file: str, layer: _Layer, bbox: Bounds | None) -> Any:
     import pyogrio
 
     def read(**more: str) -> Any:

@@ -186,3 +186,16 @@ def test_write_through_link_keeps_link(tmp_path):
     with pytest.raises(OSError, match="pipe or socket"):
         paths.write(tmp_path / "to_pipe", b"new")
     assert pipe.is_fifo()
+
+
+def test_pipe_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link"):
+        assert paths.stat(tmp_path / name) is None
+        assert StatCache()(tmp_path / name) is None
+        with pytest.raises(OSError, match="not a regular file"):
+            paths.read(tmp_path / name)
+    assert paths.stat(tmp_path) is None
+    with pytest.raises(IsADirectoryError):
+        paths.read(tmp_path)

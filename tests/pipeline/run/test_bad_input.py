@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -79,6 +80,19 @@ def _a_folder(tile: Tile) -> None:
     layer(tile, "dsm").mkdir()
 
 
+def _a_pipe(tile: Tile) -> None:
+    layer(tile, "dsm").unlink()
+    os.mkfifo(layer(tile, "dsm"))
+
+
+def _a_vrt_of_the_web(tile: Tile) -> None:
+    layer(tile, "dtm").write_text(
+        '<VRTDataset rasterXSize="60" rasterYSize="60"><VRTRasterBand dataType="Float32" band="1">'
+        "<SimpleSource><SourceFilename>/vsicurl/http://127.0.0.1:9/a.tif</SourceFilename></SimpleSource>"
+        "</VRTRasterBand></VRTDataset>"
+    )
+
+
 def _a_text(tile: Tile) -> None:
     layer(tile, "road_mask").write_text("<html>404 Not Found</html>")
 
@@ -143,7 +157,9 @@ FAULTS = (
     Fault(_absent, "dsm", "is missing; restore it or build the catalog again"),
     Fault(_zero_bytes, "dtm", "cannot be read: .*; fetch it again"),
     Fault(_truncated, "dsm", "cannot be read: .*; fetch it again"),
-    Fault(_a_folder, "dsm", "cannot be read: .*; fetch it again"),
+    Fault(_a_folder, "dsm", "is not a regular file; replace it by one"),
+    Fault(_a_pipe, "dsm", "is not a regular file; replace it by one"),
+    Fault(_a_vrt_of_the_web, "dtm", "is a VRT that names '/vsicurl/.*; only mosaics of local files"),
     Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
     Fault(_elsewhere, "dsm", r"no dsm file overlaps the tile \(.*\): .*; build the catalog again"),
     Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),
@@ -760,3 +776,29 @@ def argument_paths(made_survey, finished, tmp_path_factory):
         "X.json": folder / "x.json",
         "X.txt": folder / "x.txt",
     }
+
+
+@pytest.mark.parametrize("name", ["dsm", "roads"])
+def test_pipes_hang_neither_client_nor_worker_with_checksum(run, survey, tmp_path, name):
+    tile = Catalog.read(survey).tiles[0]
+    layer(tile, name).unlink()
+    os.mkfifo(layer(tile, name))
+    config = compose({**QUICK, "segment": "vector"} if name == "roads" else QUICK, "x")
+    path = tmp_path / "x.yaml"
+    path.write_text(json.dumps(config.raw))
+    # The file with roads is that of all tiles: then the run stops before the first one.
+    said = run("--checksum", config=path).expected(2 if name == "roads" else 1)
+    assert "is not a regular file; replace it by one" in said.errors[0]
+
+
+def test_catalog_or_run_that_is_a_pipe_is_refused(run, flexroad, survey, tmp_path):
+    pipe = tmp_path / "catalog.json"
+    os.mkfifo(pipe)
+    assert "not a regular file" in run(catalog=pipe).expected(2).err
+    run().expected(0)
+    for name in ("config.yaml", "catalog.parquet", "run.json"):
+        file = tmp_path / "run" / name
+        kept = file.rename(tmp_path / name)
+        os.mkfifo(file)
+        assert "not a regular file" in flexroad("status", tmp_path / "run").expected(2).err
+        kept.replace(file)

@@ -1,0 +1,210 @@
+"""Opening of source rasters: only regular files of known formats, none of which leads to other files.
+
+GDAL chooses the driver by a file's content, whatever its name: a VRT or WMS named ``a.tif`` would make it
+read other files or the web. So the driver is chosen here, by the first bytes, and is the only one allowed.
+Side-car files and metadata can name further files, too; they are checked as well.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import rasterio
+from rasterio.errors import RasterioError
+
+from flexroad.catalog.headers.refused import Refused, head, require_regular
+from flexroad.catalog.headers.vrt import sources
+from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
+from flexroad.catalog.trust import AllowedFolders
+
+UNKNOWN = (
+    "cannot be read: it is no GeoTIFF, ASCII grid, XYZ, JPEG 2000, PNG, JPEG or VRT; "
+    "fetch it again, or convert it with gdal_translate"
+)
+MAGIC = {
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
+    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
+}
+SUFFIXES = {
+    ".tif": "GTiff",
+    ".tiff": "GTiff",
+    ".asc": "AAIGrid",
+    ".xyz": "XYZ",
+    ".jp2": "JP2OpenJPEG",
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+}
+"""Drivers in object storage, by the suffix of a file's name: to read its first bytes is a request more."""
+NOT_TEXT = re.compile(rb"[<\0-\x08\x0e-\x19\x1b-\x1f]")
+"""Bytes that ASCII grids and XYZ do not have; 0x1a ends some files."""
+MARK = re.compile(rb"<[A-Za-z]{3}")
+ASCII_GRID = re.compile(rb"\s*(ncols|nrows|xll|yll|cellsize|dx|dy|nodata)", re.IGNORECASE)
+APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
+REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
+MAX_DEPTH = 4
+"""Largest depth of VRTs that name VRTs."""
+OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
+"""GDAL's option for local files: its file system on the web opens nothing."""
+
+
+@contextmanager
+def open_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterator[Any]:
+    """Open a source raster with rasterio.
+
+    Parameters
+    ----------
+    path : Location
+    allowed : AllowedFolders, optional
+        Where the files that a VRT names may lie; None: anywhere on disk.
+
+    Raises
+    ------
+    Refused
+        If the file is of another format, is not a regular file, or names files that may not be read.
+    RasterioError, OSError
+        If it cannot be read.
+    """
+    if not isinstance(path, Path):
+        with _remote(path) as dataset:
+            yield dataset
+        return
+    path = path.absolute()
+    driver, alone = _checked(path, allowed, MAX_DEPTH)
+    env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR" if alone else "TRUE", **OFFLINE)
+    with env, rasterio.open(str(path), driver=driver) as dataset:
+        _require_no_link(dataset)
+        yield dataset
+
+
+@contextmanager
+def _remote(path: Any) -> Iterator[Any]:
+    driver = SUFFIXES.get(path.suffix.lower())
+    if driver is None:
+        raise Refused(f"is not read from object storage: its name does not end in {', '.join(SUFFIXES)}")
+    names = sidecars(path)
+    if path.name not in names:
+        raise FileNotFoundError(str(path))
+    # Stop GDAL from searching side-car files if there are none.
+    env = {} if names - {path.name} else {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+    with rasterio.Env(**env), rasterio.open(gdal_name(path), driver=driver) as dataset:
+        _require_no_link(dataset)
+        yield dataset
+
+
+def _require_no_link(dataset: Any) -> None:
+    """Raise an error if metadata, of the file or of ``.aux.xml``, names a file of overviews."""
+    if any(key.upper() == "OVERVIEW_FILE" for key in dataset.tags(ns="OVERVIEWS")):
+        raise Refused("names another file as its overviews; remove that with gdal_translate")
+
+
+def _checked(path: Path, allowed: AllowedFolders | None, depth: int) -> tuple[str, bool]:
+    """Return the driver of a file, and whether neither it nor the files that it names have side-cars."""
+    driver = _driver(path)
+    alone = not _side_cars(path)
+    if driver != "VRT":
+        return driver, alone
+    if depth == 0:
+        raise Refused(f"is a VRT of VRTs, more than {MAX_DEPTH} deep; convert it with gdal_translate")
+    for name in sources(path):
+        if allowed is not None and not allowed.permits(name):
+            raise Refused(str(allowed.refusal("is a VRT that", name)))
+        alone &= _source(Path(name), allowed, depth)
+    return driver, alone
+
+
+def _source(path: Path, allowed: AllowedFolders | None, depth: int) -> bool:
+    """Check a file that a VRT names, which GDAL opens with any driver; return whether it has no side-cars."""
+    try:
+        driver, alone = _checked(path, allowed, depth - 1)
+        if driver != "VRT":
+            stats = path.stat()
+            _require_plain(path, driver, stats.st_size, stats.st_mtime_ns)
+    except FileNotFoundError:
+        # GDAL reports it when it needs the file.
+        return True
+    except Refused as error:
+        raise Refused(f"is a VRT of {path}, which {error}") from error
+    return alone
+
+
+@lru_cache(maxsize=16384)
+def _require_plain(path: Path, driver: str, size: int, mtime_ns: int) -> None:
+    """Check the metadata of a file; cached by size and time."""
+    try:
+        env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE", **OFFLINE)
+        with env, rasterio.open(str(path), driver=driver) as dataset:
+            _require_no_link(dataset)
+    except RasterioError as error:
+        raise Refused(f"cannot be read: {error}; fetch it again") from error
+
+
+def _driver(path: Path) -> str:
+    """Return the name of GDAL's driver for a file, by its first bytes."""
+    data = head(path)
+    for magic, driver in MAGIC.items():
+        # Of a file that a VRT names, GDAL takes a mark of XML before the first zero for its format.
+        if data.startswith(magic) and not MARK.search(data.partition(b"\0")[0]):
+            return driver
+    if data.startswith(b"\x1f\x8b") and path.suffix.lower() == ".gz":
+        return "XYZ"
+    text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if text.startswith((b"<VRTDataset", b"<?xml")) and b"<VRTDataset" in data:
+        return "VRT"
+    # Marks of other formats may stand anywhere in a text.
+    if not text or text.startswith(b"{") or NOT_TEXT.search(data):
+        raise Refused(UNKNOWN)
+    return "AAIGrid" if ASCII_GRID.match(text) else "XYZ"
+
+
+def _side_cars(path: Path) -> list[Path]:
+    """Return the side-car files of a raster that GDAL may open, checked.
+
+    Raises
+    ------
+    Refused
+        If one of them is not a regular file, or leads to other files.
+    """
+    found = [side for side in _candidates(path) if side.exists() or side.is_symlink()]
+    for side in found:
+        try:
+            require_regular(side)
+            _check_side_car(side)
+        except FileNotFoundError:
+            continue
+        except Refused as error:
+            raise Refused(f"has the side-car file {side.name}, which {error}") from error
+    return found
+
+
+def _check_side_car(side: Path) -> None:
+    suffix = side.suffix.lower()
+    if suffix in (".ovr", ".msk"):
+        if _driver(side) != "GTiff":
+            raise Refused("is no TIFF; remove it")
+        _side_cars(side)
+        stats = side.stat()
+        _require_plain(side, "GTiff", stats.st_size, stats.st_mtime_ns)
+    elif suffix == ".aux" and head(side).startswith(b"EHFA_HEADER_TAG"):
+        raise Refused("is of Erdas Imagine and may name other files; remove it")
+
+
+def _candidates(path: Path) -> Iterator[Path]:
+    """Yield the names of side-car files that GDAL looks for."""
+    end = path.suffix[1:]
+    worlds = {f".{end}w", f".{end[:1]}{end[-1:]}w"} if end else set()
+    for text in APPENDED:
+        yield from (path.with_name(path.name + case) for case in (text, text.upper()))
+    for text in sorted({*REPLACED, *worlds}):
+        yield from (path.with_suffix(case) for case in dict.fromkeys((text, text.lower(), text.upper())))

@@ -1,0 +1,110 @@
+"""Check of source vector files before GDAL opens them: regular files of known formats that lead nowhere else.
+
+pyogrio cannot be told which drivers to use, and GDAL chooses by content, whatever a file's name: an OGR VRT
+named ``roads.geojson`` would make it read other files or the web. So the format is told here from the first
+bytes, and only formats are let through that GDAL cannot take for another one.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import re
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from flexroad.catalog.headers.refused import Refused, head, require_regular
+
+UNKNOWN = (
+    "is not a vector file: it is no GeoPackage, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
+    "convert it with ogr2ogr, e.g. ogr2ogr NEW.gpkg FILE"
+)
+GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
+SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
+CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s*""", re.IGNORECASE)
+OTHER_THAN_OSM = re.compile(
+    rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
+)
+MAX_CRS_BYTES = 65536
+"""Longest text of a CRS in GeoJSON."""
+LINKS = ("link", "url")
+
+
+def vector_name(path: Path) -> str:
+    """Return the name by which GDAL opens a vector file, and no other file.
+
+    Raises
+    ------
+    Refused
+        If the file is of another format, is not a regular file, or names other files.
+    OSError
+        If it does not exist or cannot be read.
+    """
+    path = path.absolute()
+    data = head(path)
+    text = data.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if "!" in str(path) or "?" in str(path):
+        raise Refused("has a ! or ? in its path, which GDAL would not take for a part of it; rename it")
+    if text.startswith(b"{"):
+        _require_no_linked_crs(path)
+        # The prefix selects the driver, so that a mark of another format in the text has no effect.
+        return f"GeoJSON:{path}"
+    if data.startswith(b"\0\0\x27\x0a"):
+        _require_regular_parts(path)
+    elif not (
+        data.startswith(b"fgb\x03")
+        or (data.startswith(b"SQLite format 3\0") and data[68:72] in GEOPACKAGES)
+        or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader")
+        or _is_osm(text)
+    ):
+        raise Refused(UNKNOWN)
+    return str(path)
+
+
+def _is_osm(text: bytes) -> bool:
+    """Return whether a text begins as OSM's XML, without the mark of another format."""
+    if OTHER_THAN_OSM.search(text):
+        return False
+    names: list[str] = []
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = lambda name, _: names.append(name)
+    try:
+        parser.Parse(text, False)
+    except expat.ExpatError:
+        return False
+    return names[:1] == ["osm"]
+
+
+def _require_regular_parts(path: Path) -> None:
+    for suffix in SHAPEFILE_PARTS:
+        for part in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
+            try:
+                require_regular(part)
+            except FileNotFoundError:
+                continue
+            except Refused as error:
+                raise Refused(f"has the part {part.name}, which {error}") from error
+
+
+def _require_no_linked_crs(path: Path) -> None:
+    """Raise an error if a GeoJSON file has its CRS by a web address, which GDAL would ask."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for found in CRS.finditer(data):
+            rest = bytes(data[found.end() : found.end() + MAX_CRS_BYTES])
+            if rest[:1] in (b",", b"}", b"]"):
+                # A value, not a key.
+                continue
+            if not rest.startswith(b":") or _is_link(rest[1:]):
+                raise Refused("has its CRS by a link; give it one, e.g. ogr2ogr -a_srs EPSG:25832 NEW FILE")
+
+
+def _is_link(rest: bytes) -> bool:
+    """Return whether the text after ``"crs":`` is an object that links to a CRS, or none that can be read."""
+    pairs: list[tuple[str, Any]] = []
+    decoder = json.JSONDecoder(object_pairs_hook=pairs.extend)
+    try:
+        decoder.raw_decode(rest.decode(errors="replace").lstrip())
+    except ValueError:
+        return True
+    return any(key.lower() == "type" and str(value).lower() in LINKS for key, value in pairs)

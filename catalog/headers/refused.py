@@ -1,0 +1,43 @@
+"""Source files that are refused before a library opens them, and the first bytes of a file."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+HEAD_BYTES = 65536
+
+
+class Refused(OSError):
+    """A file that is not opened; the message continues a sentence that begins with its name."""
+
+
+def head(path: Path) -> bytes:
+    """Return the first bytes of a regular file; links are followed.
+
+    Raises
+    ------
+    Refused
+        If it is a folder, a pipe, a socket or a device: to open one may wait forever.
+    OSError
+        If it does not exist or cannot be read.
+    """
+    require_regular(path)
+    # Opening a pipe would wait for a writer, if one has just taken the file's place.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as file:
+        return file.read(HEAD_BYTES) or b""
+
+
+def require_regular(path: Path) -> None:
+    """Raise an error if a path is not a regular file.
+
+    Raises
+    ------
+    Refused
+        If it is a folder, a pipe, a socket or a device.
+    OSError
+        If it does not exist.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise Refused("is not a regular file; replace it by one")

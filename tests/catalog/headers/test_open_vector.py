@@ -1,0 +1,136 @@
+"""Vector files are opened only in known formats, none of which leads to other files or to the web."""
+
+import json
+import os
+
+import geopandas
+import pyogrio
+import pytest
+from shapely import LineString
+
+from flexroad.catalog import CatalogError
+from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.vectors import opened
+from tests.make_rasters import UTM
+
+LINE = {"type": "LineString", "coordinates": [[7.0, 51.0], [7.1, 51.1]]}
+FEATURE = {"type": "Feature", "properties": {"type": "link", "name": "crs"}, "geometry": LINE}
+ROADS = {"type": "FeatureCollection", "features": [FEATURE]}
+OSM = (
+    '<?xml version="1.0"?>\n<osm version="0.6"><note>by hand</note><meta osm_base="2020"/>'
+    '<node id="1" lat="51" lon="7"/><node id="2" lat="51.1" lon="7"/>'
+    '<way id="3"><nd ref="1"/><nd ref="2"/><tag k="highway" v="service"/></way></osm>'
+)
+
+
+def check_refused(path, content, match):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(Refused, match=match):
+        vector_name(path)
+    with pytest.raises(CatalogError, match=match):
+        opened(path, UTM)
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "fgb", "shp", "geojson"])
+def test_formats_are_read(tmp_path, suffix):
+    path = tmp_path / f"roads.{suffix}"
+    geopandas.GeoDataFrame({"w": [4.0]}, geometry=[LineString([(0, 0), (9, 9)])], crs=UTM).to_file(path)
+    assert len(pyogrio.read_dataframe(vector_name(path))) == 1
+    assert opened(path, None).extents
+
+
+def test_osm_is_read(tmp_path):
+    path = tmp_path / "roads.osm"
+    path.write_text(OSM)
+    assert vector_name(path) == str(path)
+    assert opened(path, None).extents is None
+
+
+@pytest.mark.parametrize(
+    "crs", [None, {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}]
+)
+def test_geojson_with_named_crs_is_read(tmp_path, crs):
+    path = tmp_path / "roads.json"
+    path.write_text("\ufeff \n" + json.dumps(ROADS | {"crs": crs}, indent=1), encoding="utf-8")
+    assert pyogrio.read_info(vector_name(path))["driver"] == "GeoJSON"
+
+
+LINKS = {
+    "link": '"crs": {"type": "link", "properties": {"href": "WEB/crs", "type": "proj4"}}',
+    "url": '"CRS" : {"properties": {"url": "WEB/crs"}, "TYPE": "URL"}',
+    "escaped": '"c\\u0072s": {"type": "l\\u0069nk", "properties": {"href": "WEB/crs"}}',
+    "quotes": "'crs': {'type': 'link', 'properties': {'href': 'WEB/crs'}}",
+    "comment": '"crs" /* : */ : {"type": "link", "properties": {"href": "WEB/crs"}}',
+    "brace": '"crs": {"a": "}", "type": "link", "properties": {"href": "WEB/crs"}}',
+    "twice": '"crs": null, "crs": {"type": "name", "type": "link", "properties": {"href": "WEB/crs"}}',
+}
+
+
+@pytest.mark.parametrize("text", LINKS.values(), ids=LINKS)
+@pytest.mark.parametrize("first", [True, False])
+def test_linked_crs_of_geojson_asks_no_server(tmp_path, web, text, first):
+    text, roads = text.replace("WEB", web.url), json.dumps(ROADS)[1:-1]
+    content = "{" + ", ".join([text, roads] if first else [roads, text]) + "}"
+    check_refused(tmp_path / "roads.geojson", content, "has its CRS by a link")
+    assert web.requests == []
+
+
+OTHERS = {
+    "ogr vrt": '<OGRVRTDataSource><OGRVRTLayer name="x"><SrcDataSource>/vsicurl/URL/x.geojson</SrcDataSource>'
+    "</OGRVRTLayer></OGRVRTDataSource>",
+    "wfs": "<OGRWFSDataSource><URL>URL/wfs</URL></OGRWFSDataSource>",
+    "kml": "<kml><NetworkLink><Link><href>URL/a.kml</href></Link></NetworkLink></kml>",
+    "gml": '<FeatureCollection xmlns:gml="http://www.opengis.net/gml" '
+    'xsi:schemaLocation="a URL/a.xsd"></FeatureCollection>',
+    "osm with a vrt": "<osm><!-- <OGRVRTDataSource><OGRVRTLayer name='x'>"
+    "<SrcDataSource>/vsicurl/URL/x.geojson</SrcDataSource></OGRVRTLayer></OGRVRTDataSource> --></osm>",
+    "sqlite": b"SQLite format 3\0" + b"\0" * 99,
+    "zip": b"PK\3\4" + b"\0" * 99,
+    "empty": b"",
+    "text": "easting,northing\n1,2\n",
+}
+
+
+@pytest.mark.parametrize("content", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("name", ["roads.geojson", "roads.gpkg", "roads.osm"])
+def test_other_formats_ask_no_server(tmp_path, web, content, name):
+    if isinstance(content, str):
+        content = content.replace("URL", web.url)
+    check_refused(tmp_path / name, content, "it is no GeoPackage.*ogr2ogr")
+    assert web.requests == []
+
+
+def test_json_of_another_format_asks_no_server(tmp_path, web):
+    path = tmp_path / "roads.geojson"
+    command = f"gdal vector pipeline ! read /vsicurl/{web.url}/x.geojson"
+    source = f"/vsicurl/{web.url}/x.geojson"
+    hidden = f"<OGRVRTDataSource><OGRVRTLayer name='x'><SrcDataSource>{source}</SrcDataSource></OGRVRTLayer>"
+    path.write_text(json.dumps({"type": "gdal_streamed_alg", "command_line": command}))
+    with pytest.raises(CatalogError, match="is not a vector file"):
+        opened(path, UTM)
+    path.write_text(json.dumps(ROADS | {"a": hidden + "</OGRVRTDataSource>"}))
+    assert opened(path, UTM).has_crs
+    assert web.requests == []
+
+
+def test_only_regular_files_are_opened(tmp_path):
+    pipe = tmp_path / "roads.gpkg"
+    os.mkfifo(pipe)
+    with pytest.raises(Refused, match="is not a regular file"):
+        vector_name(pipe)
+    with pytest.raises(Refused, match="is not a regular file"):
+        vector_name(tmp_path)
+    path = tmp_path / "roads.shp"
+    geopandas.GeoDataFrame(geometry=[LineString([(0, 0), (9, 9)])], crs=UTM).to_file(path)
+    path.with_suffix(".prj").unlink()
+    os.mkfifo(path.with_suffix(".prj"))
+    with pytest.raises(Refused, match="has the part roads.prj, which is not a regular file"):
+        vector_name(path)
+
+
+def test_path_that_gdal_would_divide_is_refused(tmp_path):
+    path = tmp_path / "a!b.geojson"
+    path.write_text(json.dumps(ROADS))
+    with pytest.raises(Refused, match="rename it"):
+        vector_name(path)
