@@ -35,7 +35,7 @@ def entries(data: bytes) -> Iterator[Item]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False)
+    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
     paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
     columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
@@ -103,7 +103,8 @@ def table_bytes(items: list[Item], full: Item) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"
-        to_parquet(pa.Table.from_pylist([row(item) for item in items], schema), file)
+        table = pa.Table.from_pylist([row(item) for item in items], schema)
+        to_parquet(table, file, write_page_checksum=True)
         return file.read_bytes()
 
 

@@ -15,7 +15,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,6 +47,7 @@ from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
+from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.artefacts import check_writable
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.tile import TileJob
@@ -196,7 +196,7 @@ class Run:
             "seal": seal(self.allowed),
             "exported": list(self.exported),
         }
-        write(self.path / "run.json", json.dumps(record, indent=1).encode())
+        write(self.path / "run.json", checked_json.dumps(record))
 
 
 def check_models(config: Config) -> None:
@@ -268,11 +268,11 @@ def _config(path: Location) -> Config:
 def _record(run: Location) -> dict[str, Any] | None:
     """Return the content of run.json, None if it is missing or damaged."""
     try:
-        record: dict[str, Any] = json.loads(read(run / "run.json"))
+        record = checked_json.loads(read(run / "run.json"))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:
         # After an access or connection error it is unknown whether there is a run.
         raise ConfigError(f"cannot read {run / 'run.json'}: {error.strerror or error}") from error
     required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
-    return record if isinstance(record, dict) and required <= record.keys() else None
+    return record if required <= record.keys() else None

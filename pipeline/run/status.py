@@ -6,7 +6,6 @@ is read only if it differs from the one in the database.
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
@@ -22,6 +21,7 @@ from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise
+from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.database import NAME, RunDatabase, TileState
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
@@ -129,7 +129,7 @@ def _last_record(folder: Location, entry: TileRecord | None, files: dict[str, Fi
 
 def _from_marker(folder: Location, marker: MarkerStat) -> TileRecord | None:
     try:
-        content = json.loads(read(folder / marker[0]))
+        content = checked_json.loads(read(folder / marker[0]))
         return (from_item if marker[0] == DONE else from_failed)(content, marker)
     except DAMAGED:
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import json
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from itertools import islice
 from typing import Any
 
 from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.records import Failure
 
@@ -77,12 +77,11 @@ def write_summary(run: Location, summary: Summary, **about: Any) -> None:
         **about,
         "flexroad": importlib.metadata.version("flexroad"),
     }
-    write(run / NAME, json.dumps(content, indent=1).encode())
+    write(run / NAME, checked_json.dumps(content))
 
 
 def read_summary(run: Location) -> dict[str, Any]:
     """Return the content of summary.json, empty if it is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
-        content = json.loads(read(run / NAME))
-        return content if isinstance(content, dict) else {}
+        return checked_json.loads(read(run / NAME))
     return {}

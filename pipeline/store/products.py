@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.store import checked_json
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class TileProducts:
         self._mark("failed.json", failure, flushed)
 
     def _mark(self, name: str, content: dict[str, Any], flushed: bool) -> None:
-        paths.write(self.path / name, json.dumps(content, indent=1, allow_nan=False).encode(), flushed)
+        paths.write(self.path / name, checked_json.dumps(content), flushed)
         if flushed:
             # The tile's folder may be new. Some network shares cannot flush folders.
             for folder in (self.path, self.path.parent):
@@ -87,10 +87,9 @@ class TileProducts:
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
-            content = json.loads(paths.read(self.path / name))
+            return checked_json.loads(paths.read(self.path / name))
         except (OSError, ValueError):
             return None
-        return content if isinstance(content, dict) else None
 
 
 def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:

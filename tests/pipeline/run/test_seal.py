@@ -1,12 +1,11 @@
 """The folders that a run may read hold only with the seal of the user's key."""
 
-import json
-
 import pytest
 
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.seal import seal, sealed
+from flexroad.pipeline.store import checked_json
 
 
 @pytest.fixture(autouse=True)
@@ -45,10 +44,10 @@ def test_changed_list_of_a_run_allows_nothing(flexroad, survey, quick_config, tm
     Run.create(run, *_settings(survey, quick_config))
     tile = Run.open(run).catalog.tiles[0]
     assert all(path.exists() for path in tile.paths(tile.layers[0]))
-    record = json.loads((run / "run.json").read_text())
+    record = checked_json.loads((run / "run.json").read_bytes())
     assert str(survey.parent) in record["allowed"]
     record["allowed"] = allowed
-    (run / "run.json").write_text(json.dumps(record))
+    (run / "run.json").write_bytes(checked_json.dumps(record))
     tile = Run.open(run).catalog.tiles[0]
     with pytest.raises(CatalogError, match=f"--allow {survey.parent}"):
         tile.paths(tile.layers[0])
