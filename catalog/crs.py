@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info, query_utm_crs_info
 from pyproj.enums import PJType
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
@@ -84,9 +85,10 @@ def short(text: str) -> str:
 
 
 def utm_of(degrees: Bounds) -> str:
-    """Return the code of the UTM zone (WGS 84) at the middle of west, south, east, north (degrees)."""
+    """Return the code of the UTM zone (WGS 84) at the middle of bounds (degrees), of any if they are NaN."""
     east, north = (degrees[0] + degrees[2]) / 2, (degrees[1] + degrees[3]) / 2
-    zones = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north))
+    known = math.isfinite(east) and math.isfinite(north)
+    zones = query_utm_crs_info("WGS 84", AreaOfInterest(east, north, east, north)) if known else []
     return f"EPSG:{zones[0].code}" if zones else "EPSG:25832"
 
 
@@ -133,6 +135,15 @@ def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
     """Return longitude and latitude (WGS 84, degrees) of a point; infinite if it cannot be transformed."""
     longitude, latitude = transformer(text, "EPSG:4326").transform(easting, northing)
     return float(longitude), float(latitude)
+
+
+def bounds_in(target: str, source: str, bounds: Bounds) -> Bounds:
+    """Return the bounds, in another CRS, of what lies within bounds; NaN if they cannot be transformed."""
+    try:
+        west, south, east, north = transformer(source, target).transform_bounds(*bounds, densify_pts=21)
+    except ProjError:
+        return (math.nan,) * 4
+    return west, south, east, north
 
 
 @lru_cache(maxsize=16)

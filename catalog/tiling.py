@@ -16,9 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from rasterio.warp import transform_bounds
 
-from flexroad.catalog.crs import same, short
+from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
@@ -122,8 +121,7 @@ def cut(
 def _place(files: Sequence[RasterFile], crs: str) -> list[_PlacedFile]:
     """Return the files with their bounds in the tiles' CRS."""
     placed = [
-        _PlacedFile(f, f.bounds if same(f.crs, crs) else transform_bounds(f.crs, crs, *f.bounds))
-        for f in files
+        _PlacedFile(f, f.bounds if same(f.crs, crs) else bounds_in(crs, f.crs, f.bounds)) for f in files
     ]
     for file, bounds in placed:
         if not np.isfinite(bounds).all():

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
-from rasterio.warp import transform_bounds
 
-from flexroad.catalog.crs import in_plan, plan_unit, short, utm_of
+from flexroad.catalog.crs import bounds_in, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import open_raster
@@ -218,7 +217,7 @@ def require_metric(file: RasterFile) -> None:
     if unit in ("metre", "meter") and metres == 1.0:
         return
     units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
-    zone = utm_of(transform_bounds(file.crs, "EPSG:4326", *file.bounds))
+    zone = utm_of(bounds_in("EPSG:4326", file.crs, file.bounds))
     raise CatalogError(
         f"{file.name} is in {short(file.crs)}, whose unit is {units}; "
         f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}"

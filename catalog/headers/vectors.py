@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj.exceptions import ProjError
 
-from flexroad.catalog.crs import transformer
+from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import vector_name
@@ -131,11 +130,8 @@ def _extent(file: VectorFile, target: str) -> Bounds:
 
 
 def _placed(crs: str, target: str, bounds: Bounds) -> Bounds:
-    try:
-        west, south, east, north = transformer(crs, target).transform_bounds(*bounds, densify_pts=21)
-    except ProjError:
-        return EVERYWHERE
-    return (west, south, east, north) if np.isfinite((west, south, east, north)).all() else EVERYWHERE
+    placed = bounds_in(target, crs, bounds)
+    return placed if np.isfinite(placed).all() else EVERYWHERE
 
 
 def _near(tile: Tile, extents: NDArray[np.float64]) -> NDArray[np.bool_]:

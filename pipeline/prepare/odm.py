@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio.warp
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
+from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
@@ -126,7 +126,7 @@ def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Grid]:
         if crs is None:
             raise CatalogError(f"{dsm} carries no CRS; give it with --crs, such as --crs EPSG:32632")
         frame = MetricTransform.of(crs, source.bounds[:2], common.to_crs, common.height_unit)
-        bounds = rasterio.warp.transform_bounds(crs, frame.target, *source.bounds)
+        bounds = bounds_in(frame.target, crs, tuple(source.bounds))
     return frame, output_grid(bounds, frame.target, common.cell_m, common.step_m)
 
 

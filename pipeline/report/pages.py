@@ -19,7 +19,7 @@ from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as text, with its interval if it has one."""
-MARKUP = re.compile(r"[\\`*<>|~$]|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
+MARKUP = re.compile(r"[\\`*|~$]|<(?=[A-Za-z/!?])|^>|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
 """Characters that are markup in Markdown at this place: not, for example, ``_`` within a word."""
 
 

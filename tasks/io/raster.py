@@ -12,10 +12,10 @@ import numpy as np
 from affine import Affine
 from rasterio.enums import MaskFlags, Resampling
 from rasterio.errors import RasterioError
-from rasterio.warp import reproject, transform_bounds
+from rasterio.warp import reproject
 from rasterio.windows import Window
 
-from flexroad.catalog.crs import same, short
+from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.headers.refused import Refused
@@ -292,7 +292,7 @@ def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str 
         raise TaskError(f"{name} has no CRS; build the catalog again with --crs", str(path))
     if same(file_crs, grid.crs):
         return lattice
-    if not _overlap(transform_bounds(file_crs, grid.crs, *lattice.bounds), grid.bounds):
+    if not _overlap(bounds_in(grid.crs, file_crs, lattice.bounds), grid.bounds):
         return None
     raise OtherCrs(
         f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "

@@ -370,6 +370,13 @@ def test_load_file_in_other_crs_outside_tile_is_ignored(tmp_path, dtm):
     np.testing.assert_array_equal(load(tile_with_files, Options()).dtm, relief(seed=9))
 
 
+def test_load_file_in_local_crs_fails(tmp_path, dtm):
+    """A site's own coordinates cannot be transformed."""
+    site = 'LOCAL_CS["my site",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    write(tmp_path / "dsm.tif", relief(), **NORTH, crs=site)
+    assert "dsm dsm.tif is in my site, the tile in EPSG:25832; reproject it" in fails(tile(tmp_path))[0]
+
+
 def test_load_file_without_crs_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, crs=None)
     assert "dsm dsm.tif has no CRS; build the catalog again with --crs" in fails(tile(tmp_path))[0]

@@ -11,7 +11,7 @@ def test_markdown_escapes_markup_and_controls():
     table = markdown(pd.DataFrame([(EVIL, "295500_5629250", 1.5)], columns=["message", "tile", "m"]))
     *_, row = table.splitlines()
     assert row == (
-        r"| \\x1b[2J\<img src=x\>\`a\` \*b\* \_c\_ [d\](e) f\|g \~h\~ \&amp; \\nx | 295500_5629250 | 1.500 |"
+        r"| \\x1b[2J\<img src=x>\`a\` \*b\* \_c\_ [d\](e) f\|g \~h\~ \&amp; \\nx | 295500_5629250 | 1.500 |"
     )
 
 

@@ -78,15 +78,14 @@ def test_segment_several_files_are_merged(tmp_path):
     ("make", "options", "message"),
     [
         (lambda path: None, {}, "cannot be opened .*put it back"),
-        (lambda path: path.write_text("roads"), {}, "cannot be read as vectors"),
+        (lambda path: path.write_text("roads"), {}, "is not a vector file"),
         (lambda path: write(path, [LINE]), {"layer": "ways"}, "has no layer 'ways'; there are r"),
         (lambda path: write(path, [LINE]), {"where": "kind = 1"}, "cannot be read as roads: .*segment.where"),
         (lambda path: write(path, [LINE]), {"where": "id = 7"}, "no road of r.gpkg lies on this tile"),
         (lambda path: write(path, [LINE], "EPSG:3857"), {}, "no road of r.gpkg lies on this tile"),
-        (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(4000)), {}, "cannot be read"),
+        (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(4000)), {}, "is not a vector file"),
     ],
 )  # fmt: skip
-@pytest.mark.filterwarnings("ignore:GPKG. bad application_id")
 def test_segment_unusable_file_raises_one_line(tmp_path, make, options, message):
     path = tmp_path / "r.gpkg"
     make(path)
