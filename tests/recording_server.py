@@ -34,8 +34,10 @@ def recording(folder: Path) -> Iterator[Recorder]:
     file.touch()
     with subprocess.Popen([sys.executable, __file__, file], stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        yield Recorder(f"http://127.0.0.1:{int(server.stdout.readline())}", file)
-        server.terminate()
+        try:
+            yield Recorder(f"http://127.0.0.1:{int(server.stdout.readline())}", file)
+        finally:
+            server.terminate()
 
 
 class _Handler(BaseHTTPRequestHandler):

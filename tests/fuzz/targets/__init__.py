@@ -1,0 +1,1 @@
+"""What is fuzzed: each module makes valid files in a folder, and reads one of them."""
