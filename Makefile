@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all lint bench clean
+.PHONY: help setup reproduce run rerun test test-all fuzz lint bench clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -80,6 +80,13 @@ test: $(STAMP) ## Run the tests but for the slow ones: minutes
 
 test-all: $(STAMP) ## Run all tests
 	$(PYTEST)
+
+# Two of the eight kinds at a time: half an hour.
+FUZZ_SECONDS ?= 450
+FUZZ_SEED ?= $(shell date +%s)
+
+fuzz: $(STAMP) ## Damage files of every kind at random and read them: make fuzz [FUZZ_SECONDS=450] [FUZZ_SEED=1]
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED) --jobs $(JOBS)
 
 lint: $(STAMP) ## Check style and types
 	$(BIN)/ruff check .

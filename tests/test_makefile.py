@@ -82,5 +82,7 @@ def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
         ]
 
 
-def test_ci_runs_lint_and_all_tests():
-    assert (ROOT / ".ci" / "run").read_text().splitlines()[-2:] == ["make lint", "make test-all"]
+def test_ci_runs_lint_all_tests_and_the_fuzzer():
+    *_, lint, tests, fuzz = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert [lint, tests] == ["make lint", "make test-all"]
+    assert fuzz.startswith("make fuzz FUZZ_SECONDS=60 ")

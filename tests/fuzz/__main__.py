@@ -47,6 +47,7 @@ def fuzz(target: str, seconds: float, seed: int, keep: Path) -> Outcome:
         folder.mkdir()
         seeds = module.make(folder)
         copy = getattr(module, "copy", beside)
+        change = getattr(module, "change", lambda path, data, rng: b"")
         with Reader(module.__name__, "read") as reader:
             # The valid files first: they start the process, and must not give a fault.
             for path in seeds:
@@ -56,7 +57,9 @@ def fuzz(target: str, seconds: float, seed: int, keep: Path) -> Outcome:
             end = time.monotonic() + seconds
             while time.monotonic() < end:
                 path = copy(seeds[rng.integers(len(seeds))], Path(name, f"copy-{counts.total()}"))
-                path.write_bytes(_damaged(path.read_bytes(), rng, watched))
+                path.write_bytes(
+                    change(path, path.read_bytes(), rng) or _damaged(path.read_bytes(), rng, watched)
+                )
                 result = reader.read(path)
                 fault = result.fault or watched.touched()
                 counts["fault" if fault else "read" if result.was_read else "refused"] += 1

@@ -21,6 +21,8 @@ START = "from tests.fuzz.reader import main; main()"
 ROOT = Path(__file__).parents[2]
 SECONDS = 30
 """Limit of one file; most take milliseconds, but the machine may be busy."""
+START_SECONDS = 300
+"""Limit of the imports; they take some seconds, on a busy machine many."""
 MEMORY = 4 * 2**30
 """Limit of the process (bytes)."""
 MAX_LINE = 2000
@@ -60,8 +62,7 @@ class Reader:
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, bufsize=0
             )
-            # The imports take some seconds, on a busy machine many.
-            assert self._line(10 * SECONDS) == b"ready\n"
+            assert self._line(START_SECONDS) == b"ready\n"
         assert self._process.stdin is not None
         self._process.stdin.write(f"{path}\n".encode())
         line = self._line(SECONDS)

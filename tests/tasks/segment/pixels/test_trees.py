@@ -4,7 +4,7 @@ import io
 import os
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from flexroad.tasks import TaskError
 from flexroad.tasks.segment.pixels.features import Features
 from flexroad.tasks.segment.pixels.model import About, encode, read_model
 from tests import fuzz
+from tests.fuzz.damage import damage
 
 NAMES = tuple("abcdef")
 ABOUT = About(features=NAMES, photo=False, cell_m=1, threshold=0.5, scikit_learn="1", trained={})
@@ -141,18 +142,16 @@ def test_read_pipe_raises_at_once(tmp_path):
     fails(tmp_path / "model.skops", "is not a file")
 
 
-def damaged_nodes(whole: bytes, n: int) -> Iterator[bytes]:
-    """Yield models whose archive is valid, but the nodes of some trees are not."""
-    for seed in range(n):
-        rng = np.random.default_rng(seed)
+def with_damaged_nodes(whole: bytes, rng: np.random.Generator) -> bytes:
+    """Return a model whose archive is valid, but the nodes of some trees are not."""
 
-        def change(name: str, content: bytes, rng=rng) -> bytes:
-            if b"is_leaf" not in content[:500] or rng.random() < 0.8:
-                return content
-            start = content.index(b"\n") + 1
-            return content[:start] + next(fuzz.damaged(content[start:], 1, int(rng.integers(2**31))))
+    def change(name: str, content: bytes) -> bytes:
+        if b"is_leaf" not in content[:500] or rng.random() < 0.8:
+            return content
+        start = content.index(b"\n") + 1
+        return content[:start] + damage(content[start:], rng)
 
-        yield repacked(whole, change)
+    return repacked(whole, change)
 
 
 @pytest.mark.slow
@@ -163,7 +162,8 @@ def test_read_damaged_at_random_raises_or_predicts(tmp_path, whole):
 
 @pytest.mark.slow
 def test_read_damaged_nodes_raises_or_predicts(tmp_path, whole):
-    fuzz.check(__name__, "predicted", damaged_nodes(whole, 200), written(tmp_path, whole))
+    copies = (with_damaged_nodes(whole, np.random.default_rng(seed)) for seed in range(200))
+    fuzz.check(__name__, "predicted", copies, written(tmp_path, whole))
 
 
 @pytest.mark.slow
