@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from datetime import date
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers import las_header
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]
@@ -22,6 +24,8 @@ NOISE = (7, 18)
 """Classes of low and high noise (ASPRS LAS 1.4)."""
 CHUNK = 1_000_000
 """Points decoded at a time, so that memory does not grow with the file."""
+CHUNK_BYTES = 256 * 2**20
+"""Largest size of points decoded at a time; a point of an absurd format has 64 KiB."""
 RGB = ("red", "green", "blue")
 DEGREES = 360.0
 SLACK = 0.01
@@ -89,21 +93,9 @@ def inspect(path: Path) -> Cloud:
         If the file is missing, not LAS or LAZ, truncated, or without points.
     """
     with _opened(path) as reader:
-        header = reader.header
-        west, south, low = map(float, header.mins)
-        east, north, high = map(float, header.maxs)
-        bounds = west, south, east, north
-        cloud = Cloud(
-            path,
-            header.point_count,
-            bounds,
-            (low, high),
-            _crs(header, bounds),
-            set(RGB) <= set(header.point_format.dimension_names),
-            header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
-        )
-        needed = header.offset_to_point_data + cloud.points * header.point_format.size
-        plain = not header.are_points_compressed
+        cloud = _attempt(path, lambda: _cloud(path, reader.header))
+        needed = reader.header.offset_to_point_data + cloud.points * reader.header.point_format.size
+        plain = not reader.header.are_points_compressed
     if cloud.points == 0:
         raise CatalogError(f"{path} has no points; leave it out, or write it again")
     if not np.isfinite((*cloud.bounds, *cloud.heights)).all():
@@ -115,6 +107,21 @@ def inspect(path: Path) -> Cloud:
     return cloud
 
 
+def _cloud(path: Path, header: Any) -> Cloud:
+    west, south, low = map(float, header.mins)
+    east, north, high = map(float, header.maxs)
+    bounds = west, south, east, north
+    return Cloud(
+        path,
+        header.point_count,
+        bounds,
+        (low, high),
+        _crs(header, bounds),
+        set(RGB) <= set(header.point_format.dimension_names),
+        header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
+    )
+
+
 def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iterator[Chunk]:
     """Yield the points of a cloud, decoded once; withheld points are left out.
 
@@ -123,7 +130,7 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
     path : Path
         LAS, LAZ or COPC file.
     size : int
-        Points decoded at a time.
+        Points decoded at a time, at most.
     drop : Collection[int]
         Classes to leave out.
 
@@ -137,12 +144,14 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
         header, done = reader.header, 0
         low, high = np.asarray(header.mins), np.asarray(header.maxs)
         slack = SLACK * (high - low) + 1
+        size = max(1, min(size, CHUNK_BYTES // header.point_format.size))
         while done < header.point_count:
             points = _attempt(path, lambda: reader.read_points(size), f" after {done:,} points")
             if not len(points):
                 break
             done += len(points)
-            yield _chunk(path, points, (low - slack, high + slack), drop)
+            limits = low - slack, high + slack
+            yield _attempt(path, functools.partial(_chunk, path, points, limits, drop))
     if done != header.point_count:
         raise CatalogError(
             f"{path} is cut short: {done:,} of {header.point_count:,} points; download it again"
@@ -171,29 +180,34 @@ def _opened(path: Path) -> Any:
     import laspy
 
     if not path.is_file():
-        raise CatalogError(f"{path} does not exist; give LAS or LAZ files, or folders of them")
-    backends = (laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs)
-    return _attempt(path, lambda: laspy.open(path, laz_backend=backends))
+        missing = "is not a file" if path.exists() else "does not exist"
+        raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
+    largest = _attempt(path, lambda: las_header.check(path))
+    # The parallel decoder allocates a whole chunk, which the header may give as 2^32 points.
+    backend = laspy.LazBackend.Lazrs if largest > CHUNK_BYTES else laspy.LazBackend.LazrsParallel
+    return _attempt(path, lambda: laspy.open(path, laz_backend=backend))
 
 
 def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
     """Return the result of ``read``; turn any error of the decoders into a `CatalogError` of one line."""
-    from laspy import LaspyException
-
     try:
         return read()
-    except (LaspyException, OSError, ValueError, RuntimeError, OverflowError, MemoryError) as error:
+    except CatalogError:
+        raise
+    except BaseException as error:
+        # For a damaged file, laspy raises exceptions of many types, and lazrs one that is no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise CatalogError(
-            f"{path} cannot be read as a point cloud{when}: {error}; download it again"
+            f"{path} cannot be read as a point cloud{when}: {reason}; download it again"
         ) from error
 
 
 def _crs(header: Any, bounds: Bounds) -> str | None:
-    from pyproj.exceptions import CRSError
-
     try:
         crs = header.parse_crs()
-    except (CRSError, UnicodeDecodeError):
+    except Exception:  # laspy and pyproj raise many types for damaged records
         return None
     # GeoTIFF keys of a user-defined projection also name its geographic base CRS, which laspy then returns.
     if crs is None or (crs.is_geographic and max(map(abs, bounds)) > DEGREES):
