@@ -94,9 +94,12 @@ class MetricTransform:
         if self.plan_m is not None:
             return x * self.plan_m, y * self.plan_m, height
         easting, northing = transformer(self.source, self.target).transform(x, y)
-        if not (np.isfinite(easting).all() and np.isfinite(northing).all()):
+        lost = ~(np.isfinite(easting) & np.isfinite(northing))
+        if lost.any():
+            at = int(np.argmax(lost))
             raise CatalogError(
-                f"points in {short(self.source)} have no position in {short(self.target)}; "
+                f"a point at {x[at]:.9g}, {y[at]:.9g} in {short(self.source)} has no position in "
+                f"{short(self.target)}; "
                 "give a CRS that is valid there with --to-crs, or correct --crs"
             )
         return easting, northing, height

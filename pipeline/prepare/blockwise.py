@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,21 @@ from rich.console import Console
 from rich.progress import track
 
 from flexroad.catalog import Grid
-from flexroad.catalog.grid import Bounds
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.prepare.point_buckets import BlockIndex, BucketedPoints, PointBuckets, disk_errors
+from flexroad.pipeline.prepare.point_buckets import (
+    BlockIndex,
+    BucketedPoints,
+    PointBuckets,
+    disk_errors,
+)
 from flexroad.pipeline.prepare.raster_writer import GROUND, RasterWriter
+from flexroad.tasks import memory
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise, reach_m
 from flexroad.tasks.types import Orthophoto
+
+POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
+"""Memory that a block takes per point, cell and pixel of the orthophoto (bytes); measured."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +42,6 @@ class BlockJob:
     """Pixel of the orthophoto (m); None if there is none."""
     target: Path
     """Output file with the rasters, ``.npz``."""
-
-
-def output_grid(bounds: Bounds, crs: str, cell: float, step: float) -> Grid:
-    """Return the smallest grid on multiples of ``step`` (m) that covers the bounds."""
-    west, south, east, north = (side / step for side in bounds)
-    west, south = math.floor(west) * step, math.floor(south) * step
-    east, north = math.ceil(east) * step, math.ceil(north) * step
-    return Grid.covering(crs, (west, south, max(east, west + step), max(north, south + step)), cell)
 
 
 def write_blocks(
@@ -71,8 +70,11 @@ def write_blocks(
     ------
     ConfigError
         If the disk is full, or a worker dies.
+    TaskError
+        If a block would not fit in memory.
     """
     jobs = list(_jobs(writer, bucketed, options))
+    _check_memory(jobs)
     log(f"{len(jobs)} block{'s' * (len(jobs) != 1)} of {bucketed.buckets.edge:g} m")
     finished = executor.map(_rasterise_block, jobs, _fail)
     for job in track(finished, "making rasters", len(jobs), console=Console(stderr=True)):
@@ -88,6 +90,33 @@ def _jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> I
         grid = _block_grid(writer.grid, buckets.edge, index)
         if grid and not bucketed.occupied.isdisjoint(buckets.overlapping(grid, reach)):
             yield BlockJob(buckets, grid, options, dop_cell, writer.scratch / f"{index[0]}_{index[1]}.npz")
+
+
+def _check_memory(jobs: Sequence[BlockJob]) -> None:
+    """Check that each block with its rim fits in memory.
+
+    Raises
+    ------
+    TaskError
+        If a block has too many points or cells.
+    """
+    counts: dict[BlockIndex, int] = {}
+    for job in jobs:
+        reach = reach_m(job.options, job.grid.cell)
+        rim, points = job.grid.buffered(reach), 0.0
+        for index in job.buckets.overlapping(job.grid, reach):
+            if index not in counts:
+                counts[index] = job.buckets.count(index)
+            # The points of a block may lie anywhere in it; of its neighbours only the rim is kept.
+            is_whole = job.buckets.share(index, job.grid.bounds) > 0
+            points += counts[index] * (1 if is_whole else job.buckets.share(index, rim.bounds))
+        cells = float(rim.width * rim.height)
+        pixels = cells * (rim.cell / job.dop_cell) ** 2 if job.dop_cell else 0
+        memory.check(
+            POINT_BYTES * points + CELL_BYTES * cells + PIXEL_BYTES * pixels,
+            f"block {job.grid.west:.0f}_{job.grid.south:.0f}, {points:,.0f} points and {cells:,.0f} cells,",
+            "thin the points, or use larger cells (--cell, --dop-cell)",
+        )
 
 
 def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:

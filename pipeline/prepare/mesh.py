@@ -13,7 +13,8 @@ from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.prepare.blockwise import output_grid, write_blocks
+from flexroad.pipeline.prepare.blockwise import write_blocks
+from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.point_buckets import (
     PER_METRE,
@@ -34,6 +35,8 @@ from flexroad.tasks.acquire.points import to_rasters
 
 BAND = 1024
 """Rows of the orthophoto drawn at a time, so that memory does not grow with the area."""
+REFINE_BYTES, REFERENCE_BYTES = 300, 50
+"""Memory of the refinement and of the reference per cell of the area (bytes); measured."""
 POINTS = to_rasters.Options(ground="filter")
 """Default options for points of a mesh: they have no classes, so the ground filter is used."""
 
@@ -107,7 +110,18 @@ def publish_mesh(
     """Make the rasters and the catalog of a mesh in memory; ``name`` is its source. See `prepare_mesh`."""
     frame = MetricTransform.of(mesh.crs, mesh.bounds[:2], common.to_crs, common.height_unit)
     mesh = in_metres(mesh, frame)
-    grid = output_grid(mesh.bounds, frame.target, common.cell_m, common.step_m)
+    grid = prepared_grid(
+        mesh.bounds,
+        frame.target,
+        common,
+        name,
+        out,
+        photo=mesh_options.dop,
+        per_cell=_whole(mesh_options, common),
+    )
+    points = mesh_options.density * mesh.area
+    remedy = "use a lower --density, or a part of the mesh"
+    check_disk(out, RECORD.itemsize * points, f"the {points:,.0f} points sampled on {name}", remedy)
     dop_cell = common.dop_cell_m if mesh_options.dop else None
     log(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
     with RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options)) as writer:
@@ -133,6 +147,12 @@ def publish_mesh(
             dataset = f"{dataset}; {reference.CIRCULAR}"
         published = writer.publish(common.tile_size_m, common.date, dataset)
     return published.with_notes(*mesh.notes, *frame.notes)
+
+
+def _whole(mesh_options: MeshOptions, common: PrepareOptions) -> int:
+    """Return the memory of the steps that hold the whole area (bytes per cell)."""
+    needed = REFERENCE_BYTES if common.roads is not None else 0
+    return max(needed, REFINE_BYTES) if mesh_options.refine else needed
 
 
 def _tags(name: str, mesh_options: MeshOptions, options: to_rasters.Options) -> dict[str, str]:

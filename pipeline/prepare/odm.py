@@ -19,16 +19,18 @@ from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import bounds_in
+from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.prepare.blockwise import output_grid
+from flexroad.pipeline.prepare.limits import SMALLER, prepared_grid
 from flexroad.pipeline.prepare.mesh import MeshOptions, prepare_mesh
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.tasks import memory
 from flexroad.tasks.acquire.points import fill_voids, ground_filter, to_rasters
 from flexroad.tasks.types import Floats, Orthophoto
 
@@ -40,6 +42,8 @@ MESHES = tuple(
 CLOUDS = tuple(f"odm_georeferencing/odm_georeferenced_model.{kind}" for kind in ("laz", "las"))
 BLOCK = 512
 """Side of the windows that are processed one at a time (cells or pixels), to bound the memory."""
+FILTER_BYTES = 200
+"""Memory of the ground filter per cell of a window and its rim (bytes); measured."""
 
 
 def prepare_odm(
@@ -93,8 +97,9 @@ def prepare_odm(
 def _from_rasters(
     folder: Path, out: Path, common: PrepareOptions, options: to_rasters.Options, log: Callable[[str], None]
 ) -> PreparedDataset:
-    frame, grid = _frame(folder / DSM, common)
     has_dtm, photo = (folder / DTM).is_file(), folder / PHOTO
+    frame, bounds = _frame(folder / DSM, common)
+    grid = prepared_grid(bounds, frame.target, common, str(folder / DSM), out, photo=photo.is_file())
     dop_cell = common.dop_cell_m if photo.is_file() else None
     dtm_source = (
         DTM if has_dtm else f"slope-filtered cells of the DSM; voids up to {options.void_m:g} m filled"
@@ -119,15 +124,15 @@ def _from_rasters(
     return published.with_notes(*frame.notes, *missing)
 
 
-def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Grid]:
-    """Return the transform to metres and the grid that covers the surface model."""
+def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Bounds]:
+    """Return the transform to metres, and the bounds of the surface model (m)."""
     with _opened(dsm) as source:
         crs = source.crs.to_wkt() if source.crs else common.crs
         if crs is None:
             raise CatalogError(f"{dsm} carries no CRS; give it with --crs, such as --crs EPSG:32632")
         frame = MetricTransform.of(crs, source.bounds[:2], common.to_crs, common.height_unit)
         bounds = bounds_in(frame.target, crs, tuple(source.bounds))
-    return frame, output_grid(bounds, frame.target, common.cell_m, common.step_m)
+    return frame, bounds
 
 
 def _resample_heights(
@@ -159,6 +164,11 @@ def _filter_ground(writer: RasterWriter, options: to_rasters.Options) -> None:
     slope = options.filter
     reach = slope.radius_m + (slope.low_radius_m if slope.low_m is not None else 0)
     reach += fill_voids.reach_m(options.void_m, writer.grid.cell)
+    side = BLOCK + 2 * reach / writer.grid.cell
+    cells = min(side**2, writer.grid.width * writer.grid.height)
+    memory.check(
+        FILTER_BYTES * cells, f"the ground filter over {reach:.0f} m of {writer.grid.cell:g} m cells", SMALLER
+    )
     for part, _ in _windows(writer.grid):
         rim = _clipped(part.buffered(reach), writer.grid)
         dsm: Floats = writer.read("dsm", rim)

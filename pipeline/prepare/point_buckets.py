@@ -22,6 +22,7 @@ from flexroad.catalog import Bounds, CatalogError, Grid
 from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.prepare.limits import check_extent
 from flexroad.tasks.acquire.types import Points
 
 PER_METRE = 10_000
@@ -78,6 +79,23 @@ class PointBuckets:
     def corner(self, index: BlockIndex) -> tuple[int, int]:
         """Return easting and northing of a block's south-west corner, in stored units."""
         return round(index[0] * self.edge * PER_METRE), round(index[1] * self.edge * PER_METRE)
+
+    def share(self, index: BlockIndex, bounds: Bounds) -> float:
+        """Return the share of a block's area that is inside bounds (m)."""
+        west, south = index[0] * self.edge, index[1] * self.edge
+        wide = min(bounds[2], west + self.edge) - max(bounds[0], west)
+        tall = min(bounds[3], south + self.edge) - max(bounds[1], south)
+        return max(wide, 0) * max(tall, 0) / self.edge**2
+
+    def first_point(self, index: BlockIndex) -> tuple[float, float]:
+        """Return easting and northing (m) of a point of a block."""
+        (record,), corner = np.fromfile(self.path(index), RECORD, count=1), self.corner(index)
+        return (int(record["east"]) + corner[0]) / PER_METRE, (int(record["north"]) + corner[1]) / PER_METRE
+
+    def count(self, index: BlockIndex) -> int:
+        """Return the number of points of a block."""
+        file = self.path(index)
+        return file.stat().st_size // RECORD.itemsize if file.exists() else 0
 
     def append(self, east: Integers, north: Integers, records: NDArray[np.void]) -> set[BlockIndex]:
         """Add points, ``(n,)``, with coordinates in stored units; return the blocks that received any."""
@@ -194,7 +212,7 @@ def bucket_points(
     Raises
     ------
     CatalogError
-        If a file cannot be read, or no point is left.
+        If a file cannot be read, points are too far apart or have no position in metres, or no point is left.
     ConfigError
         If the disk is full.
     """
@@ -205,10 +223,15 @@ def bucket_points(
         log(f"reading {cloud.path} ({number} of {len(clouds)}, {cloud.points:,} points)")
         counts, colours = np.zeros(256, np.int64), _ByteColours()
         for chunk in chunks(cloud.path, CHUNK):
-            plan, records = _records(chunk, frame, colours)
+            try:
+                plan, records = _records(chunk, frame, colours)
+            except CatalogError as error:
+                raise CatalogError(f"{cloud.path}: {error}") from error
             out_of_range += len(chunk.z) - len(records)
             if not len(records):
                 continue
+            before = (*low / PER_METRE, *high / PER_METRE) if occupied else None
+            check_extent(str(cloud.path), plan / PER_METRE, before)
             counts += np.bincount(records["kind"], minlength=256)
             low, high = np.minimum(low, plan.min(axis=1)), np.maximum(high, plan.max(axis=1))
             with disk_errors(folder.parent):

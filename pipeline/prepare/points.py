@@ -6,15 +6,19 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.point_clouds import Cloud, find, inspect
 from flexroad.catalog.headers.rasters import some
 from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.prepare.blockwise import output_grid, write_blocks
+from flexroad.pipeline.prepare.blockwise import write_blocks
+from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.point_buckets import (
+    RECORD,
     BucketedPoints,
     block_edge_of,
     bucket_points,
@@ -29,8 +33,9 @@ MIN_GROUND = 0.01
 """A file with a smaller share of ground points is taken as not classified."""
 DENSE, DENSE_CONFIDENCE = 50.0, 3.0
 """Above this density (points per m2) the slope filter uses this ``confidence``: see docs/ground.md."""
-MAX_CELLS = 10**10
-"""100 km x 100 km at 1 m; a larger grid means that a point has wrong coordinates."""
+FEWER = "prepare fewer files at a time"
+LARGE, GAP_M = 10**9, 10_000.0
+"""From so many cells on, an area may not have an empty gap of this width (m) and of half its side."""
 
 
 def prepare_points(
@@ -68,14 +73,19 @@ def prepare_points(
     Raises
     ------
     CatalogError
-        If a file is missing, unreadable, empty or cut short, the files' CRSs differ or are unknown, or
-        ``ground`` is ``classes`` and no point has a ground class.
+        If a file is missing, unreadable, empty or cut short, points are too far apart, the files' CRSs
+        differ or are unknown, or ``ground`` is ``classes`` and no point has a ground class.
+    TaskError
+        If a block, or the road mask, would not fit in memory.
     ConfigError
-        If the folder cannot be written, the disk is full, or cell and pixel sizes do not fit each other.
+        If the folder cannot be written, the disk is full or too small, or cell and pixel sizes do not fit
+        each other.
     """
     step = common.step_m
     clouds = tuple(inspect(path) for path in find(files))
     frame = _frame(clouds, common)
+    names = some([str(cloud.path) for cloud in clouds])
+    check_disk(out, RECORD.itemsize * sum(cloud.points for cloud in clouds), f"the points of {names}", FEWER)
     with scratch_folder(out) as folder:
         farthest = max(
             reach_m(_with_method(options, method), common.cell_m) for method in ("classes", "filter")
@@ -83,14 +93,13 @@ def prepare_points(
         bucketed = bucket_points(clouds, frame, folder, block_edge_of(clouds, frame, farthest, step), log)
         method, notes = _ground(clouds, bucketed, options, ground)
         options, dense = _for_density(_with_method(options, method), bucketed)
-        grid = output_grid(bucketed.bounds, frame.target, common.cell_m, step)
-        if grid.width * grid.height > MAX_CELLS:
-            raise CatalogError(_too_large(clouds))
         colourless = [
             cloud.path.name
             for cloud, coloured in zip(clouds, bucketed.has_colours, strict=True)
             if not coloured
         ]
+        _require_no_gap(clouds, frame, bucketed, common.cell_m)
+        grid = prepared_grid(bucketed.bounds, frame.target, common, names, out, photo=not colourless)
         notes = (*frame.notes, *notes, *dense, *_left_out(bucketed, colourless))
         file_tags = _tags(clouds, frame, bucketed, options)
         with RasterWriter(out, grid, None if colourless else common.dop_cell_m, file_tags) as writer:
@@ -177,17 +186,47 @@ def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str,
     return tuple(notes)
 
 
-def _too_large(clouds: Sequence[Cloud]) -> str:
-    def size(cloud: Cloud) -> float:
-        west, south, east, north = cloud.bounds
-        return max(east - west, north - south)
+def _require_no_gap(
+    clouds: Sequence[Cloud], frame: MetricTransform, bucketed: BucketedPoints, cell_m: float
+) -> None:
+    """Check that a large area is not large because of a few distant points.
 
-    widest = max(clouds, key=size)
-    return (
-        f"the points are too far apart for one area; {widest.path} alone spans {size(widest):.0f} of its "
-        "units: remove points with wrong coordinates, prepare distant files separately, or use larger cells "
-        "(--cell)"
-    )
+    Raises
+    ------
+    CatalogError
+        If an area of more than `LARGE` cells has an empty gap of `GAP_M` and of half its side.
+    """
+    west, south, east, north = bucketed.bounds
+    if (east - west) * (north - south) <= LARGE * cell_m**2:
+        return
+    buckets = bucketed.buckets
+    for axis, side in ((0, east - west), (1, north - south)):
+        lines = np.unique([index[axis] for index in bucketed.occupied])
+        gap = np.diff(lines, append=lines[-1])
+        widest = int(gap.argmax())
+        width = (gap[widest] - 1) * buckets.edge
+        if width < max(GAP_M, side / 2):
+            continue
+        first = [index for index in bucketed.occupied if index[axis] <= lines[widest]]
+        last = bucketed.occupied.difference(first)
+        few = min(first, last, key=lambda blocks: sum(map(buckets.count, blocks)))
+        x, y = buckets.first_point(min(few))
+        raise CatalogError(
+            f"{_file_at(clouds, frame, x, y)} has points at easting {x:.2f} and northing {y:.2f} (m), "
+            f"{width / 1000:.0f} km from the others; remove points with wrong coordinates, prepare distant "
+            "files separately, or use larger cells (--cell)"
+        )
+
+
+def _file_at(clouds: Sequence[Cloud], frame: MetricTransform, x: float, y: float) -> Path:
+    """Return the file whose bounds are nearest to a point (m)."""
+
+    def distance(cloud: Cloud) -> float:
+        west, south, east, north = cloud.bounds
+        xs, ys, _ = frame.metres(np.array([west, east]), np.array([south, north]), np.zeros(2))
+        return float(max(min(xs) - x, x - max(xs), min(ys) - y, y - max(ys)))
+
+    return min(clouds, key=distance).path
 
 
 def _tags(

@@ -23,11 +23,15 @@ from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.raster_writer import RasterWriter
+from flexroad.tasks import memory
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 
 MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
+RASTER_BYTES = 4
+"""Memory that reading a raster takes, as a multiple of its values: masked, compared and copied."""
+CUT = "cut it to the area, e.g. gdal_translate -projwin"
 LINES = ("LineString", "MultiLineString")
 
 
@@ -125,6 +129,10 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
         with open_raster(path) as source:
             if source.count == 0 or source.crs is None:
                 return None
+            needed = RASTER_BYTES * np.dtype(source.dtypes[0]).itemsize * source.width * source.height
+            memory.check(
+                needed, f"--roads {path}, {source.width:,} x {source.height:,} cells,", CUT, str(path)
+            )
             mask = np.zeros(grid.shape, np.uint8)
             reproject(
                 (source.read(1, masked=True).filled(0) != 0).astype(np.uint8),

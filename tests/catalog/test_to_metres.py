@@ -117,7 +117,9 @@ def test_invalid_crs_or_unit_raises_error(arguments, message):
 
 def test_point_outside_target_crs_raises_error():
     frame = MetricTransform.of("EPSG:4326", COLOGNE, to_crs="EPSG:25832")
-    with pytest.raises(CatalogError, match="in EPSG:4326 have no position in EPSG:25832; .* --to-crs"):
+    with pytest.raises(
+        CatalogError, match="a point at .* in EPSG:4326 has no position in EPSG:25832; .* --to-crs"
+    ):
         frame.metres(np.array([7.0]), np.array([95.0]), np.zeros(1))
 
 

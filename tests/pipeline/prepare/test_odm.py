@@ -14,6 +14,7 @@ from flexroad.pipeline.prepare import odm
 from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions
 from flexroad.pipeline.prepare.odm import prepare_odm
 from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.tasks import TaskError, memory
 
 CRS = "EPSG:32615"
 WEST, NORTH, SIDE = 576_000.0, 5_188_040.0, 40
@@ -125,6 +126,13 @@ def prepare(folder, out, options=None):
 def read(path):
     with rasterio.open(path) as raster:
         return raster.read().squeeze()
+
+
+def test_prepare_odm_ground_filter_larger_than_memory_raises(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "limit", lambda: 100_000)
+    with pytest.raises(TaskError, match=r"the ground filter over \d+ m of 1 m cells would need .*--cell"):
+        prepare(project(tmp_path, dsm), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_prepare_odm_uses_the_rasters_of_the_project(tmp_path):

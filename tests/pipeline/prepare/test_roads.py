@@ -11,6 +11,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, burn
+from flexroad.tasks import TaskError, memory
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
 
@@ -60,6 +61,18 @@ def test_burn_raster_is_resampled_by_nearest_neighbour(tmp_path):
         raster.write(values.astype(np.uint8), 1)
     row, col = coarse.cells(GRID.eastings[None, :], GRID.northings[:, None])
     assert np.array_equal(burn(path, None, None, GRID), values[row, col])
+
+
+def test_burn_raster_larger_than_memory_raises_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "mask.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", dtype="uint8", count=1, width=2000, height=2000, crs=GRID.crs,
+        transform=GRID.transform, sparse_ok=True,
+    ):  # fmt: skip
+        pass
+    monkeypatch.setattr(memory, "limit", lambda: 10**7)
+    with pytest.raises(TaskError, match="--roads .*mask.tif, 2,000 x 2,000 cells, .* cut it to the area"):
+        burn(path, None, None, GRID)
 
 
 def published(folder, roads, **options):
