@@ -10,8 +10,11 @@ from __future__ import annotations
 import json
 import mmap
 import re
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 from xml.parsers import expat
 
 from flexroad.catalog.headers.refused import Refused, head, require_regular
@@ -20,12 +23,15 @@ UNKNOWN = (
     "is not a vector file: it is no GeoPackage, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
     "convert it with ogr2ogr, e.g. ogr2ogr NEW.gpkg FILE"
 )
+SQLITE = b"SQLite format 3\0"
 GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
 CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s*""", re.IGNORECASE)
 OTHER_THAN_OSM = re.compile(
     rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
 )
+WITH = re.compile(r"\bwith\b", re.IGNORECASE)
+"""Word with which recursive queries begin; SQLite does not require the word RECURSIVE."""
 MAX_CRS_BYTES = 65536
 """Longest text of a CRS in GeoJSON."""
 LINKS = ("link", "url")
@@ -52,14 +58,28 @@ def vector_name(path: Path) -> str:
         return f"GeoJSON:{path}"
     if data.startswith(b"\0\0\x27\x0a"):
         _require_regular_parts(path)
+    elif data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
+        _require_queries_that_end(path)
     elif not (
-        data.startswith(b"fgb\x03")
-        or (data.startswith(b"SQLite format 3\0") and data[68:72] in GEOPACKAGES)
-        or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader")
-        or _is_osm(text)
+        data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
         raise Refused(UNKNOWN)
     return str(path)
+
+
+def _require_queries_that_end(path: Path) -> None:
+    """Raise an error if a GeoPackage has a view that repeats itself: its rows may have no end."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+            views = file.execute("SELECT name, sql FROM sqlite_master WHERE sql LIKE '%view%'").fetchall()
+    except sqlite3.Error:
+        # GDAL reports what is wrong.
+        return
+    for name, query in views:
+        if WITH.search(str(query)):
+            raise Refused(
+                f"has the view {name!r} with a query WITH, which may never end; write its result to a table"
+            )
 
 
 def _is_osm(text: bytes) -> bool:

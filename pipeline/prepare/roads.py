@@ -24,6 +24,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.tasks import memory
+from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 
@@ -159,6 +160,7 @@ def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> A
     if features.crs is None:
         raise ConfigError(f"{path} has no CRS; assign one, e.g. ogr2ogr -a_srs {short(grid.crs)}")
     features = features[~(features.geometry.isna() | features.geometry.is_empty)].to_crs(grid.crs)
+    features = features[has_place(features.geometry.to_numpy())]
     kinds = sorted(set(features.geom_type) - {*AREAS, *LINES})
     if kinds:
         raise ConfigError(

@@ -20,6 +20,7 @@ from weakref import finalize
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog.crs import short, transformer
@@ -28,7 +29,9 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
+from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -41,6 +44,10 @@ OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highw
 """Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
 """Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
+FARTHEST = 1e9
+"""Largest coordinate of a place (m or degrees)."""
+WHOLE = 8
+"""Memory that all features of a file take, as a multiple of its size."""
 TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
@@ -186,8 +193,7 @@ def _described(request: Query, name: str, info: Any) -> _Layer:
 def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
     """Return a layer's features, or those that touch a square (m, in ``request.crs``), in ``request.crs``."""
     try:
-        bbox = square and transformer(request.crs, layer.crs).transform_bounds(*square, densify_pts=21)
-        table = _read(request, _file(request, version), layer, bbox)
+        table = _read_square(request, version, layer, square)
         if table.crs is None:
             table = table.set_crs(layer.crs)
         table = table.to_crs(request.crs)
@@ -197,8 +203,35 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
         raise _error(request, f"cannot be read as roads: {error}{hint}") from error
     table = table.rename(columns={name: name.lower() for name in layer.columns})
     # Coordinates that cannot be transformed to the tiles' CRS become infinite.
-    valid = ~(table.geometry.isna() | table.geometry.is_empty) & np.isfinite(table.bounds).all(axis=1)
-    return _unpacked(table[valid], request.columns)
+    table = table[~(table.geometry.isna() | table.geometry.is_empty)]
+    table = table[has_place(table.geometry.to_numpy())]
+    return _unpacked(table if square is None else _touching(table, square), request.columns)
+
+
+def has_place(features: NDArray[np.object_]) -> Bools:
+    """Return which geometries have only coordinates that can be a place, ``(n,)``: none infinite or NaN."""
+    coordinates, owner = shapely.get_coordinates(features, return_index=True)
+    placed = np.ones(len(features), bool)
+    placed[owner[~(np.abs(coordinates) <= FARTHEST).all(axis=1)]] = False
+    return placed
+
+
+def _read_square(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
+    """Return a layer's features, or those that touch a square, in the layer's CRS."""
+    import pyogrio
+
+    file = _file(request, version)
+    bbox = square and transformer(request.crs, layer.crs).transform_bounds(*square, densify_pts=21)
+    try:
+        return _read(request, file, layer, bbox)
+    except (RuntimeError, pyogrio.errors.FeatureError) as error:
+        if bbox is None or "NaN/Inf" not in str(error):
+            raise
+        # GEOS cannot tell whether a feature with a coordinate that is no number touches the square, and GDAL
+        # then returns no feature at all.
+        remedy = "remove features with infinite coordinates, or convert the file with ogr2ogr -skipfailures"
+        memory.check(WHOLE * version.size, f"{request.path}, read as a whole,", remedy, str(request.path))
+        return _read(request, file, layer, None)
 
 
 def _read(request: Query, file: str, layer: _Layer, bbox: Bounds | None) -> Any:

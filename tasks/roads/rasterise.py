@@ -15,7 +15,7 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import LayerMissing
-from flexroad.tasks.io.vectors import Query, read_near
+from flexroad.tasks.io.vectors import Query, has_place, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -85,7 +85,7 @@ def cells(areas: NDArray[np.object_], grid: Grid) -> Bools:
     """Return the cells whose centre lies in one of the polygons, ``(H, W)``."""
     from rasterio.features import rasterize
 
-    areas = areas[~shapely.is_empty(areas)]
+    areas = areas[~shapely.is_empty(areas) & has_place(areas)]
     if not len(areas):
         return np.zeros(grid.shape, bool)
     burnt: Any = rasterize(areas, out_shape=grid.shape, transform=grid.transform, dtype=np.uint8)

@@ -1,7 +1,9 @@
 """Vector files are opened only in known formats, none of which leads to other files or to the web."""
 
+import contextlib
 import json
 import os
+import sqlite3
 
 import geopandas
 import pyogrio
@@ -134,3 +136,43 @@ def test_path_that_gdal_would_divide_is_refused(tmp_path):
     path.write_text(json.dumps(ROADS))
     with pytest.raises(Refused, match="rename it"):
         vector_name(path)
+
+
+def with_view(path, *queries):
+    """Write a GeoPackage whose layer ``v`` is a view."""
+    roads = geopandas.GeoDataFrame(geometry=[LineString([(0, 0), (1, 1)])], crs=UTM)
+    roads.to_file(path, layer="roads")
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as file:
+        for query in queries:
+            file.execute(query)
+        file.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, srs_id) "
+            "SELECT 'v', 'features', 'v', srs_id FROM gpkg_contents"
+        )
+        file.execute(
+            "INSERT INTO gpkg_geometry_columns SELECT 'v', column_name, geometry_type_name, srs_id, z, m "
+            "FROM gpkg_geometry_columns"
+        )
+    return path
+
+
+def test_view_of_a_geopackage_is_read(tmp_path):
+    path = with_view(tmp_path / "a#b.gpkg", "CREATE VIEW v AS SELECT * FROM roads")
+    assert len(opened(path, None).extents) == 2
+
+
+ENDLESS = "WITH c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS fid, r.geom FROM c, roads r"
+
+
+@pytest.mark.parametrize(
+    ("queries", "match"),
+    [
+        ([f"CREATE VIEW v AS {ENDLESS}"], "a#b.gpkg has the view 'v' with a query WITH, which may never end"),
+        (["CREATE VIEW v AS SELECT * FROM v"], "view v is circularly defined"),
+        (["CREATE VIEW w AS SELECT * FROM v", "CREATE VIEW v AS SELECT * FROM w"], "circularly defined"),
+    ],
+)
+def test_view_without_end_raises_one_line(tmp_path, queries, match):
+    with pytest.raises(CatalogError, match=match) as error:
+        opened(with_view(tmp_path / "a#b.gpkg", *queries), None)
+    assert "\n" not in str(error.value)
