@@ -119,7 +119,7 @@ class Catalog:
         items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
         make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
-            paths.write(path, make(items))
+            paths.write(path, make(items), flushed=True)
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 

@@ -12,8 +12,10 @@ from uuid import uuid4
 
 
 @contextlib.contextmanager
-def atomic_path(where: Path) -> Iterator[Path]:
+def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
     """Yield a temporary file beside ``where``; rename it to ``where`` at the end of the block.
+
+    With ``flushed`` the content is on the disk before the file has its name.
 
     Raises
     ------
@@ -25,6 +27,8 @@ def atomic_path(where: Path) -> Iterator[Path]:
     temporary = target.with_name(f".{target.name}.{uuid4().hex}.tmp")
     try:
         yield temporary
+        if flushed:
+            flush_path(temporary)
         temporary.replace(target)
     except OSError as error:
         # The error of a full disk has no file name, that of a failed rename has the temporary one.
@@ -33,6 +37,23 @@ def atomic_path(where: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def flush_path(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk.
+
+    Raises
+    ------
+    OSError
+        If the disk does not take them; names the file.
+    """
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        os.close(opened)
 
 
 def output_file(where: Path) -> Path:

@@ -22,7 +22,7 @@ from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 
-from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.catalog.storage.outputs import atomic_path, flush_path
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -280,11 +280,9 @@ def write(where: Location, data: bytes, flushed: bool = False) -> None:
         with named(where):
             where.fs.pipe_file(where.path, data)
         return
-    with atomic_path(where) as temporary:
+    with atomic_path(where, flushed) as temporary:
         where.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
-        if flushed:
-            flush(temporary)
 
 
 def flush(where: Location) -> None:
@@ -293,14 +291,17 @@ def flush(where: Location) -> None:
     Raises
     ------
     OSError
-        If the disk does not take them.
+        If the disk does not take them; names the file.
     """
     if isinstance(where, Path):
-        opened = os.open(where, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
+        flush_path(where)
+
+
+def flush_names(*folders: Location) -> None:
+    """Wait until the names in folders are on the disk, if the storage can do that: some shares cannot."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            flush(folder)
 
 
 def remove(where: Location) -> None:

@@ -92,8 +92,10 @@ class StagedFile:
 
 
 @contextlib.contextmanager
-def atomic_file(where: Location) -> Iterator[Path]:
+def atomic_file(where: Location, flushed: bool = False) -> Iterator[Path]:
     """Yield a local file to write; at the end of the block, move or upload it to ``where``.
+
+    With ``flushed`` the content is on the disk before the file has its name.
 
     Raises
     ------
@@ -106,5 +108,5 @@ def atomic_file(where: Location) -> Iterator[Path]:
             yield local
             write(where, local.read_bytes())
         return
-    with atomic_path(where) as temporary:
+    with atomic_path(where, flushed) as temporary:
         yield temporary

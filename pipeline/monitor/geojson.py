@@ -36,7 +36,7 @@ def write_states(run: Run, where: Location) -> None:
     with open_database(run) as database:
         rows = [_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)]
     table = GeoDataFrame(rows, columns=COLUMNS, dtype=object, geometry=outlines(run.catalog.tiles))
-    write(where, table.set_index("id", drop=False).to_json().encode())
+    write(where, table.set_index("id", drop=False).to_json().encode(), run.config.cluster.flush)
 
 
 def outlines(tiles: Sequence[Tile]) -> Any:

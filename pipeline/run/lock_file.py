@@ -63,6 +63,9 @@ class OnDisk:
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(data)
+                file.flush()
+                # After a power failure the owner of an empty lock would be unknown.
+                os.fsync(file.fileno())
         except OSError:
             self.path.unlink(missing_ok=True)
             raise
@@ -86,7 +89,7 @@ class OnDisk:
         with contextlib.ExitStack() as stack:
             unchanged = self._locked_unchanged(stack, expected)
             if unchanged:
-                write(self.path, data)
+                write(self.path, data, flushed=True)
         return unchanged
 
     def renew(self, expected: LockStat) -> None:

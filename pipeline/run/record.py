@@ -31,6 +31,7 @@ from flexroad.catalog.storage.paths import (
     StatCache,
     absolute,
     exists,
+    flush_names,
     is_remote,
     parse_location,
     read,
@@ -183,7 +184,8 @@ class Run:
         return TileProducts.of(self.path, tile_id)
 
     def _write(self) -> None:
-        write(self.path / "config.yaml", yaml.safe_dump(self.config.raw, sort_keys=False).encode())
+        config = yaml.safe_dump(self.config.raw, sort_keys=False).encode()
+        write(self.path / "config.yaml", config, flushed=True)
         self.catalog.write(self.path / "catalog.parquet", movable=False)
         record = {
             "config": self.config.name,
@@ -196,7 +198,9 @@ class Run:
             "seal": seal(self.allowed),
             "exported": list(self.exported),
         }
-        write(self.path / "run.json", checked_json.dumps(record))
+        write(self.path / "run.json", checked_json.dumps(record), flushed=True)
+        # The run's folder may be new.
+        flush_names(self.path, self.path.parent)
 
 
 def check_models(config: Config) -> None:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import exists, parse_location
+from flexroad.catalog.storage.paths import exists, flush_names, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import check_tiles
@@ -200,11 +200,13 @@ def _close(
     )
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
-        write_tables(run.path, database.rows(), database.failures())
+        write_tables(run.path, database.rows(), database.failures(), run.config.cluster.flush)
     summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
     log.note("end", **{name: value for name, value in asdict(summary).items() if name != "failures"})
     about = {"start": start, "end": utc_now(), "config": run.config.name, "origin": list(run.origin)}
-    write_summary(run.path, summary, **about)
+    write_summary(run.path, summary, run.config.cluster.flush, **about)
+    if run.config.cluster.flush:
+        flush_names(run.path)
     return summary
 
 

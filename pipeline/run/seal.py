@@ -17,6 +17,8 @@ import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
+from flexroad.catalog.storage.paths import flush_names
+
 KEY_BYTES = 32
 
 
@@ -61,9 +63,13 @@ def _new_key() -> bytes:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             file.write(secrets.token_bytes(KEY_BYTES))
+            file.flush()
+            # A power failure must not leave a key of zeros, which others could guess.
+            os.fsync(file.fileno())
         # Unlike a rename, this keeps the key that another process has written meanwhile.
         with contextlib.suppress(FileExistsError):
             os.link(temporary, path)
+        flush_names(path.parent, path.parent.parent)
     except OSError:
         return b""
     finally:

@@ -31,7 +31,7 @@ def register(store: Location, run: Location) -> None:
     if absolute(store) != absolute(run / "store"):
         path = _entry(store, run)
         if not exists(path):
-            write(path, json.dumps({"run": str(absolute(run))}).encode())
+            write(path, json.dumps({"run": str(absolute(run))}).encode(), flushed=True)
 
 
 def runs_using(store: Location) -> Iterator[Location]:

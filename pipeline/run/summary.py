@@ -62,8 +62,10 @@ def summarise(tiles: int, counts: Counter[TileState], failures: Iterable[Failure
     return Summary(tiles, done, counts["failed"], counts["cached"], pending, failures=first)
 
 
-def write_summary(run: Location, summary: Summary, **about: Any) -> None:
+def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:
     """Write summary.json: the fields of the summary and those in ``about``.
+
+    With ``flushed`` its content is on the disk before it replaces the old one.
 
     Raises
     ------
@@ -77,7 +79,7 @@ def write_summary(run: Location, summary: Summary, **about: Any) -> None:
         **about,
         "flexroad": importlib.metadata.version("flexroad"),
     }
-    write(run / NAME, checked_json.dumps(content))
+    write(run / NAME, checked_json.dumps(content), flushed)
 
 
 def read_summary(run: Location) -> dict[str, Any]:

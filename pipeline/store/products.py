@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 from collections.abc import Mapping
@@ -58,14 +57,17 @@ class TileProducts:
         """Write the products, then the item that marks the tile as done.
 
         An existing item is removed first, so that a tile with old and new products never counts as done.
-        With ``flushed`` all of them are on the disk at the end, the products before the item.
+        With ``flushed`` each of these steps is on the disk before the next one.
         """
-        paths.remove(self.path / "item.json")
+        self._unmark(flushed)
         for name, data in products.items():
             paths.write(self.path / name, data)
-        # Together they take hardly longer than one.
-        for name in products if flushed else ():
-            paths.flush(self.path / name)
+        if flushed:
+            # Together they take hardly longer than one.
+            for name in products:
+                paths.flush(self.path / name)
+            # Otherwise a new item could meet an old product of the same size.
+            paths.flush_names(self.path)
         self._mark("item.json", item, flushed)
         paths.remove(self.path / "failed.json")
 
@@ -74,16 +76,20 @@ class TileProducts:
 
         With ``flushed`` the file is on the disk at the end.
         """
-        paths.remove(self.path / "item.json")
+        self._unmark(flushed)
         self._mark("failed.json", failure, flushed)
+
+    def _unmark(self, flushed: bool) -> None:
+        """Remove the item; with ``flushed`` it is not back after a power failure."""
+        paths.remove(self.path / "item.json")
+        if flushed:
+            paths.flush_names(self.path)
 
     def _mark(self, name: str, content: dict[str, Any], flushed: bool) -> None:
         paths.write(self.path / name, checked_json.dumps(content), flushed)
         if flushed:
-            # The tile's folder may be new. Some network shares cannot flush folders.
-            for folder in (self.path, self.path.parent):
-                with contextlib.suppress(OSError):
-                    paths.flush(folder)
+            # The tile's folder and the folder of all tiles may be new.
+            paths.flush_names(self.path, self.path.parent, self.path.parent.parent)
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:

@@ -63,8 +63,12 @@ def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
     return frame.astype(COLUMNS)
 
 
-def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure]) -> None:
+def write_tables(
+    run: Location, rows: Iterable[MetricsRow], failures: Iterable[Failure], flushed: bool = False
+) -> None:
     """Write metrics.parquet and failures.csv in chunks.
+
+    With ``flushed`` their contents are on the disk before they replace the old tables.
 
     Raises
     ------
@@ -76,13 +80,13 @@ def write_tables(run: Location, rows: Iterable[MetricsRow], failures: Iterable[F
 
     schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
     with (
-        atomic_file(run / "metrics.parquet") as path,
+        atomic_file(run / "metrics.parquet", flushed) as path,
         pq.ParquetWriter(path, schema, write_page_checksum=True) as table,
     ):
         for chunk in _chunks(rows):
             table.write_table(pa.Table.from_pandas(metrics_frame(chunk), schema, preserve_index=False))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
-    with atomic_file(run / "failures.csv") as path, path.open("w", newline="") as file:
+    with atomic_file(run / "failures.csv", flushed) as path, path.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(names)
         lines.writerows([getattr(failure, name) for name in names] for failure in failures)

@@ -13,6 +13,8 @@ import pytest
 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
+from tests.faulty_files import intercepted
+from tests.power_loss import Recording, states
 
 HOLD = """
 import sys, time
@@ -48,6 +50,14 @@ def take_lock(folder, heartbeat: Heartbeat = QUICK) -> list[str]:
         assert owner(folder).pid == os.getpid()
     assert not (folder / "lock.json").exists()
     return messages
+
+
+def test_lock_after_power_failure_names_its_owner_or_is_missing(tmp_path):
+    recording = Recording(tmp_path)
+    with intercepted(tmp_path, recording), run_lock(tmp_path):
+        end, whole = len(recording.operations), (tmp_path / "lock.json").read_bytes()
+    found = {state.get(tmp_path / "lock.json", (None,))[0] for state in states(recording, 100, end)}
+    assert found == {whole, None}
 
 
 def test_lock_held_by_living_process_is_refused(process, tmp_path):

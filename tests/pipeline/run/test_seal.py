@@ -6,6 +6,8 @@ from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.store import checked_json
+from tests.faulty_files import intercepted
+from tests.power_loss import Recording, states
 
 
 @pytest.fixture(autouse=True)
@@ -30,6 +32,15 @@ def test_seal_holds_for_its_list_and_its_user(home, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(home / "of another user"))
     assert not sealed(allowed, text)
     assert seal(allowed) != text
+
+
+def test_key_after_power_failure_is_whole_or_missing(home, tmp_path):
+    recording = Recording(tmp_path)
+    with intercepted(tmp_path, recording):
+        assert seal(["/data"])
+    path = home / "flexroad" / "key"
+    whole = path.read_bytes()
+    assert {state.get(path, (None,))[0] for state in states(recording, 200)} == {whole, None}
 
 
 def test_user_without_writable_home_seals_nothing(home):

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,8 +11,10 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.store.products import TileProducts, file_entry
 from tests.conftest import QUICK
+from tests.faulty_files import intercepted
+from tests.power_loss import Recording, states, write_state
 
 
 @pytest.fixture
@@ -40,12 +43,14 @@ def test_finish_flushes_products_then_item_then_folders(tmp_path, events):
     folder.finish({"id": "a"}, {"a.glb": b"mesh", "a.tif": b"heights"}, flushed=True)
     products = [(event, name) for event in ("name", "flush") for name in ("a.glb", "a.tif")]
     marker = [("flush", "item.json"), ("name", "item.json")]
-    assert events == [*products, *marker, ("flush", "a"), ("flush", "tiles")]
+    folders = [("flush", "a"), ("flush", "tiles"), ("flush", tmp_path.name)]
+    assert events == [*products, ("flush", "a"), *marker, *folders]
 
 
 def test_fail_flushes_marker_then_folders(tmp_path, events):
     TileProducts.of(tmp_path, "a").fail({"tile": "a"}, flushed=True)
-    assert events == [("flush", "failed.json"), ("name", "failed.json"), ("flush", "a"), ("flush", "tiles")]
+    folders = [("flush", "a"), ("flush", "tiles"), ("flush", tmp_path.name)]
+    assert events == [("flush", "failed.json"), ("name", "failed.json"), *folders]
 
 
 def test_finish_on_share_that_cannot_flush_folders_completes(tmp_path, monkeypatch):
@@ -60,6 +65,35 @@ def test_finish_on_share_that_cannot_flush_folders_completes(tmp_path, monkeypat
     folder = TileProducts.of(tmp_path, "a")
     folder.finish({"id": "a"}, {}, flushed=True)
     assert (folder.path / "item.json").exists()
+
+
+def _finish(folder: TileProducts, content: bytes) -> None:
+    """Finish the tile with two products of the same sizes as those of other contents."""
+    products = {"a.glb": content, "a.tif": content * 2}
+    assets = {name: file_entry(name, data, "") for name, data in products.items()}
+    properties = {"flexroad:fingerprint": content.hex(), "flexroad:rows": []}
+    folder.finish({"properties": properties, "assets": assets}, products, flushed=True)
+
+
+@pytest.mark.parametrize("interrupted", [False, True], ids=["finished before", "interrupted before"])
+def test_finish_power_failure_leaves_no_item_with_products_of_another(interrupted, tmp_path):
+    root = tmp_path / "disk"
+    before = TileProducts.of(root, "a")
+    _finish(before, b"old")
+    if interrupted:
+        (before.path / "item.json").unlink()
+    recording = Recording(root)
+    with intercepted(root, recording):
+        _finish(before, b"new")
+    kinds = set()
+    for number, state in enumerate(states(recording, 600)):
+        write_state(state, root, tmp_path / str(number))
+        after = TileProducts.of(tmp_path / str(number), "a")
+        graphs = (SimpleNamespace(fingerprint=content.hex()) for content in (b"old", b"new"))
+        done = [after.done(graph) is not None for graph in graphs]
+        assert not any(done) or after.verified(), f"state {number}"
+        kinds.add(tuple(done))
+    assert len(kinds) == (2 if interrupted else 3)
 
 
 @pytest.mark.parametrize("flush", [True, False])
