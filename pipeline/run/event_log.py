@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from dataclasses import asdict
+from pathlib import Path
 from typing import IO, Any
 
 from flexroad.catalog.storage.outputs import output_file
@@ -35,6 +37,8 @@ class EventLog:
         with contextlib.suppress(OSError):
             # A pipe without a reader would block the run.
             self._file = output_file(self._staged.path).open("a", buffering=1)
+            if _is_cut_off(self._staged.path):
+                self._file.write("\n")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -70,3 +74,11 @@ class EventLog:
         if result.failures:
             fields["failures"] = [asdict(failure) for failure in result.failures]
         self.note("tile", tile=result.tile_id, **fields)
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Return whether the last line of a file has no end, as after a full disk or a killed process."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 1, 0))
+        return file.read() not in (b"", b"\n")
