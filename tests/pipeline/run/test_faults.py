@@ -33,15 +33,11 @@ from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import wait_for
+from tests.whole_run import LIGHT, assert_whole, rows, times
 
 pytestmark = pytest.mark.slow
 
-LIGHT = {
-    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 3},
-    "variants": {"rgt": {"fit": "raster", "sample": "uniform"}, "flexroad": {}},
-}
 DAY_S = 86400
 
 
@@ -81,34 +77,6 @@ def night(flexroad, config, made_survey, out):
         return flexroad("run", *words, *more)
 
     return call
-
-
-def rows(out: Path) -> pd.DataFrame:
-    return read_metrics(out).drop(columns="seconds")
-
-
-def products(out: Path) -> dict[str, bytes]:
-    """The contents of all tile files except the markers, which contain times."""
-    return {
-        path.relative_to(out).as_posix(): path.read_bytes()
-        for path in out.glob("tiles/*/*")
-        if path.suffix != ".json"
-    }
-
-
-def times(out: Path) -> dict[str, int]:
-    """Modification time of each product, marker and artefact (ns)."""
-    paths = (path for part in ("tiles", "store") for path in (out / part).rglob("*") if path.is_file())
-    return {path.relative_to(out).as_posix(): path.stat().st_mtime_ns for path in paths}
-
-
-def assert_whole(out: Path, undisturbed: Path) -> None:
-    """The run equals the undisturbed one, without temporary files or a lock."""
-    pd.testing.assert_frame_equal(rows(out), rows(undisturbed), check_exact=True)
-    assert products(out) == products(undisturbed)
-    assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
-    assert not [path for path in out.rglob("*") if path.suffix == ".tmp" or "probe" in path.name]
-    assert not (out / "lock.json").exists()
 
 
 def computed(out: Path, since: int = 0) -> Counter[str]:

@@ -1,0 +1,166 @@
+"""A fault at every operation on a file of a run: the next run gives the results of an undisturbed one.
+
+By default a sample of the operations has a fault; with the environment variable ``FLEXROAD_ALL_FAULTS=1``
+each of them, which takes about ten minutes (``pytest -s`` then prints the numbers).
+"""
+
+import errno
+import json
+import os
+import signal
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.run.lock import Owner
+from tests import command_line
+from tests.faulty_files import Operation, intercepted
+from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files
+
+pytestmark = pytest.mark.slow
+
+SAMPLE = 12
+"""Operations that have a fault, of each kind of fault."""
+KILL_S = 120
+"""Longest time of a run that is to be killed (s)."""
+
+
+@dataclass
+class Faulty:
+    """An observer that counts operations and lets one fail, or all that need space from there on."""
+
+    at: int
+    act: Callable[[], None]
+    lasting: bool = False
+    met: list[Operation] = field(default_factory=list)
+    failed: list[Operation] = field(default_factory=list)
+
+    def __call__(self, operation: Operation) -> None:
+        number = len(self.met)
+        self.met.append(operation)
+        needs_space = operation.kind in ("create", "write", "mkdir")
+        if number == self.at or (self.lasting and number > self.at and needs_space):
+            self.failed.append(operation)
+            self.act()
+
+
+def _raise(number: int) -> None:
+    raise OSError(number, os.strerror(number))
+
+
+FAULTS = {
+    "no space": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC)),
+    "disk stays full": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC), lasting=True),
+    "input/output error": lambda at: Faulty(at, lambda: _raise(errno.EIO)),
+    "killed": lambda at: Faulty(at, lambda: os.kill(os.getpid(), signal.SIGKILL)),
+}
+
+
+@pytest.fixture(scope="module")
+def words(tmp_path_factory) -> list:
+    """A run command of two adjacent tiles, without the run folder."""
+    folder = tmp_path_factory.mktemp("small")
+    write_scenes(folder, 2, seed=3, size_m=60)
+    (folder / "light.yaml").write_text(yaml.safe_dump(LIGHT, sort_keys=False))
+    catalog = folder / "catalog.parquet"
+    return ["run", "--config", folder / "light.yaml", "--catalog", catalog, "--executor", "serial", "--out"]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(words, tmp_path_factory) -> tuple[Path, list[Operation]]:
+    """A finished run without faults, and its operations."""
+    out, counting = tmp_path_factory.mktemp("undisturbed") / "run", Faulty(-1, lambda: None)
+    command_line.call(*words, tmp_path_factory.mktemp("first") / "run").expected(0)
+    with intercepted(out, counting):
+        command_line.call(*words, out).expected(0)
+    return out, counting.met
+
+
+def run_with(fault: Faulty, words: list, out: Path) -> command_line.Said:
+    with intercepted(out, fault):
+        return command_line.call(*words, out)
+
+
+def killed_with(fault: Faulty, words: list, out: Path) -> None:
+    """Run in a copy of this process, which ends itself."""
+    if child := os.fork():
+        _, status = os.waitpid(child, 0)
+        assert os.WIFSIGNALED(status), "the run was not killed"
+        assert os.WTERMSIG(status) == signal.SIGKILL
+        return
+    try:
+        signal.alarm(KILL_S)
+        run_with(fault, words, out)
+    finally:
+        os._exit(0)
+
+
+def check_after_error(said: command_line.Said, out: Path, fault: Faulty, undisturbed: Path) -> None:
+    """One line tells the error; no temporary file is left, except one whose removal failed."""
+    if said.code == 0:
+        # The fault met nothing that the results need.
+        assert not said.errors
+        assert json.loads((out / "summary.json").read_text())["done"] == 2
+    else:
+        assert said.code in (1, 2)
+        assert said.errors
+        assert all(str(out) in line for line in said.errors), said.errors
+    kept = {operation.path for operation in fault.failed if operation.kind == "remove"}
+    assert set(temporary_files(out)) <= kept
+
+
+def runs_in_log(out: Path) -> int:
+    """Number of runs whose start is in the log; other lines may be cut off."""
+    log = out / "log.jsonl"
+    lines = log.read_text().splitlines() if log.exists() else []
+    return sum(line.startswith("{") and line.endswith("}") and '"event": "run"' in line for line in lines)
+
+
+def check_next(words: list, out: Path, undisturbed: Path) -> None:
+    """The next run is whole, and keeps tiles that were finished."""
+    if (out / "lock.json").exists():
+        # The process that could not remove its lock would have ended by then.
+        ended = replace(Owner.me(), pid=2**22 + 1)
+        (out / "lock.json").write_bytes(ended.data)
+    finished, logged = item_times(out), runs_in_log(out)
+    with intercepted(out, lambda operation: None):
+        command_line.call(*words, out).expected(0)
+    if temporary_files(out):
+        command_line.call("clean", out).expected(0)
+    assert_whole(out, undisturbed)
+    assert finished.items() <= item_times(out).items()
+    assert runs_in_log(out) == logged + 1
+
+
+def spread(total: int) -> list[int]:
+    """All positions, or a sample that includes the first and the last."""
+    if os.environ.get("FLEXROAD_ALL_FAULTS"):
+        return list(range(total))
+    return sorted({round(i * (total - 1) / (SAMPLE - 1)) for i in range(SAMPLE)})
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_run_fault_at_any_write_next_run_is_whole(kind, words, undisturbed, tmp_path):
+    whole, operations = undisturbed
+    wrong, codes = [], Counter[int]()
+    for at in spread(len(operations)):
+        out, fault = tmp_path / str(at) / "run", FAULTS[kind](at)
+        try:
+            if kind == "killed":
+                killed_with(fault, words, out)
+                assert len(temporary_files(out)) <= 1
+            else:
+                said = run_with(fault, words, out)
+                codes[said.code] += 1
+                check_after_error(said, out, fault, whole)
+            check_next(words, out, whole)
+        except AssertionError as error:
+            first = str(error).strip().splitlines() or [repr(error)]
+            wrong.append(f"{at} {operations[at].kind} {operations[at].path.name}: {' '.join(first)[:300]}")
+    print(f"{kind}: {len(spread(len(operations)))} of {len(operations)}, exit codes {dict(codes)}")  # noqa: T201
+    assert not wrong, "\n".join(wrong)
