@@ -17,6 +17,7 @@ from typing import Any
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some
+from flexroad.catalog.text import shown
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
 
@@ -38,11 +39,12 @@ class Layout:
     def __post_init__(self) -> None:
         for name, template in self.layers.items():
             if name not in LAYERS:
-                raise CatalogError(f"layout: unknown layer {name!r}; layers are {', '.join(LAYERS)}")
+                raise CatalogError(f"layout: unknown layer {shown(name)}; layers are {', '.join(LAYERS)}")
             names = PLACEHOLDER.findall(template)
             if "tile" not in names or not set(names) <= {"tile", "stratum"}:
                 raise CatalogError(
-                    f"layout: {name}: {template!r} needs {{tile}} and may have {{stratum}} and *, no others"
+                    f"layout: {name}: {shown(template)} needs {{tile}} and may have {{stratum}} and *, "
+                    "no others"
                 )
         for name in NEEDED:
             if name not in self.layers:
@@ -64,13 +66,17 @@ class Layout:
         kinds["road_values"] = (list, "a list of whole numbers")
         for key, value in raw.items():
             if key not in kinds:
-                raise CatalogError(f"layout: unknown key {key!r}; keys are {', '.join(kinds)}")
+                raise CatalogError(f"layout: unknown key {shown(key)}; keys are {', '.join(kinds)}")
             if not isinstance(value, kinds[key][0]):
-                raise CatalogError(f"layout: {key}: expected {kinds[key][1]}, not {value!r}")
+                raise CatalogError(f"layout: {key}: expected {kinds[key][1]}, not {shown(value)}")
         if not all(isinstance(template, str) for template in raw.get("layers", {}).values()):
-            raise CatalogError(f"layout: layers: every template must be text, not as in {raw['layers']!r}")
+            raise CatalogError(
+                f"layout: layers: every template must be text, not as in {shown(raw['layers'])}"
+            )
         if not all(isinstance(value, int) for value in raw.get("road_values", [])):
-            raise CatalogError(f"layout: road_values: expected whole numbers, not {raw['road_values']!r}")
+            raise CatalogError(
+                f"layout: road_values: expected whole numbers, not {shown(raw['road_values'])}"
+            )
         return cls(raw.get("layers", {}), tuple(raw.get("road_values", ())), raw.get("crs"))
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.cli.command import Allow
 from flexroad.pipeline.cli.stdio import echo
 
@@ -80,17 +81,15 @@ def train(
 
 def _settings(assignments: list[str]) -> dict[str, Any]:
     """Return the settings by name; values are parsed as YAML."""
-    import yaml
-
+    from flexroad.pipeline.config import document
     from flexroad.pipeline.errors import ConfigError
 
     parsed: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
-        try:
-            parsed[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {assignment}: not readable as NAME=VALUE") from error
         if not equals:
-            raise ConfigError(f"--set {assignment}: give NAME=VALUE, like --set rounds=100")
+            raise ConfigError(f"--set {shown(assignment)}: give NAME=VALUE, like --set rounds=100")
+        parsed[name] = document.parse(
+            value.encode(errors="surrogateescape"), f"--set {printable(name)}"
+        ).value
     return parsed

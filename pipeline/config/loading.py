@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from flexroad.catalog.storage.paths import stat
+from flexroad.catalog.text import printable, shown
+from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
@@ -26,6 +28,20 @@ RENAMED = {
     "smoothness": SPLINE,
 }
 """Option names of earlier versions and the hint for each."""
+SECTIONS = ("dataset", "export", "cluster", "variants")
+"""Parts of a configuration that are no stages."""
+SUFFIXES = (".yaml", ".yml")
+"""Endings of the files that may be extended."""
+MAX_PARENTS = 10
+"""Longest chain of files that extend each other."""
+MAX_VARIANT = 80
+"""Longest name of a variant (bytes in UTF-8), which is a part of names of files."""
+MAX_KEY = 60
+"""Longest text of a key in a message."""
+MAX_NAME = 500
+"""Longest name of a file in a message that it does not exist."""
+MAX_ERRORS = 10
+"""Most errors of one stage that are listed."""
 
 
 def shipped() -> dict[str, Path]:
@@ -55,7 +71,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
         If a key or value is invalid; one line per error.
     """
     stages = list(stage_models())
-    _reject_unknown_keys(raw, ["dataset", *stages, "export", "cluster", "variants"], name, "")
+    _reject_unknown_keys(raw, [*stages, *SECTIONS], name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
         stage: _merge(DEFAULTS.get(stage), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
@@ -63,11 +79,8 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     }
     chains = {}
     for variant, overrides in variants.items():
+        _check_variant(str(variant), name)
         where = f"variants.{variant}"
-        if not str(variant).replace("-", "").replace("_", "").isalnum():
-            raise ConfigError(
-                f"{name}: {where}: the name is part of file names; use letters, digits, - and _"
-            )
         overrides = _mapping(overrides or {}, name, where)
         _reject_unknown_keys(overrides, stages, name, where)
         chains[str(variant)] = {
@@ -83,37 +96,108 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     )
     for variant in export.variants:
         if variant not in chains:
-            raise ConfigError(f"{name}: export.variants: no variant {variant!r}, only {', '.join(chains)}")
+            raise ConfigError(
+                f"{name}: export.variants: no variant {shown(variant)}, only {', '.join(chains)}"
+            )
     options = _merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
     cluster = _validate(TypeAdapter(Cluster), options, f"{name}: cluster")
     dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
+    if wrong := [key for key in dataset if not isinstance(key, str)]:
+        raise ConfigError(f"{name}: dataset: the key {shown(wrong[0])} is not a text; correct or remove it")
     return Config(name=name, chains=chains, export=export, cluster=cluster, dataset=dataset, raw=dict(raw))
 
 
-def _raw(name: str | Path, children: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the file's mapping merged over its parents; ``children`` are the files that extend it."""
+def read_mapping(data: bytes, name: str) -> dict[str, Any]:
+    """Return the mapping in a configuration file's bytes, with ``extends`` as it is written.
+
+    Raises
+    ------
+    ConfigError
+        If it is not a mapping in YAML.
+    """
+    return _mapping_of(document.parse(data, name), name)
+
+
+def _raw(name: str | Path) -> dict[str, Any]:
+    """Return the file's mapping merged over its parents."""
+    path = _existing(name)
+    layers, seen = [_read(path)], [path]
+    while (parent := layers[-1].pop("extends", None)) is not None:
+        path = _parent(parent, path)
+        if path.resolve() in (file.resolve() for file in seen):
+            raise ConfigError(f"{path}: extends: the file extends itself; name another file or paper")
+        if len(seen) > MAX_PARENTS:
+            raise ConfigError(f"{path}: extends: more than {MAX_PARENTS} files extend each other")
+        layers.append(_read(path, own=False))
+        seen.append(path)
+    merged = layers.pop()
+    while layers:
+        merged = _extend(merged, layers.pop())
+    return merged
+
+
+def _existing(name: str | Path) -> Path:
+    """Return the path of a shipped name or of a file."""
     configs = shipped()
-    path = configs.get(str(name), Path(name))
-    if not path.is_file():
-        near = difflib.get_close_matches(Path(name).name, configs, n=1)
-        hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
-        raise ConfigError(f"no configuration {str(name)!r}: neither a file nor a shipped name{hint}")
-    if path.resolve() in children:
-        raise ConfigError(f"{path}: extends: the file extends itself; name another file or paper")
+    path, given = configs.get(str(name), Path(name)), _short(name, MAX_NAME)
+    if stat(path) is not None:
+        return path
     try:
-        raw = yaml.safe_load(path.read_text()) or {}
-    except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from error
-    raw = _mapping(raw, str(name), "the file")
-    parent = raw.pop("extends", None)
-    if parent is None:
-        return raw
+        special = path.exists()
+    except OSError as error:
+        raise ConfigError(f"configuration '{given}': {error.strerror}; name a YAML file") from error
+    if special:
+        raise ConfigError(f"configuration '{given}' is not a regular file; name a YAML file")
+    near = difflib.get_close_matches(Path(name).name, configs, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
+    raise ConfigError(f"no configuration '{given}': neither a file nor a shipped name{hint}")
+
+
+def _parent(parent: Any, path: Path) -> Path:
+    """Return the path of the configuration that the one in ``path`` extends.
+
+    A configuration may come from others, and all files are read with the user's rights: only files with
+    YAML's endings are read, also behind links.
+    """
     if not isinstance(parent, str):
-        raise ConfigError(f"{name}: extends: expected a file or a shipped name, not {parent!r}")
-    if parent not in configs:
-        # The parent's path is relative to the file, not to the working directory.
-        parent = path.parent / parent
-    return _extend(_raw(parent, (*children, path.resolve())), raw)
+        raise ConfigError(f"{path}: extends: expected a file or a shipped name, not {shown(parent)}")
+    if parent in shipped():
+        return _existing(parent)
+    # The parent's path is relative to the file, not to the working directory.
+    found = _existing(path.parent / parent)
+    if not {found.suffix, found.resolve().suffix} <= set(SUFFIXES):
+        raise ConfigError(f"{path}: extends: {found} is not a YAML file; its name must end in .yaml or .yml")
+    return found
+
+
+def _read(path: Path, own: bool = True) -> dict[str, Any]:
+    """Return the mapping in a file; ``own`` is False for a file that another one extends."""
+    try:
+        with path.open("rb") as file:
+            content = document.parse(file.read(document.MAX_BYTES + 1), str(path))
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read {path}: {error.strerror or error}; name a file that can be"
+        ) from error
+    raw = _mapping_of(content, str(path))
+    for key in () if own else raw:
+        if key not in ("extends", *SECTIONS, *stage_models()):
+            # The file may be no configuration at all: its text is not shown.
+            line = content.lines.get(str(key), 1)
+            raise ConfigError(
+                f"{path}: line {line}: the key is none of a configuration; correct or remove it"
+            )
+    return raw
+
+
+def _mapping_of(content: document.Document, name: str) -> dict[str, Any]:
+    if content.value is None:
+        return {}
+    if not isinstance(content.value, dict):
+        texts = isinstance(content.value, str)
+        kind = "a list" if isinstance(content.value, list) else "a text" if texts else "a single value"
+        raise ConfigError(f"{name}: expected a mapping of stages to options, but it is {kind}")
+    return dict(content.value)
 
 
 def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
@@ -144,21 +228,35 @@ def _tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
         return {tag: options if isinstance(options, str) else ("on" if options else "off")}
     if isinstance(options, dict):
         return dict(options)
-    raise ConfigError(f"{where}: expected a mapping of options, not {options!r}")
+    raise ConfigError(f"{where}: expected a mapping of options, not {shown(options)}")
 
 
 def _mapping(value: Any, name: str, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f"{name}: {where}: expected a mapping, not {value!r}")
+        raise ConfigError(f"{name}: {where}: expected a mapping, not {shown(value)}")
     return dict(value)
+
+
+def _check_variant(variant: str, name: str) -> None:
+    if not variant.replace("-", "").replace("_", "").isalnum() or len(variant.encode()) > MAX_VARIANT:
+        raise ConfigError(
+            f"{name}: variants.{_short(variant)}: the name is part of file names; use letters, digits, - "
+            f"and _, at most {MAX_VARIANT} bytes"
+        )
 
 
 def _reject_unknown_keys(raw: Mapping[str, Any], allowed: list[str], name: str, where: str) -> None:
     for key in raw:
         if key not in allowed:
             raise ConfigError(
-                f"{name}: {where + '.' if where else ''}{key}: unknown key{_hint(str(key), allowed)}"
+                f"{name}: {where + '.' if where else ''}{_short(key)}: unknown key{_hint(str(key), allowed)}"
             )
+
+
+def _short(key: object, limit: int = MAX_KEY) -> str:
+    """Return a key or the name of a file for messages."""
+    text = printable(str(key))
+    return text if len(text) <= limit else f"{text[:limit]}..."
 
 
 def _hint(key: str, allowed: list[str]) -> str:
@@ -170,7 +268,10 @@ def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> A
     try:
         return model.validate_python(options)
     except ValidationError as error:
-        lines = [_error_line(details, model, where) for details in error.errors()]
+        errors = error.errors(include_url=False)
+        lines = [_error_line(details, model, where) for details in errors[:MAX_ERRORS]]
+        if len(errors) > MAX_ERRORS:
+            lines.append(f"{where}: {len(errors) - MAX_ERRORS} more errors")
         raise ConfigError("\n".join(lines)) from None
 
 
@@ -180,19 +281,19 @@ def _error_line(details: Any, model: TypeAdapter[Any], where: str) -> str:
     keys = _keys(model)
     method = next((str(part) for part in details["loc"][:1] if part in keys), "")
     path = [str(part) for part in details["loc"][bool(method) :]]
-    key = ".".join([where, *path])
+    key = ".".join([where, *map(_short, path)])
     if details["type"] == "extra_forbidden":
         if len(path) > 1:
             return f"{key}: unknown key{RENAMED.get(path[-1]) or _hint(path[-1], _nested_keys(model))}"
         return f"{key}: unknown key{_remedy(path[-1], method, keys)}"
     if details["type"] == "union_tag_invalid":
         tag = details["ctx"]["tag"]
-        return f"{key}: there is no method {tag!r}{RENAMED.get(tag) or _hint(tag, sorted(keys))}"
-    message = details["msg"].removeprefix("Value error, ")
+        return f"{key}: there is no method {shown(tag)}{RENAMED.get(tag) or _hint(tag, sorted(keys))}"
+    message = printable(details["msg"].removeprefix("Value error, "))
     if isinstance(details["input"], dict):
         # The message of an error about several options contains their values.
         return f"{key}: {message[0].lower()}{message[1:]}"
-    return f"{key}: {message[0].lower()}{message[1:]}, not {details['input']!r}"
+    return f"{key}: {message[0].lower()}{message[1:]}, not {shown(details['input'])}"
 
 
 def _remedy(key: str, method: str, keys: Mapping[str, list[str]]) -> str:

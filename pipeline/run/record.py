@@ -38,7 +38,7 @@ from flexroad.catalog.storage.paths import (
     stat,
     write,
 )
-from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.config.loading import compose, load_config, read_mapping
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
@@ -266,7 +266,7 @@ def _config(path: Location) -> Config:
         raise ConfigError(f"{path} is not a regular file; `flexroad run` writes it again")
     if isinstance(path, Path):
         return load_config(path)
-    return compose(yaml.safe_load(read(path)), str(path))
+    return compose(read_mapping(read(path), str(path)), str(path))
 
 
 def _record(run: Location) -> dict[str, Any] | None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
+from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config.methods import methods
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
@@ -324,9 +325,9 @@ def _settings(method: Any, options: TrainOptions) -> Options:
         settings: Options = method.Options(**values)
     except ValidationError as error:
         fault = error.errors()[0]
-        name = ".".join(str(part) for part in fault["loc"])
+        name = printable(".".join(str(part) for part in fault["loc"]))
         raise ConfigError(
-            f"--set {name}: {fault['msg'].lower()}, not {fault['input']!r}; "
+            f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
             f"{options.method} has {', '.join(method.Options.model_fields)}"
         ) from error
     return settings

@@ -276,3 +276,14 @@ def test_catalog_show_lists_layers_and_count(made_survey):
     said = flexroad("catalog", "show", made_survey / "catalog.parquet")
     assert said.splitlines()[-1] == "4 tiles, EPSG:25832"
     assert "dsm(4) dtm(4) road_mask(4) reference(4) reference_road(4)" in said
+
+
+def test_train_setting_that_cannot_be_read_gives_one_line(flexroad):
+    command = ["train", "none.json", "--method", "pixels", "--labels", "mask", "-o", "x.skops", "--set"]
+    for setting, message in {
+        f"rounds={'9' * 5000}": "--set rounds: not readable as YAML: line 1, column 1: a number of more than",
+        "rounds=[": "--set rounds: not readable as YAML",
+        "rounds": "--set 'rounds': give NAME=VALUE, like --set rounds=100",
+    }.items():
+        (line,) = flexroad(*command, setting).expected(2).errors
+        assert message in line

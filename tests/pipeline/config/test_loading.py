@@ -1,9 +1,14 @@
 import json
+import os
 
 import pytest
 import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from flexroad.pipeline.config.loading import compose, load_config, shipped
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.path_templates import Layout
+from flexroad.pipeline.config.loading import compose, load_config, read_mapping, shipped
 from flexroad.pipeline.config.schema import schema, template
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.filter import planar
@@ -108,6 +113,116 @@ def test_load_config_unusable_file_raises(tmp_path):
     bad.write_text("- a\n- b\n")
     with pytest.raises(ConfigError, match="expected a mapping"):
         load_config(bad)
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for special in (tmp_path / "pipe.yaml", tmp_path):
+        with pytest.raises(ConfigError, match="is not a regular file; name a YAML file"):
+            load_config(special)
+    with pytest.raises(ConfigError, match="File name too long"):
+        load_config("a" * 5000)
+
+
+def refusal(path) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+def test_extends_reads_no_file_but_yaml_and_shows_nothing_of_it(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    (tmp_path / "shadow").write_text("root:$6$hash: 1\n")
+    (tmp_path / "link.yaml").symlink_to(tmp_path / "shadow")
+    (tmp_path / "other.yaml").write_text("# not a configuration\npassword: hash\n")
+    (tmp_path / "text.yaml").write_text("root:$6$hash\n")
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for parent, message in {
+        "shadow": "is not a YAML file; its name must end in .yaml or .yml",
+        str(tmp_path / "shadow"): "is not a YAML file",
+        "link.yaml": "is not a YAML file",
+        "other.yaml": "other.yaml: line 2: the key is none of a configuration",
+        "text.yaml": "text.yaml: expected a mapping of stages to options, but it is a text",
+        "pipe.yaml": "is not a regular file",
+        "missing.yaml": "neither a file nor a shipped name",
+        '"a\\0b"': "neither a file nor a shipped name",
+        "[paper]": "extends: expected a file or a shipped name, not ['paper']",
+    }.items():
+        mine.write_text(f"extends: {parent}\n")
+        assert message in refusal(mine)
+        assert "hash" not in refusal(mine)
+        assert "password" not in refusal(mine)
+
+
+def test_extends_endless_chain_raises(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("extends: mine.yaml\n")
+    assert "the file extends itself" in refusal(mine)
+    for number in range(20):
+        (tmp_path / f"{number}.yaml").write_text(f"extends: {number + 1}.yaml\n")
+    assert "more than 10 files extend each other" in refusal(tmp_path / "0.yaml")
+
+
+def test_extends_file_of_another_folder_is_read(tmp_path):
+    (tmp_path / "city").mkdir()
+    (tmp_path / "base.yml").write_text("fit: {degree: 2}\n")
+    for parent in ("../base.yml", tmp_path / "base.yml"):
+        (tmp_path / "city" / "mine.yaml").write_text(f"extends: {parent}\nload: {{halo_m: 5}}\n")
+        chain = load_config(tmp_path / "city" / "mine.yaml").chains["flexroad"]
+        assert (chain["fit"].degree, chain["load"].halo_m) == (2, 5)
+
+
+HOSTILE = st.sampled_from(
+    [
+        None, True, -1, 10**99, 1e308, float("nan"), float("inf"), "", "x" * 5000, "\x1b[2J", "\ud800",
+        "a\nb", "/", [], {}, [[]], {1: 2}, {"": None}, {None: 1}, {"method": []}, {"method": "plane"},
+        {"method": "\x1b"}, b"x", ["flexroad"] * 100, {"\u202e": 1}, {f"k{n}": n for n in range(50)},
+    ]
+)  # fmt: skip
+SEEDS = [
+    {"fit": {"degree": 3, "control_points": [12, 12]}, "load": {"halo_m": 5}, "cluster": {"memory": "4 GiB"}},
+    {
+        "segment": {"method": "vector", "cleanup": {"drop_m2": 3}},
+        "ecsrc": "off",
+        "export": {"formats": ["glb"]},
+    },
+    {"extends": "nightly", "variants": {"a": {"fit": "plane"}, "b": {"sample": {"road_m": 2}}}},
+    {"dataset": {"layers": {"dsm": "{tile}.tif"}, "crs": "EPSG:25832"}, "cluster": "slurm", "fit": "nurbs"},
+]
+
+
+def changed(draw, value):
+    """Return the value with one part replaced, added or removed."""
+    if isinstance(value, dict | list) and value and draw(st.integers(0, 3)):
+        keys = sorted(value) if isinstance(value, dict) else range(len(value))
+        key = draw(st.sampled_from(list(keys)))
+        copy = value.copy()
+        copy[key] = changed(draw, value[key])
+        if isinstance(value, dict) and draw(st.booleans()):
+            copy[draw(st.sampled_from(["fit", "method", "", "\n", 1, None, "variants", "extends"]))] = draw(
+                HOSTILE
+            )
+        return copy
+    return draw(HOSTILE)
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_change_gives_a_configuration_or_lines(tmp_path, data):
+    text = yaml.dump(changed(data.draw, data.draw(st.sampled_from(SEEDS)))).encode(errors="replace")
+    if data.draw(st.booleans()):
+        at = data.draw(st.integers(0, len(text)))
+        text = text[:at] + data.draw(st.binary(max_size=4)) + text[at + data.draw(st.integers(0, 4)) :]
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(text)
+    try:
+        config = load_config(path)
+        Layout.of(config.dataset)
+    except (ConfigError, CatalogError) as error:
+        message = str(error)
+    else:
+        # As written to a run.
+        message = str(compose(read_mapping(yaml.safe_dump(config.raw).encode(), "x"), "x").name)
+    assert len(message) < 5000
+    assert all(line.isprintable() for line in message.splitlines())
 
 
 def test_template_equals_default_configuration():

@@ -412,7 +412,7 @@ DEEP = "{a: " * 2000 + "1" + "}" * 2000
         ("fit: {learning_rate: .inf}", "fit.learning_rate: input should be a finite number, not inf"),
         ("fit: bspline", "fit: there is no method 'bspline'"),
         ("fit:\n\tdegree: 3", "not readable as YAML: .*line 2"),
-        ("- a", "expected a mapping, not ['a']"),
+        ("- a", "expected a mapping of stages to options, but it is a list"),
         ("variants: [a, b]", "variants: expected a mapping, not ['a', 'b']"),
         ("load: 3", "load: expected a mapping of options, not 3"),
         ("variants: {a/b: {}}", "variants.a/b: the name is part of file names; use letters, digits, - and _"),
