@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import tempfile
@@ -51,7 +53,7 @@ def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None =
     """
     text = json.dumps(summary, indent=1)
     policy = policy or RetryPolicy()
-    if target.startswith(("http://", "https://")):
+    if re.match(r"https?://", target, re.IGNORECASE):
         return _post(target, text, policy)
     return _run_command(target, text, policy)
 
@@ -61,8 +63,11 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
     from requests.adapters import HTTPAdapter
     from urllib3 import Retry
 
-    # The rest of the address is often a secret: messages name only the host.
-    host = urlsplit(url).hostname
+    try:
+        # The rest of the address is often a secret: messages name only the host.
+        scheme, host = urlsplit(url).scheme, urlsplit(url).hostname
+    except ValueError:
+        return "the web address cannot be read"
     retry = Retry(
         policy.retries,
         backoff_factor=policy.pause_s / 2,
@@ -73,7 +78,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
         raise_on_status=False,
     )
     with requests.Session() as session:
-        session.mount(f"{urlsplit(url).scheme}://", HTTPAdapter(max_retries=retry))
+        session.mount(f"{scheme}://", HTTPAdapter(max_retries=retry))
         try:
             answer = session.post(
                 url,
@@ -82,7 +87,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
                 timeout=policy.answer_s,
                 allow_redirects=False,
             )
-        except requests.RequestException as error:
+        except (requests.RequestException, ValueError) as error:
             return f"{host} cannot be reached: {type(error).__name__}"
     return None if answer.status_code // 100 == 2 else f"{host} answered {answer.status_code}"
 
@@ -101,17 +106,29 @@ def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
                 env={**os.environ, "FLEXROAD_SUMMARY": str(path)},
                 start_new_session=True,
             )
-            return _wait(process, text, policy)
+            return _wait(process, text, policy, _program(command))
     except (OSError, ValueError) as error:
-        return f"`{command}` cannot be run: {error}"
+        # The message of an error may have the whole command.
+        reason = (isinstance(error, OSError) and error.strerror) or type(error).__name__
+        return f"{_program(command)} cannot be run: {reason}"
 
 
-def _wait(process: subprocess.Popen[bytes], text: str, policy: RetryPolicy) -> str | None:
+def _program(command: str) -> str:
+    """Return what a shell command calls first, for messages: its arguments are often secrets."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        words = []
+    program = next((word for word in words if not re.match(r"\w+=", word)), "")
+    return f"`{program} ...`" if re.fullmatch(r"[\w./+-]{1,100}", program) else "the command"
+
+
+def _wait(process: subprocess.Popen[bytes], text: str, policy: RetryPolicy, name: str) -> str | None:
     try:
         process.communicate(text.encode(), policy.command_s)
     except subprocess.TimeoutExpired:
         # The whole process group: the command may have started others.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        return f"`{process.args!s}` took more than {policy.command_s:g} s and was killed"
-    return f"`{process.args!s}` ended with exit code {process.returncode}" if process.returncode else None
+        return f"{name} took more than {policy.command_s:g} s and was killed"
+    return f"{name} ended with exit code {process.returncode}" if process.returncode else None

@@ -74,3 +74,27 @@ def test_notify_unreachable_server_returns_reason():
     reason = notify("http://127.0.0.1:9/hook/secret", SUMMARY, QUICK)
     assert reason == "127.0.0.1 cannot be reached: ConnectionError"
     assert "cannot be reached" in notify("http://", SUMMARY, QUICK)
+    assert notify("http://[::1/secret", SUMMARY, QUICK) == "the web address cannot be read"
+
+
+def test_notify_address_in_upper_case_is_an_address(server):
+    assert notify(server.url.replace("http:", "HTTP:"), SUMMARY, QUICK) is None
+    assert server.received == [("/hook/secret", "application/json", SUMMARY)]
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("false --header 'token: s3cret' https://hooks/s3cret", "`false ...`"),
+        ("TOKEN=s3cret false", "`false ...`"),
+        ("sleep 60; s3cret", "`sleep ...`"),
+        ("exit 3 'open s3cret", "the command"),
+        ("$(echo s3cret) x", "the command"),
+        ("false s3cret\0", "`false ...`"),
+        ("{ s3cret; }", "the command"),
+    ],
+)
+def test_notify_failed_command_names_only_the_program(command, name):
+    reason = notify(command, SUMMARY, QUICK)
+    assert reason.startswith(name)
+    assert "s3cret" not in reason
