@@ -21,7 +21,7 @@ from pathlib import Path
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 
-ADDRESS = re.compile(r"(?!s3:)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
+ADDRESS = re.compile(r"(?!(?i:s3):)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
 
 
 @dataclass(frozen=True)

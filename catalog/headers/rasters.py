@@ -19,7 +19,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.storage.paths import gdal_options
+from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.trust import AllowedFolders
 
 GDAL = {

@@ -5,8 +5,7 @@ needs the extra ``s3``. Both join with ``/`` and have ``parent`` and ``name``; r
 files is done by the functions below.
 
 This module does not retry requests. botocore (used by s3fs) and GDAL do, with growing pauses, when storage
-throttles, answers 5xx or drops the connection. Both read the usual variables ``AWS_...``; `gdal_options`
-passes on those that have another name in GDAL.
+throttles, answers 5xx or drops the connection.
 """
 
 from __future__ import annotations
@@ -20,28 +19,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
-from urllib.parse import urlsplit
 
+from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.outputs import atomic_path, flush_path
+from flexroad.catalog.storage.settings import s3_options
+from flexroad.catalog.text import printable
 
 if TYPE_CHECKING:
     from upath import UPath
 
 Location: TypeAlias = "Path | UPath"
 
-TRIES = 5
-"""Attempts per request before it fails, unless AWS_MAX_ATTEMPTS is set."""
 ROUNDS = 3
 """Attempts of s3fs when an answer breaks off in the middle; botocore does not retry these."""
 # Path("s3://bucket") drops a slash.
-_BUCKET = re.compile(r"s3:/{1,2}(?=[^/])")
+_BUCKET = re.compile(r"(?i:s3):/{1,2}(?=[^/])")
+_SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*:/")
 # s3fs raises some of these without an errno.
 _NUMBERS = (
     (FileNotFoundError, errno.ENOENT),
     (PermissionError, errno.EACCES),
     (FileExistsError, errno.EEXIST),
 )
-_YES = ("YES", "TRUE", "ON", "1")
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,8 @@ def parse_location(where: str | Location) -> Location:
 
     Raises
     ------
+    CatalogError
+        If it is an address of another kind, or in a bucket and a variable ``AWS_...`` is wrong.
     OSError
         If it is in a bucket and s3fs is not installed; the message gives the install command.
     """
@@ -67,11 +68,14 @@ def parse_location(where: str | Location) -> Location:
     text = str(where)
     bucket = _BUCKET.match(text)
     if bucket is None:
+        if _SCHEME.match(text):
+            reason = "is neither a path on disk nor s3://BUCKET/NAME"
+            raise CatalogError(f"{printable(text)} {reason}; fetch it first, or give its path")
         return Path(where)
     try:
         from upath import UPath
 
-        remote: UPath = UPath("s3://" + text[bucket.end() :], **_s3_options())
+        remote: UPath = UPath("s3://" + text[bucket.end() :], **s3_options())
         remote.fs.retries = ROUNDS
     except ImportError as error:
         raise OSError(
@@ -108,29 +112,6 @@ def normalise(name: str) -> str:
 def gdal_name(where: Location) -> str:
     """Return GDAL's name of a file."""
     return str(where) if isinstance(where, Path) else f"/vsis3/{where.path}"
-
-
-def gdal_options() -> dict[str, str]:
-    """Return GDAL's options for object storage; options set in the environment are left out."""
-    options = {
-        # A file may change during a worker's life: drop its cached content when it is closed.
-        "CPL_VSIL_CURL_NON_CACHED": "/vsis3/",
-        "GDAL_HTTP_MAX_RETRY": str(_tries() - 1),
-        "GDAL_HTTP_RETRY_DELAY": "0.5",
-        # 0 means no answer.
-        "GDAL_HTTP_RETRY_CODES": "0,429,500,502,503,504",
-        "GDAL_HTTP_CONNECTTIMEOUT": "10",
-        # Give up below 1 byte per second for a minute; large files are not affected.
-        "GDAL_HTTP_LOW_SPEED_LIMIT": "1",
-        "GDAL_HTTP_LOW_SPEED_TIME": "60",
-    }
-    if endpoint := _endpoint():
-        options |= {
-            "AWS_S3_ENDPOINT": urlsplit(endpoint).netloc,
-            "AWS_HTTPS": "YES" if endpoint.startswith("https:") else "NO",
-            "AWS_VIRTUAL_HOSTING": "FALSE",
-        }
-    return {name: value for name, value in options.items() if name not in os.environ}
 
 
 def stat(where: Location) -> FileStat | None:
@@ -340,35 +321,6 @@ def _entry_stat(entry: dict[str, Any]) -> FileStat | None:
     return FileStat(int(entry["size"]), str(entry["ETag"]).strip('"'))
 
 
-def _endpoint() -> str:
-    return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-
-
-def _tries() -> int:
-    return int(os.environ.get("AWS_MAX_ATTEMPTS") or TRIES)
-
-
-def _s3_options() -> dict[str, Any]:
-    """Return the options of s3fs; it reads credentials and region itself, as AWS programs do."""
-    config: dict[str, Any] = {
-        # The other modes limit the retries per process; a long run would use them up.
-        "retries": {"total_max_attempts": _tries(), "mode": os.environ.get("AWS_RETRY_MODE") or "legacy"},
-        "connect_timeout": 10,
-        "read_timeout": 60,
-    }
-    options: dict[str, Any] = {
-        "config_kwargs": config,
-        # Files that another process has just written must be listed.
-        "use_listings_cache": False,
-        "anon": os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in _YES,
-    }
-    if endpoint := _endpoint():
-        # Private endpoints rarely have a host name per bucket.
-        config["s3"] = {"addressing_style": "path"}
-        options["endpoint_url"] = endpoint
-    return options
-
-
 @contextlib.contextmanager
 def named(where: UPath) -> Iterator[None]:
     """Turn errors of object storage into an OSError that names the file."""
@@ -380,5 +332,6 @@ def named(where: UPath) -> Iterator[None]:
     except OSError as error:
         number = error.errno or next((n for kind, n in _NUMBERS if isinstance(error, kind)), errno.EIO)
         raise OSError(number, error.strerror or str(error), str(where)) from error
-    except (BotoCoreError, ClientError) as error:
+    except (BotoCoreError, ClientError, ValueError) as error:
+        # botocore raises ValueError for settings that it cannot use.
         raise OSError(errno.EIO, str(error), str(where)) from error

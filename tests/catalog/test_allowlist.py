@@ -28,6 +28,7 @@ def check(made, folder, allow=(), layers=LAYERS):
         ("a/../../b/../dsm/a.tif", "{}"),
         ("/etc/passwd", "/etc"),
         ("s3://bucket/dsm/a.tif", "s3://bucket/dsm"),
+        ("S3://bucket/dsm/a.tif", "s3://bucket/dsm"),
         ("s3:/bucket/my dsm/a.tif", "'s3://bucket/my dsm'"),
     ],
 )
@@ -51,6 +52,8 @@ def test_file_outside_folder_raises_error_with_option(tmp_path, file, allow):
     [
         "https://host/a.tif",
         "file:///etc/passwd",
+        "FILE:///etc/passwd",
+        "HTTPS://host/a.tif",
         "ftp://host/a",
         "HTTP:/host/a",
         "/vsicurl/http://169.254.169.254/latest/a.tif",

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from fsspec.registry import _registry
 
+from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import StatCache, parse_location
 from tests.s3_server import Fault
@@ -61,7 +62,7 @@ def test_location_text_round_trip(tmp_path, bucket):
     assert not paths.is_remote(parse_location("a/s3:/b"))
     address = f"{bucket}/a/b.tif"
     # Path() drops a slash of the address.
-    for text in (address, Path(address), bucket / "a" / "b.tif"):
+    for text in (address, Path(address), bucket / "a" / "b.tif", address.replace("s3:", "S3:")):
         assert str(parse_location(text)) == address
         assert paths.is_remote(parse_location(text))
     assert paths.gdal_name(parse_location(address)) == address.replace("s3://", "/vsis3/")
@@ -74,10 +75,19 @@ def test_parse_location_without_s3fs_names_remedy(monkeypatch):
         parse_location("s3://bucket/name")
 
 
+@pytest.mark.parametrize("text", ["https://x/a", "HTTPS://x/a", "File:///a", "file:/a", "gs://b/a"])
+def test_parse_location_of_other_address_is_refused(text):
+    for where in (text, Path(text)):
+        with pytest.raises(CatalogError, match="neither a path on disk nor s3://BUCKET/NAME"):
+            parse_location(where)
+
+
 def test_normalise_does_not_follow_links(tmp_path):
     (tmp_path / "link").symlink_to("/")
     assert paths.normalise(f"{tmp_path}/link/../b/./c") == f"{tmp_path}/b/c"
     assert paths.normalise("s3://one/a/../b/c") == "s3://one/b/c"
+    assert paths.normalise("S3://one/a/../b/c") == "s3://one/b/c"
+    assert paths.join("/a", "S3://one/b") == "S3://one/b"
     # ".." above the bucket leads to another bucket.
     assert paths.normalise("s3://one/a/../../../two/c") == "s3://two/c"
 
