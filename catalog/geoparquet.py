@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from datetime import datetime
 from itertools import pairwise
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import shapely
+
+from flexroad.catalog.storage.scratch import ScratchFolder
 
 Item = dict[str, Any]
 
@@ -100,7 +101,7 @@ def table_bytes(items: list[Item], full: Item) -> bytes:
     from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
 
     schema = parse_stac_items_to_arrow([full]).read_all().schema
-    with tempfile.TemporaryDirectory() as folder:
+    with ScratchFolder() as folder:
         # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"
         table = pa.Table.from_pylist([row(item) for item in items], schema)

@@ -2,7 +2,6 @@
 
 import atexit
 import os
-import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -47,9 +46,12 @@ def _set_numba_cache() -> None:
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME", "/"), ".cache"))
     if "NUMBA_CACHE_DIR" in os.environ or _writable(beside) or _writable(home / "numba"):
         return
+    from flexroad.catalog.storage.scratch import ScratchFolder
+
     # A new private folder, because numba executes the code that it reads from its cache.
-    os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="flexroad-")
-    atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
+    folder = ScratchFolder()
+    os.environ["NUMBA_CACHE_DIR"] = folder.name
+    atexit.register(folder.cleanup)
 
 
 _set_numba_cache()

@@ -7,13 +7,13 @@ staged file is the file itself; nothing is copied.
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.catalog.storage.scratch import ScratchFolder
 
 PUT_S = 60.0
 """Shortest time between two uploads (s)."""
@@ -38,11 +38,11 @@ class StagedFile:
     def __init__(self, where: Location, writable: bool = True) -> None:
         self.where = where
         self.writable = writable
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: ScratchFolder | None = None
         if isinstance(where, Path):
             self.path = where
         else:
-            self._folder = tempfile.TemporaryDirectory(prefix="flexroad-")
+            self._folder = ScratchFolder()
             self.path = Path(self._folder.name) / where.name
         self._put = time.monotonic()
         self._pause = PUT_S
@@ -103,7 +103,7 @@ def atomic_file(where: Location, flushed: bool = False) -> Iterator[Path]:
         If it cannot be written; names ``where``. No temporary file is left.
     """
     if not isinstance(where, Path):
-        with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
+        with ScratchFolder() as folder:
             local = Path(folder) / where.name
             yield local
             write(where, local.read_bytes())

@@ -24,6 +24,7 @@ def clean(
 ) -> None:
     """Delete what no run needs: unused artefacts, files of removed tiles and products, temporary files."""
     from flexroad.catalog.storage.paths import absolute, parse_location
+    from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
     from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
     from flexroad.pipeline.run.lock import run_lock
     from flexroad.pipeline.run.record import Run
@@ -55,5 +56,8 @@ def clean(
     for kind, meaning in MEANING.items():
         if files[kind]:
             echo(f"{meaning}: {files[kind]} files, {sizes[kind] / 1e6:.1f} MB")
+    folders = sum(1 for _ in abandoned()) if dry_run else remove_abandoned()
+    if folders:
+        echo(f"temporary folders of processes that were killed: {folders}")
     verb = "would free" if dry_run else "freed"
     echo(f"{verb} {files.total()} files, {sizes.total() / 1e6:.1f} MB")

@@ -7,13 +7,13 @@ import importlib
 import logging
 import shutil
 import sys
-import tempfile
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
@@ -75,7 +75,7 @@ def open_cluster(
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
         stack.enter_context(dask.config.set(SETTINGS))
-        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexroad-"))
+        scratch = stack.enter_context(ScratchFolder())
         opened = stack.enter_context(make(cluster, scratch, dashboard))
         start_s = 0 if cluster.kind == "local" else cluster.start_s
         yield ClusterTarget(opened, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")

@@ -8,12 +8,13 @@ import re
 import shlex
 import signal
 import subprocess
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
+
+from flexroad.catalog.storage.scratch import ScratchFolder
 
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the request is repeated."""
@@ -94,7 +95,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
 
 def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
     try:
-        with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
+        with ScratchFolder() as folder:
             path = Path(folder) / "summary.json"
             path.write_text(text)
             # Its output goes to standard error, with the messages of the run.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline.report.render import _small, log
 from flexroad.tasks.types import Mesh
 
@@ -49,7 +49,7 @@ def render_meshes(
     """
     if not meshes:
         return {}
-    with tempfile.TemporaryDirectory(prefix="flexroad-") as name:
+    with ScratchFolder() as name:
         folder = Path(name)
         for i, (mesh_name, mesh) in enumerate(meshes.items()):
             optional = {

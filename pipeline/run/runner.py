@@ -12,6 +12,7 @@ from functools import partial
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import exists, flush_names, parse_location
+from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.borders import check_tiles
@@ -70,6 +71,7 @@ def run_tiles(
     """
     check_models(run.config)
     check_tiles(run.config, run.catalog)
+    remove_abandoned()
     with open_database(run, write=True) as database, EventLog(run.path) as log:
         log.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)
         close = partial(_close, run, database, log, utc_now(), time.perf_counter())

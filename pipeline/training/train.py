@@ -7,7 +7,6 @@ of the model alone.
 from __future__ import annotations
 
 import importlib
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config.methods import methods
 from flexroad.pipeline.config.models import Config
@@ -223,7 +223,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
 
     trained: Trained = method.train(*samples, settings, progress)
     segment = methods("segment")[options.method]
-    with tempfile.TemporaryDirectory(prefix="flexroad-") as folder:
+    with ScratchFolder() as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
         applied = segment_options(config, options.method, model)

@@ -13,8 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 from weakref import finalize
 
@@ -29,6 +27,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools
@@ -160,9 +159,9 @@ class _Copy:
     """A local copy of a file in a bucket, deleted when this object is garbage-collected."""
 
     def __init__(self, path: UPath) -> None:
-        folder = Path(mkdtemp(prefix="flexroad-"))
-        finalize(self, rmtree, folder, ignore_errors=True)
-        self.path = fetch(path, folder)
+        folder = ScratchFolder()
+        finalize(self, folder.cleanup)
+        self.path = fetch(path, Path(folder.name))
 
 
 @lru_cache(maxsize=CACHE_SIZE)
