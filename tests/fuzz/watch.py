@@ -49,7 +49,8 @@ def outside(folder: Path) -> Iterator[Outside]:
     """Make the folder, and start the server."""
     folder.mkdir()
     write(folder / "secret.tif", [[1.0, 2.0], [3.0, 4.0]])
-    for name in ("secret.yaml", "secret.json", "secret.png", "secret.txt"):
+    # No YAML: a configuration may extend one in any folder.
+    for name in ("secret.json", "secret.png", "secret.txt"):
         (folder / name).write_text("{}")
     libc = ctypes.CDLL(None, use_errno=True)
     inotify = libc.inotify_init1(os.O_NONBLOCK)
