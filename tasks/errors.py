@@ -24,3 +24,7 @@ class TaskError(Exception):
 
 class LayerMissing(TaskError):
     """A tile lacks a layer that a stage needs; around a border of tiles it may end before the heights do."""
+
+
+class MeshFault(TaskError):
+    """A mesh that is no height field triangulated once (`tasks.metrics.mesh_check`)."""

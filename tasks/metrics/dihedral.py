@@ -19,7 +19,7 @@ def mean_angles(mesh: Mesh) -> Floats:
     The paper averages over three neighbours; a face at the border has two or one. NaN if it has none.
     """
     totals, counts = np.zeros(len(mesh.faces)), np.zeros(len(mesh.faces))
-    start, far, owner = _edges(mesh.faces, len(mesh.vertices))
+    start, far, owner = edges(mesh.faces, len(mesh.vertices))
     _add_angles(_normals(mesh.vertices, mesh.faces), start, far, owner, totals, counts)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.degrees(totals / counts))
@@ -39,7 +39,7 @@ def _normals(vertices: Floats, faces: Indices) -> Floats:
 
 
 @compiled()
-def _edges(faces: Indices, vertices: int) -> tuple[Indices, Indices, Indices]:
+def edges(faces: Indices, vertices: int) -> tuple[Indices, Indices, Indices]:
     """Return the faces' edges sorted by their lower vertex.
 
     The edges of vertex v are ``start[v]`` to ``start[v + 1]`` (exclusive). For each edge, ``far`` is its

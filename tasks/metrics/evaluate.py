@@ -3,6 +3,8 @@
 Distances are vertical, at the reference's cell centres in the tile's core. The evaluation mask classes cells,
 and faces by the cell under their centroid, as road or terrain. It is the reference's road mask, else the raw
 segmented one; the paper uses the segmented one.
+
+Only a mesh without faults (`tasks.metrics.mesh_check`) is measured, so that a tile with a broken mesh fails.
 """
 
 from __future__ import annotations
@@ -13,13 +15,14 @@ import numpy as np
 from pydantic import Field
 
 from flexroad.tasks import options as base
+from flexroad.tasks.metrics import mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.point_to_mesh import nearest
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, TileData
 
-VERSION = 1
+VERSION = 2
 
 
 class Options(base.Options):
@@ -52,7 +55,13 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
     Metrics
         Metres and degrees. Distances are over the cells where both mesh and reference have a height;
         NaN for a class without any.
+
+    Raises
+    ------
+    MeshFault
+        If the mesh is no height field triangulated once.
     """
+    mesh_check.check(mesh)
     truth = data.dtm if data.reference is None else data.reference
     reference_road = data.reference_road if options.classes == "reference" else None
     is_road = road.mask if reference_road is None else reference_road

@@ -12,7 +12,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs, raster
-from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.metrics import evaluate, mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.synthetic.scene import make_scene
@@ -78,6 +78,7 @@ def main() -> None:
             options = evaluate.Options(nearest=nearest)
             time_ms = best(lambda m=mesh, o=options: evaluate.evaluate(m, data, road, o))
             line(f"evaluate {name}{' +3D' * nearest}", len(mesh.faces), time_ms)
+        line(f"check {name}", len(mesh.faces), best(lambda m=mesh: mesh_check.check(m)))
         peers_of_evaluate(name, mesh)
 
 

@@ -95,5 +95,5 @@ def test_evaluate_output_is_pinned_to_version(tile, clusters):
         "road_fraction": 0.229583333333,
         "completeness": 1.0,
     }
-    assert evaluate.VERSION == 1
+    assert evaluate.VERSION == 2
     assert metrics == pytest.approx(golden, rel=1e-9)

@@ -142,7 +142,10 @@ def test_evaluate_hole_in_mesh_lowers_completeness():
     grid = ground(41, 31)
     mesh = on_lattice(grid, tilt(0.0))
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
-    holed = replace(mesh, faces=mesh.faces[(np.abs(centroids[:, :2] - [20.5, 15.5]) > 5).any(axis=1)])
+    used, faces = np.unique(
+        mesh.faces[(np.abs(centroids[:, :2] - [20.5, 15.5]) > 5).any(axis=1)], return_inverse=True
+    )
+    holed = replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3).astype(np.int32))
     metrics = figures(holed, grid, np.full(grid.shape, 160.5))
     # The hole is 10 m wide from centre to centre; the cells on its rim have heights.
     assert metrics.completeness == pytest.approx(1 - 81 / (41 * 31))

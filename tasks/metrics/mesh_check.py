@@ -1,0 +1,235 @@
+"""Check of a mesh: a height field triangulated once, with at most one face over any place.
+
+The number w(p) of faces over a place p (beside the edges) is shown to be 0 or 1 as follows. All faces are
+counter-clockwise, so w(p) is the sum of the winding numbers of their outlines around p. An edge of two faces
+is passed once in each direction and cancels out. What remains are the edges of one face, the rim: w is the
+winding number of the rim. It is constant in every part of the plan without rim, and smaller by one on the
+right of a rim edge than on its left. Rim edges meet at common ends only, so both sides of an edge are of one
+part each. The middle of every edge has 0 faces on its right, hence 1 on its left. Every part borders on an
+edge, so w is 0 or 1 everywhere.
+
+So no two faces overlap, and a vertex of one face is inside of no other face or edge: its own face would
+overlap the other, or it is the end of a rim edge that touches another. For the same reason only vertices of
+the rim can share a place, and only these are compared. To compare the sum of the areas with the area in the
+rim would not do: both are equal with overlaps, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.errors import MeshFault
+from flexroad.tasks.metrics.dihedral import edges
+from flexroad.tasks.types import Bools, Floats, Mesh
+
+ROUNDING = 3.3306690738754716e-16
+"""Bound of the rounding error of a doubled area, relative to the sum of its two products (Shewchuk 1997)."""
+ONLY_ENDS_MEET = "FF*F*****"
+"""DE-9IM pattern of two lines that have no point in common but ends of both."""
+
+RIM, REPEATED = 1, 2
+"""Kinds of edges: of one face; of two faces on the same side."""
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One kind of fault of a mesh."""
+
+    kind: str
+    count: int
+    place: str
+    """Index, or easting and northing (m), of the first one."""
+
+    def __str__(self) -> str:
+        return f"{self.count} {self.kind} (the first at {self.place})"
+
+
+def check(mesh: Mesh) -> None:
+    """Check a mesh.
+
+    Raises
+    ------
+    MeshFault
+        With kind, number and first place of the faults.
+    """
+    if found := faults(mesh):
+        raise MeshFault(
+            f"the mesh has {', '.join(map(str, found))}; this is an error of FlexRoad, report it; "
+            "other spacings (sample.road_m, sample.terrain_m) may avoid it"
+        )
+
+
+def faults(mesh: Mesh) -> tuple[Fault, ...]:
+    """Return the faults of a mesh, one entry per kind; empty if it is a height field triangulated once.
+
+    Each group of checks presupposes the one before: numbers and indices, faces and vertices, overlaps. So
+    only the faults of the first group with faults are returned.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
+    for group in (_invalid_numbers, _invalid_parts, _overlaps):
+        if found := tuple(group(vertices, faces, mesh.origin)):
+            return found
+    return ()
+
+
+def _invalid_numbers(
+    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
+) -> Iterator[Fault]:
+    infinite = ~np.isfinite(vertices).all(axis=1)
+    if infinite.any():
+        yield Fault("vertices that are not finite", int(infinite.sum()), f"vertex {infinite.argmax()}")
+    if faces.min(initial=0) < 0 or faces.max(initial=-1) >= len(vertices):
+        beyond = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
+        yield Fault("faces with unknown vertices", int(beyond.sum()), f"face {beyond.argmax()}")
+
+
+def _invalid_parts(
+    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
+) -> Iterator[Fault]:
+    sides = _sides(vertices, faces)
+    yield from _found("degenerate faces", sides == 0, faces, vertices, origin)
+    yield from _found("inverted faces", sides == -1, faces, vertices, origin)
+    unused = np.ones(len(vertices), np.bool_)
+    unused[faces] = False
+    yield from _found("unused vertices", unused, np.arange(len(vertices))[:, None], vertices, origin)
+
+
+def _overlaps(
+    vertices: Floats, faces: NDArray[np.int32], origin: tuple[float, float, float]
+) -> Iterator[Fault]:
+    ends, kinds = _directed(faces, *edges(faces, len(vertices)))
+    rim = ends[kinds == RIM]
+    once, lines = np.unique(rim)[:, None], vertices[rim, :2]
+    findings = (
+        ("edges with overlapping faces", lambda: kinds == REPEATED, ends),
+        ("duplicate vertices", lambda: _repeated(vertices[once[:, 0], :2]), once),
+        ("outline edges that cross or touch others", lambda: _crossing(lines), rim),
+        ("outline edges under or over other faces", lambda: _covered(lines), rim),
+    )
+    for kind, find, parts in findings:
+        if found := tuple(_found(kind, find(), parts, vertices, origin)):
+            yield from found
+            return
+
+
+def _found(
+    kind: str,
+    at: Bools,
+    parts: NDArray[np.integer],
+    vertices: Floats,
+    origin: tuple[float, float, float],
+) -> Iterator[Fault]:
+    """Yield the faults of one kind; ``parts`` are vertices, edges or faces, ``(n, 1 to 3)``."""
+    if at.any():
+        east, north = vertices[parts[at.argmax()], :2].mean(axis=0) + origin[:2]
+        yield Fault(kind, int(at.sum()), f"{east:.3f}, {north:.3f}")
+
+
+@compiled()
+def _sides(vertices: Floats, faces: NDArray[np.int32]) -> NDArray[np.int8]:
+    """Return 1 for faces that look up, -1 for inverted ones, 0 for those without an area, ``(F,)``."""
+    sides = np.zeros(faces.shape[0], np.int8)
+    for f in range(faces.shape[0]):
+        ax, ay, _ = vertices[faces[f, 0]]
+        bx, by, _ = vertices[faces[f, 1]]
+        cx, cy, _ = vertices[faces[f, 2]]
+        left, right = (bx - ax) * (cy - ay), (by - ay) * (cx - ax)
+        bound = ROUNDING * (abs(left) + abs(right))
+        if left - right > bound:
+            sides[f] = 1
+        elif left - right < -bound:
+            sides[f] = -1
+    return sides
+
+
+@compiled()
+def _directed(
+    faces: NDArray[np.int32], start: NDArray[np.int32], far: NDArray[np.int32], owner: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Return for each edge of each face its ends, ``(n, 2)``, and `RIM`, `REPEATED` or 0, ``(n,)``.
+
+    The face is on the left. `REPEATED` are edges that another face passes in the same direction, beside the
+    first one of them.
+    """
+    ends, kinds = np.empty((far.size, 2), np.int32), np.zeros(far.size, np.int8)
+    for v in range(start.size - 1):
+        for i in range(start[v], start[v + 1]):
+            backward = False
+            for k in range(3):
+                backward |= faces[owner[i], k] == v and faces[owner[i], k - 1] == far[i]
+            ends[i, int(backward)], ends[i, 1 - int(backward)] = v, far[i]
+            kinds[i] = RIM
+            for j in range(start[v], start[v + 1]):
+                if j != i and far[j] == far[i]:
+                    kinds[i] = 0
+            for j in range(start[v], i):
+                if far[j] == far[i] and ends[j, 0] == ends[i, 0]:
+                    kinds[i] = REPEATED
+    return ends, kinds
+
+
+def _repeated(places: Floats) -> Bools:
+    """Return which places, ``(n, 2)``, equal another one, beside one of them."""
+    order = np.lexsort((places[:, 0], places[:, 1]))
+    result = np.zeros(len(places), np.bool_)
+    result[order[1:]] = (places[order[1:]] == places[order[:-1]]).all(axis=1)
+    return result
+
+
+def _crossing(rim: Floats) -> Bools:
+    """Return which edges, ``(n, 2, 2)``, have points in common with others that are not ends of both."""
+    import shapely
+
+    lines = shapely.linestrings(rim)
+    result = np.zeros(len(rim), np.bool_)
+    if not shapely.is_simple(shapely.multilinestrings(lines)):
+        one, other = shapely.STRtree(lines).query(lines, predicate="intersects")
+        one, other = one[one != other], other[one != other]
+        result[one[~shapely.relate_pattern(lines[one], lines[other], ONLY_ENDS_MEET)]] = True
+    return result
+
+
+def _covered(rim: Floats) -> Bools:
+    """Return which edges, ``(n, 2, 2)``, have faces on the right of their middles."""
+    south = rim[..., 1].min(axis=1)
+    order = np.argsort(south)
+    ordered, south = np.ascontiguousarray(rim[order]), south[order]
+    # A ray from a middle to the east crosses only edges that begin south of it, at most their length away.
+    north, length = ordered[..., 1].mean(axis=1), np.ptp(ordered[..., 1], axis=1).max(initial=0.0)
+    first, last = np.searchsorted(south, north - 1.001 * length), np.searchsorted(south, north, "right")
+    result = np.zeros(len(rim), np.bool_)
+    result[order] = _windings(ordered, first, last) != 0
+    return result
+
+
+@compiled()
+def _windings(rim: Floats, first: Indices, last: Indices) -> Indices:
+    """Return the winding number of the rim on the right of each edge's middle, ``(n,)``.
+
+    Edges that a ray to the east crosses upward count 1, downward -1; a ray along an edge is taken as just
+    north of it. Those that can be crossed are ``first`` to ``last`` (exclusive).
+    """
+    result = np.zeros(rim.shape[0], np.int64)
+    for i in range(rim.shape[0]):
+        (ax, ay), (bx, by) = rim[i, 0], rim[i, 1]
+        x, y = (ax + bx) / 2, (ay + by) / 2
+        # The ray begins on the right: it crosses the edge downward, or runs north of it, on its left.
+        if by < ay or (by == ay and bx > ax):
+            result[i] = -1
+        for j in range(first[i], last[i]):
+            (ax, ay), (bx, by) = rim[j, 0], rim[j, 1]
+            if j == i or (ay <= y) == (by <= y):
+                continue
+            on_left = (bx - ax) * (y - ay) > (by - ay) * (x - ax)
+            if ay <= y and on_left:
+                result[i] += 1
+            elif by <= y and not on_left:
+                result[i] -= 1
+    return result
