@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import pandas as pd
 import yaml
 
+from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.record import Run
@@ -57,6 +58,8 @@ class Content:
     """Error estimates and support per variant, mean over tiles; empty if the run has none."""
     worst_estimates: pd.DataFrame
     """Tiles with the highest error estimate of the exported variant; needs no ground truth."""
+    meshes: pd.DataFrame
+    """Result of the check of the meshes, per variant."""
     steps: EdgeSteps
     """Steps between the surfaces of neighbouring tiles."""
     failures: pd.DataFrame
@@ -95,6 +98,7 @@ def gather(run: Run) -> Content:
         worst=_worst(done, exported),
         quality=over_tiles(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
+        meshes=mesh_checks(rows, run.config.chains),
         steps=edge_steps(run),
         failures=failures,
         versions=run.versions,

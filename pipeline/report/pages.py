@@ -14,7 +14,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from flexroad.catalog.text import printable
-from flexroad.pipeline.report import quality
+from flexroad.pipeline.report import meshes, quality
 from flexroad.pipeline.report.content import Content
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
@@ -79,6 +79,7 @@ def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Worst tiles by road L2", content.worst, ""),
         ("Worst tiles by error estimate, without ground truth", content.worst_estimates, quality.MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
+        ("Meshes", content.meshes, meshes.MEANING),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
         ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),
         ("Failures", content.failures, ""),

@@ -147,6 +147,7 @@ def test_report_writes_every_format(finished, form):
     if form == "md":
         assert "| method | tiles | L2 road (m) |" in text
         assert "Steps between neighbouring tiles" in text
+        assert "no fault" in text
     if form == "html":
         assert text.count("data:image/png;base64,") >= 12
         assert "http" not in text.split("<body>")[1].split("Configuration")[0]

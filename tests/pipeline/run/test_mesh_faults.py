@@ -1,0 +1,108 @@
+"""Meshes of runs are checked: those of all variants have no fault, and one with a fault fails its tile."""
+
+import zipfile
+from dataclasses import replace
+
+import pytest
+
+from flexroad.catalog import Catalog
+from flexroad.catalog.sources import rasters
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.report.content import gather
+from flexroad.pipeline.report.pages import html_page, markdown_page
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tasks import sample
+
+SPLINE = {"load": {"halo_m": 50}, "fit": {"method": "smoothing_spline", "spacing_m": 20}}
+VARIANTS = {
+    "plane": {"fit": "plane", "sample": "corners"},
+    "rgt": {"fit": "raster", "sample": "uniform"},
+    "flexroad": {},
+    "filtered": {"sample": {"mask": "filtered"}},
+    "uneven": {"sample": {"road_m": 0.7, "terrain_m": 3.3}},
+    "halo": {"load": {"halo_m": 20}},
+    "nightly": SPLINE,
+    "nightly_uniform": {**SPLINE, "sample": "uniform"},
+    "nightly_uneven": {**SPLINE, "sample": {"road_m": 0.7, "terrain_m": 3.3}},
+}
+EVERY = {
+    "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 2},
+    "variants": VARIANTS,
+}
+"""All fits and sampling methods; the fits are quick and inaccurate, which changes no plan coordinate."""
+
+
+def checks(run):
+    return gather(run).meshes.set_index("method")
+
+
+@pytest.mark.slow
+def test_meshes_of_all_variants_have_no_fault(survey, tmp_path):
+    catalog = Catalog.read(survey)
+    pair = catalog.select([tile.id for tile in catalog.tiles[:2]])
+    run = Run.create(tmp_path / "run", compose(EVERY, "every"), pair)
+    assert run_tiles(run, SerialExecutor()).done == 2
+    table = checks(run)
+    assert list(table.index) == list(VARIANTS)
+    assert set(table.meshes) == {2}
+    assert set(table.result) == {"no fault"}
+    assert table.faces["rgt"] == 2 * 2 * 59**2
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_meshes_of_real_tiles_have_no_fault(real_data, tmp_path):
+    """Four tiles of two cities; the surveys end within three of them."""
+    tiles = []
+    for archive, names in (
+        ("London_BNG", ("dsm_barb*.tif", "dem_barb*.tif", "landcover*.tif")),
+        ("Goteborg_SWEREF99_1200", ("DSM_KRbig.tif", "DEM_KRbig.tif", "landcover.tif")),
+    ):
+        zipfile.ZipFile(real_data / "umep" / f"{archive}.zip").extractall(tmp_path)
+        layers = dict(zip(("dsm", "dtm", "road_mask"), names, strict=True))
+        tiles += rasters.index(tmp_path / archive, layers, road_values=(1,)).tiles
+    catalog = Catalog(tuple(tiles[number] for number in (2, 4, 5, 9)))
+    catalog.write(tmp_path / "real.parquet")
+    run = Run.create(tmp_path / "run", compose(EVERY, "every"), Catalog.read(tmp_path / "real.parquet"))
+    assert run_tiles(run, SerialExecutor()).done == 4
+    table = checks(run)
+    assert set(table.meshes) == {4}
+    assert set(table.result) == {"no fault"}
+
+
+def test_mesh_with_fault_fails_its_tile_with_one_line(survey, quick_config, tmp_path, monkeypatch):
+    run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
+    first = run.catalog.tiles[0]
+    sampled = sample.sample
+
+    def broken(surface, road, *arguments, **named):
+        mesh = sampled(surface, road, *arguments, **named)
+        if road.core != first.grid or len(mesh.faces) == 2:
+            return mesh
+        faces = mesh.faces.copy()
+        faces[[3, 8]] = faces[[3, 8], ::-1]
+        return replace(mesh, faces=faces)
+
+    monkeypatch.setattr(sample, "sample", broken)
+    summary = run_tiles(run, SerialExecutor())
+    assert (summary.done, summary.failed) == (3, 1)
+    notices = [failure.notice for failure in summary.failures]
+    assert len(notices) == 2
+    for notice in notices:
+        assert notice.startswith(
+            f"{first.id}: evaluate: MeshFault: the mesh has 2 inverted faces (the first at "
+        )
+    assert not list(run.folder(first.id).path.glob("*.glb"))
+    rows = read_metrics(run.path).set_index(["tile_id", "variant"])
+    assert list(rows.status[first.id]) == ["done", "failed", "failed"]
+    table = checks(run)
+    assert list(table["meshes with faults"]) == [0, 1, 1]
+    assert list(table.meshes) == [4, 4, 4]
+    assert "| rgt | 4 | 20,886 | 1 | error: 1 of 4 meshes have faults |" in markdown_page(gather(run))
+    assert "error: 1 of 4 meshes have faults" in html_page(gather(run), ())
+    monkeypatch.undo()
+    assert run_tiles(run, SerialExecutor(), force=frozenset({"sample"})).done == 4
+    assert set(checks(run).result) == {"no fault"}
