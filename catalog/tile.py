@@ -12,6 +12,8 @@ from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.trust import AllowedFolders, full_name, located
 
+HEIGHTS = ("dsm", "dtm", "reference", "bridges")
+"""Layers with heights in metres."""
 LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
 """Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true heights of road
 and terrain including bridges (m), true road mask, heights of bridge decks only (m), roads as lines or areas

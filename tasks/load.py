@@ -17,6 +17,7 @@ from pydantic import Field
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import Unit, height_unit
 from flexroad.catalog.storage.paths import stat
+from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats, Source, TileData
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 VERSION = 3
 
-HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES
 """Layers that are read; of other layers the result holds only the file names."""
@@ -216,7 +216,8 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
     absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            patch = read_window(path, f"{layer.name} {name}", grid, core, layer.crs, together, tile.allowed)
+            title = f"{layer.name} {name}"
+            patch = read_window(path, title, grid, core, layer.crs, together, tile.allowed, heights)
         except Unreadable as error:
             broken.append(error)
             continue

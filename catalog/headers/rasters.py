@@ -18,8 +18,10 @@ from flexroad.catalog.crs import bounds_in, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.settings import gdal_options
+from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
 
 GDAL = {
@@ -116,7 +118,7 @@ def opened(
     with quiet():
         for path in paths:
             try:
-                files.append(_open(root, path, crs, allowed))
+                files.append(_open(root, path, crs, allowed, layer in HEIGHTS))
             except _Skip as reason:
                 skipped[str(reason)].append(_name(root, path))
     return files, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
@@ -157,11 +159,12 @@ def _name(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
-def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders) -> RasterFile:
+def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heights: bool) -> RasterFile:
     try:
         with open_raster(path, allowed) as src:
             wkt = src.crs.to_wkt() if src.crs else ""
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
+            fault = georeference_fault(src) or (heights_fault(src) if heights else None)
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
     except Refused as error:
         raise _Skip(f"it {error}") from error
@@ -169,6 +172,8 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders) -> R
         raise _Skip("not a raster that GDAL can read") from error
     if transform.is_identity:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")
+    if fault:
+        raise _Skip(f"it {fault}")
     if transform.b or transform.d:
         raise _Skip("a rotated raster; turn it north up with gdalwarp")
     name = _name(root, path)

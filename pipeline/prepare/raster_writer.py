@@ -28,11 +28,11 @@ from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.tiling import assumed, cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Orthophoto
 
-HEIGHTS = ("dsm", "dtm", "reference", "bridges")
 PHOTO = "dop"
 GROUND = "ground"
 """Cells with ground points: an intermediate layer, not published."""

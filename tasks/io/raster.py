@@ -18,6 +18,7 @@ from rasterio.windows import Window
 from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import Location, is_remote, stat
 from flexroad.catalog.trust import AllowedFolders
@@ -150,6 +151,7 @@ def read_window(
     crs: str | None,
     resampling: Resampling = Resampling.average,
     allowed: AllowedFolders | None = None,
+    heights: bool = False,
 ) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
 
@@ -172,6 +174,8 @@ def read_window(
         How several cells are read as one: ``average`` of heights, ``mode`` of classes.
     allowed : AllowedFolders, optional
         Where the files that a VRT names may lie; None: anywhere on disk.
+    heights : bool
+        Whether the file must have heights: one band of real numbers.
 
     Returns
     -------
@@ -183,9 +187,12 @@ def read_window(
     Unreadable
         If the file is missing or broken.
     TaskError
-        If it is rotated or in another CRS than the grid.
+        If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
     """
     with opened(path, name, allowed) as src:
+        fault = heights_fault(src) if heights else None
+        if fault:
+            raise TaskError(f"{name} {fault}", str(path))
         lattice = place(src, path, name, grid, core, crs)
         slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:
@@ -284,6 +291,9 @@ def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str 
             f"the tile {core.width} x {core.height}; give it a world file",
             str(path),
         )
+    fault = georeference_fault(src)
+    if fault:
+        raise TaskError(f"{name} {fault}", str(path))
     if src.transform.b or src.transform.d:
         raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
     lattice = RasterGrid.of(src.transform, src.width, src.height)

@@ -1,0 +1,41 @@
+"""Why a raster cannot be used: its georeference, or its bands where heights are needed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rasterio.enums import ColorInterp
+
+AGAIN = "give it its georeference with gdal_translate -a_ullr"
+FARTHEST = 1e9
+"""Largest coordinate and cell, in any unit."""
+
+
+def georeference_fault(dataset: Any) -> str | None:
+    """Return why the position of an open raster is no place, to follow its name; None if it is one."""
+    west, east_step, north, north_step = (getattr(dataset.transform, key) for key in "cafe")
+    if not all(math.isfinite(number) for number in dataset.transform[:6]):
+        cells = f"cells of {east_step:g} x {north_step:g}"
+        return f"has the origin {west:g}, {north:g} and {cells}, which is no place; {AGAIN}"
+    if not dataset.transform.determinant:
+        return f"has cells of {east_step:g} x {north_step:g}; {AGAIN}"
+    corners = (west, north, west + dataset.width * east_step, north + dataset.height * north_step)
+    if max(map(abs, corners)) > FARTHEST:
+        return (
+            f"reaches from {west:g}, {north:g} to {corners[2]:g}, {corners[3]:g}, which is no place; {AGAIN}"
+        )
+    return None
+
+
+def heights_fault(dataset: Any) -> str | None:
+    """Return why an open raster has no heights, to follow its name; None if it has one band of numbers."""
+    kinds = [kind for kind in dataset.colorinterp if kind != ColorInterp.alpha]
+    if len(kinds) > 1:
+        bands = f"{len(kinds)} bands ({', '.join(kind.name for kind in kinds[:4])})"
+        return f"has {bands}, but heights are one; keep theirs with gdal_translate -b 1"
+    if ColorInterp.palette in kinds:
+        return "has a palette of colours, no heights; give a raster of heights"
+    if dataset.dtypes[0].startswith("complex"):
+        return f"has complex numbers ({dataset.dtypes[0]}), no heights; give a raster of heights"
+    return None

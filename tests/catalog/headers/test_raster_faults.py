@@ -1,0 +1,86 @@
+"""Rasters without heights or without a place are named, by `flexroad catalog` and by the tile's load."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import rasterio
+
+from flexroad.catalog import CatalogError, Grid, Layer, Tile
+from flexroad.catalog.sources import rasters
+from flexroad.tasks import TaskError
+from flexroad.tasks.load import Options, load
+from tests.make_rasters import UTM, write
+
+GRID = Grid(UTM, 295_500.0, 5_629_500.0, 1.0, 20, 20)
+HEIGHTS = np.full((20, 20), 100, np.float32)
+VRT = """<VRTDataset rasterXSize="20" rasterYSize="20">
+<SRS>EPSG:25832</SRS><GeoTransform>{}</GeoTransform>
+<VRTRasterBand dataType="Float32" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">dtm.tif</SourceFilename><SourceBand>1</SourceBand>
+</SimpleSource></VRTRasterBand></VRTDataset>"""
+
+
+def bands(path, count, dtype="uint8", **profile):
+    profile |= {"count": count, "dtype": dtype, "width": 20, "height": 20, "crs": UTM}
+    with rasterio.open(path, "w", driver="GTiff", transform=GRID.transform, **profile) as raster:
+        raster.write(np.ones((count, 20, 20), dtype))
+        if "photometric" in profile and count == 1:
+            raster.write_colormap(1, {0: (0, 0, 0), 1: (9, 9, 9)})
+
+
+def refused(root, name, match):
+    """Check that a DSM is refused by both commands; a DTM is beside it."""
+    with pytest.raises(CatalogError, match=f"skipped {name} .dsm.: it {match}") as error:
+        rasters.index(root, {"dsm": name, "dtm": "dtm.tif"})
+    assert "\n" not in str(error.value)
+    layers = Layer("dsm", (name,)), Layer("dtm", ("dtm.tif",))
+    with pytest.raises(TaskError, match=f"dsm {name} {match}") as failed:
+        load(Tile("t", GRID, layers, root=str(root), datetime=datetime.now(UTC)), Options())
+    assert "\n" not in str(failed.value)
+
+
+@pytest.mark.parametrize(
+    ("count", "more", "match"),
+    [
+        (
+            3,
+            {"photometric": "RGB"},
+            r"has 3 bands \(red, green, blue\), but heights are one; keep theirs with",
+        ),
+        (2, {"photometric": "MINISBLACK"}, r"has 2 bands \(gray, undefined\), but heights are one"),
+        (1, {"photometric": "PALETTE"}, "has a palette of colours, no heights; give a raster of heights"),
+        (1, {"dtype": "complex64"}, r"has complex numbers \(complex64\), no heights; give a raster"),
+    ],
+)
+def test_raster_without_heights_is_refused(tmp_path, count, more, match):
+    write(tmp_path / "dtm.tif", HEIGHTS)
+    bands(tmp_path / "a.tif", count, **more)
+    refused(tmp_path, "a.tif", match)
+
+
+def test_alpha_band_and_mask_are_no_heights(tmp_path):
+    write(tmp_path / "dtm.tif", HEIGHTS)
+    bands(tmp_path / "a.tif", 2, "uint8", photometric="MINISBLACK", alpha="YES")
+    (tile,) = rasters.index(tmp_path, {"dsm": "a.tif", "dtm": "dtm.tif"}, tile_size_m=20, min_cover=0).tiles
+    assert tile.layer("dsm").files == ("a.tif",)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "match"),
+    [
+        ("295500, 0, 0, 5629500, 0, -1", "has cells of 0 x -1; give it its georeference"),
+        ("295500, 1, 0, 5629500, 0, 0", "has cells of 1 x 0; give it"),
+        (
+            "nan, 1, 0, 5629500, 0, -1",
+            "has the origin nan, 5.6295e.06 and cells of 1 x -1, which is no place",
+        ),
+        ("295500, 1, 0, inf, 0, -1", "has the origin 295500, inf and cells of"),
+        ("295500, inf, 0, 5629500, 0, -1", "has the origin .* and cells of inf x -1, which is no place"),
+        ("1e300, 1, 0, 5629500, 0, -1", r"reaches from 1e.300, .* which is no place"),
+    ],
+)
+def test_raster_at_no_place_is_refused(tmp_path, numbers, match):
+    write(tmp_path / "dtm.tif", HEIGHTS)
+    (tmp_path / "a.vrt").write_text(VRT.format(numbers))
+    refused(tmp_path, "a.vrt", match)
