@@ -50,7 +50,7 @@ class Processes:
         return process
 
 
-def until(condition, seconds: float = 60):
+def until(condition, seconds: float = 180):
     """Call a function until its result is true; return the result."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:

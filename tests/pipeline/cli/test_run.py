@@ -13,6 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.store import checked_json
 from tests.command_line import same_signals
 
 QUICK = "fit: {control_points: [8, 8], iterations: 3}\nvariants:\n  flexroad: {}\n"
@@ -159,8 +160,10 @@ def test_run_source_outside_catalog_folder_needs_allow(flexroad, nightly, survey
     assert option in said
     flexroad(*nightly, *option.split())
     flexroad("rerun", tmp_path / "run", "--executor", "serial")
-    record = tmp_path / "run" / "run.json"
-    record.write_text(record.read_text().replace(str(tmp_path / "dtm"), str(tmp_path / "other")))
+    path = tmp_path / "run" / "run.json"
+    record = checked_json.loads(path.read_bytes())
+    record["allowed"] = [str(tmp_path / "other")]
+    path.write_bytes(checked_json.dumps(record))
     assert f"--allow {tmp_path}\n" in flexroad("rerun", tmp_path / "run", "--executor", "serial", expect=2)
 
 
