@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 SAMPLE = 12
 """Operations that have a fault, of each kind of fault."""
-KILL_S = 120
+KILL_S = 600
 """Longest time of a run that is to be killed (s)."""
 
 
