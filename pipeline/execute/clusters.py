@@ -30,6 +30,8 @@ nothing that could be spilled to disk, and a paused worker would wait forever fo
 memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time."""
 DEFAULT_MEMORY_BYTES = 4 * 1024**3
 """Memory of one SLURM or Kubernetes worker if the configuration gives none."""
+SILENT_S = 300.0
+"""How long a worker may be silent beyond the time limit of a tile (s)."""
 GRACE_S = 10.0
 """How long a running scheduler may have no workers (s): a nanny may be replacing one."""
 CLUSTER_PACKAGES = {
@@ -74,11 +76,18 @@ def open_cluster(
     make = {"local": local, "slurm": slurm, "kubernetes": kubernetes}[cluster.kind]
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
-        stack.enter_context(dask.config.set(SETTINGS))
+        stack.enter_context(dask.config.set(settings(cluster)))
         scratch = stack.enter_context(ScratchFolder())
         opened = stack.enter_context(make(cluster, scratch, dashboard))
         start_s = 0 if cluster.kind == "local" else cluster.start_s
         yield ClusterTarget(opened, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
+
+
+def settings(cluster: Cluster) -> dict[str, Any]:
+    """Return the Dask settings of scheduler and workers."""
+    # A worker is silent while a library holds the interpreter. By default it counts as dead after 5 minutes;
+    # the time limit of a tile ends it if it hangs.
+    return SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
 
 
 def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
@@ -91,7 +100,8 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
     """
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
-    from distributed.system import MEMORY_LIMIT
+
+    from flexroad.pipeline.execute.memory import available_bytes
 
     # Dask's count respects the limits of a container.
     workers = cluster.workers or CPU_COUNT
@@ -100,7 +110,7 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
-            memory_limit=cluster.memory or MEMORY_LIMIT // workers,
+            memory_limit=cluster.memory or available_bytes() // workers,
             dashboard_address="127.0.0.1:8787" if dashboard else None,
             worker_dashboard_address=None,
             local_directory=scratch,
@@ -139,7 +149,7 @@ def slurm_options(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
     walltime = timedelta(hours=cluster.walltime_h)
     # A worker that closes before SLURM kills it returns its tiles to the scheduler.
     lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
-    exports = [f"export {name}={value}" for name, value in _environment().items()]
+    exports = [f"export {name}={value}" for name, value in _environment(cluster).items()]
     return {
         "queue": cluster.queue,
         "account": cluster.account,
@@ -198,7 +208,7 @@ def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
         "image": cluster.image,
         "n_workers": cluster.workers or 1,
         "resources": {"requests": size, "limits": size},
-        "env": _environment(),
+        "env": _environment(cluster),
         "worker_command": "dask worker --nthreads 1",
         # If the client is killed, the cluster ends by itself after this many seconds.
         "idle_timeout": 900,
@@ -209,9 +219,14 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or repr(error)
 
 
-def _environment() -> dict[str, str]:
-    settings = {f"DASK_{key.replace('.', '__').upper()}": str(value) for key, value in SETTINGS.items()}
-    return ONE_THREAD | settings
+def _environment(cluster: Cluster) -> dict[str, str]:
+    """Return the environment of workers, and of a scheduler that is started elsewhere."""
+    values = settings(cluster).items()
+    return ONE_THREAD | {_variable(key): str(value) for key, value in values}
+
+
+def _variable(key: str) -> str:
+    return f"DASK_{key.replace('.', '__').replace('-', '_').upper()}"
 
 
 def _extra(kind: str) -> Any:

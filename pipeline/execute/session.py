@@ -1,7 +1,10 @@
 """Jobs in flight on one Dask scheduler.
 
 If a worker dies, all jobs that were assigned to it fail, and the one that caused the death is unknown. All
-of them are quarantined: they run last, one at a time on a worker. A job whose worker dies again is lost.
+of them are quarantined: they run last, one at a time on a worker. A job that exceeds the memory or the time
+of its worker then is lost. If its worker dies again for an unknown reason, that may have come from a job on
+another worker of the same machine, which took its memory: such a job runs once more with no other job at the
+same time, and is lost if its worker dies a third time.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ class InFlight(Generic[J]):
     job: J
     reserved_worker: str = ""
     """Address of the worker that runs only this job; empty if the job is not quarantined."""
+    alone: bool = False
+    """Whether no other job runs at the same time."""
     submitted: float = field(default_factory=time.monotonic)
 
 
@@ -82,6 +87,8 @@ class Session(Generic[J, R]):
         self.jobs = jobs
         self.quarantined: deque[J] = deque()
         """Jobs that were assigned to a worker that died."""
+        self.suspects: deque[J] = deque()
+        """Quarantined jobs whose worker died again for an unknown reason."""
         self.lost = lost
         self.patience_s = cluster.patience_s
         self.limit_s = cluster.tile_timeout_s
@@ -109,7 +116,7 @@ class Session(Generic[J, R]):
         while True:
             self._check_cluster()
             self._submit_jobs()
-            if not (self.in_flight or self.quarantined):
+            if not (self.in_flight or self.quarantined or self.suspects):
                 return
             for future in self._take_completed():
                 yield from self._outcome(future, self.in_flight.pop(future))
@@ -126,6 +133,8 @@ class Session(Generic[J, R]):
             for address in [address for address in self.workers if address not in reserved]:
                 if self.quarantined:
                     self._submit(InFlight(self.quarantined.popleft(), address))
+        if self.suspects and self.workers and not self.in_flight:
+            self._submit(InFlight(self.suspects.popleft(), next(iter(self.workers)), alone=True))
 
     def _submit(self, flight: InFlight[J]) -> None:
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
@@ -168,7 +177,7 @@ class Session(Generic[J, R]):
             worker = flight.reserved_worker
             if worker and worker not in self.workers and not future.done():
                 # The reserved worker died before the job started.
-                self.quarantined.append(self.in_flight.pop(future).job)
+                self._again(self.in_flight.pop(future))
                 future.release()
 
     def _wait_for_workers(self) -> None:
@@ -187,7 +196,7 @@ class Session(Generic[J, R]):
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be configured to fail tasks without workers; here ``patience_s`` decides.
             if flight.reserved_worker:
-                self.quarantined.append(flight.job)
+                self._again(flight)
             else:
                 self._submit(flight)
         elif future.status == "error":
@@ -215,30 +224,39 @@ class Session(Generic[J, R]):
         if self.client.status != "running":
             raise self._cluster_lost()
         # The worker died before its result was fetched.
-        self.quarantined.append(flight.job)
+        self._again(flight)
+
+    def _again(self, flight: InFlight[J]) -> None:
+        """Queue a job again that nothing is known against: no worker died while it ran."""
+        (self.suspects if flight.alone else self.quarantined).append(flight.job)
 
     def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
-        if flight.reserved_worker:
-            yield self.lost(flight.job, self._death_reason(flight, error))
-        else:
+        if not flight.reserved_worker:
             self.quarantined.append(flight.job)
+        elif (reason := self._own_fault(flight, error)) or flight.alone:
+            unknown = "the worker process died 3 times here; too little memory is the usual cause"
+            yield self.lost(flight.job, reason or unknown)
+        else:
+            self.suspects.append(flight.job)
 
     def _cluster_lost(self) -> ClusterLost:
         return ClusterLost(f"{self.name} is gone")
 
-    def _death_reason(self, flight: InFlight[J], error: KilledWorker) -> str:
+    def _own_fault(self, flight: InFlight[J], error: KilledWorker) -> str:
+        """Return why the job itself ended its reserved worker, empty if that is unknown."""
+        times = 3 if flight.alone else 2
         # A reserved worker starts its job at once.
         if time.monotonic() - flight.submitted >= self.limit_s:
             return (
-                f"it took more than {self.limit_s:g} s, 2 times, and was stopped; look at its source files, "
-                "or raise cluster.tile_timeout_s"
+                f"it took more than {self.limit_s:g} s, {times} times, and was stopped; look at its source "
+                "files, or raise cluster.tile_timeout_s"
             )
         worker = error.last_worker
         for _, event in self.client.get_events("worker-restart-memory") or ():
             if event["worker"] == worker.address:
                 used, limit = format_bytes(event["rss"]), format_bytes(worker.memory_limit)
                 return (
-                    f"the worker process died 2 times here, at last for memory: it used {used} and may use "
-                    f"{limit}; give each worker more (cluster: memory, fewer --workers)"
+                    f"the worker process died {times} times here, at last for memory: it used {used} and "
+                    f"may use {limit}; give each worker more (cluster: memory, fewer --workers)"
                 )
-        return "the worker process died 2 times here; too little memory is the usual cause"
+        return ""

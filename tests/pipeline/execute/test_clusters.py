@@ -182,8 +182,45 @@ def test_map_job_that_kills_its_worker_loses_only_that_job(running, poison):
     results = list(DaskExecutor(scheduler=running.address).map(deadly, jobs, lost))
     lost_jobs = [result for result in results if isinstance(result, tuple)]
     assert sorted(job for job, _ in lost_jobs) == poison
-    assert all("died 2 times here" in why for _, why in lost_jobs)
+    assert all("died 3 times here" in why for _, why in lost_jobs)
     assert sorted(result for result in results if isinstance(result, int)) == list(range(20))
+
+
+def deadly_for_all(job):
+    """Kill all worker processes of the machine's cluster if the job is "kill"; else return the job."""
+    if job == "kill":
+        # A job on the other worker has started then.
+        time.sleep(0.5)
+        for process in psutil.Process().parent().children():
+            if process.pid != os.getpid() and "spawn_main" in " ".join(process.cmdline()):
+                process.kill()
+        os._exit(3)
+    time.sleep(1)
+    return job
+
+
+def test_job_that_kills_all_workers_each_time_loses_no_other_job(running):
+    """As one that takes the machine's memory, so that the system ends other processes, too."""
+    jobs = ["kill", *"abcdef"]
+    results = list(DaskExecutor(scheduler=running.address).map(deadly_for_all, jobs, lost))
+    assert sorted(result for result in results if isinstance(result, str)) == [*"abcdef"]
+    ((job, why),) = (result for result in results if isinstance(result, tuple))
+    assert job == "kill"
+    assert why.startswith("the worker process died 3 times here")
+
+
+def test_local_workers_share_the_memory_and_may_be_silent(monkeypatch):
+    from distributed import Client
+
+    monkeypatch.setattr("flexroad.pipeline.execute.memory.MEMORY_LIMIT", 2 * 1024**3)
+    with (
+        open_cluster(Cluster(workers=2), None, None, False) as target,
+        Client(target.target, set_as_default=False) as client,
+    ):
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        assert [worker["memory_limit"] for worker in workers] == [1024**3, 1024**3]
+        # A tile may hold the interpreter for as long as it may take.
+        assert client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) == 3900
 
 
 def greedy(job):
