@@ -32,6 +32,8 @@ MIN_CELL_M, MAX_CELL_M = 0.001, 1e4
 YEARS = range(1000, 10_000)
 """Years that are written with four digits."""
 MAX_MESSAGE = 500
+MAX_FAULTS = 10_000
+"""Most entries of a catalog that cannot be used; with more it is something else, and may have millions."""
 
 MAX_LABEL = 200
 """Longest stratum and name of a dataset."""
@@ -127,8 +129,21 @@ class TileReader:
         self._names = _Names()
 
     def tiles(self, entries: Iterable[Any]) -> tuple[Tile, ...]:
-        """Return a tile for each entry; those of unusable entries have a fault."""
-        tiles = [self._tile(entry, number) for number, entry in enumerate(entries, 1)]
+        """Return a tile for each entry; those of unusable entries have a fault.
+
+        Raises
+        ------
+        CatalogError
+            If more than `MAX_FAULTS` entries have one.
+        """
+        tiles, faults = [], 0
+        for number, entry in enumerate(entries, 1):
+            tiles.append(self._tile(entry, number))
+            faults += bool(tiles[-1].fault)
+            if faults > MAX_FAULTS:
+                raise CatalogError(
+                    f"more than {MAX_FAULTS:,} entries cannot be used, the last one: {tiles[-1].fault}"
+                )
         taken = {tile.id for tile in tiles}
         return tuple(self._with_id(tile, number, taken) for number, tile in enumerate(tiles, 1))
 

@@ -13,6 +13,9 @@ import shapely
 from flexroad.catalog.storage.scratch import ScratchFolder
 
 Item = dict[str, Any]
+MAX_ROWS = 10_000_000
+MAX_UNPACKED = 8 * 2**30
+"""Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
 
 
 class Unreadable:
@@ -37,6 +40,7 @@ def entries(data: bytes) -> Iterator[Item]:
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
+    _check_size(file.metadata)
     paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
     columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
@@ -49,6 +53,14 @@ def entries(data: bytes) -> Iterator[Item]:
     if extents:
         _add_extents(rows, file.read(extents, use_threads=False)["assets"].combine_chunks())
     return ({**_top(row), "properties": row} for row in rows)
+
+
+def _check_size(metadata: Any) -> None:
+    """Check what the file declares: a few kilobytes can unpack to any size."""
+    groups = (metadata.row_group(number) for number in range(metadata.num_row_groups))
+    unpacked = sum(group.total_byte_size for group in groups)
+    if metadata.num_rows > MAX_ROWS or unpacked > MAX_UNPACKED:
+        raise ValueError(f"it has {metadata.num_rows:,} rows, which unpack to {unpacked / 2**30:,.1f} GiB")
 
 
 def _top(row: Item) -> Item:

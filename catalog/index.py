@@ -33,6 +33,8 @@ from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import AllowedFolders
 
 STAC_VERSION = "1.1.0"
+MAX_BYTES = 2**30
+"""Largest file: about 180,000 tiles of six layers in JSON, and millions in GeoParquet."""
 PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 JSON_SUFFIXES = (".json", ".geojson")
 
@@ -72,7 +74,7 @@ class Catalog:
         """
         path = _location(path)
         try:
-            data = paths.read(path)
+            data = _content(path)
         except FileNotFoundError as error:
             raise CatalogError(f"catalog {path} does not exist; make one with `flexroad catalog`") from error
         except IsADirectoryError as error:
@@ -89,7 +91,10 @@ class Catalog:
             raise _not_a_catalog(path, reason) from error
         kind = "feature" if is_json else "row"
         allowed = AllowedFolders.of(path.parent, allow)
-        tiles = TileReader(str(absolute(path).parent), allowed, kind, path.name).tiles(entries)
+        try:
+            tiles = TileReader(str(absolute(path).parent), allowed, kind, path.name).tiles(entries)
+        except CatalogError as error:
+            raise _not_a_catalog(path, str(error)) from error
         catalog = cls(tiles)
         if tiles and not catalog.usable:
             raise _not_a_catalog(path, f"no entry can be used: {tiles[0].fault}")
@@ -245,6 +250,14 @@ def _asset(layer: Layer, root: str) -> Item:
         # One flat list, because nested lists take twice as long to read.
         "flexroad:extents": [edge for extent in layer.extents for edge in extent] or None,
     }
+
+
+def _content(path: Location) -> bytes:
+    """Return the bytes of a catalog, which are several times as large in memory when they are read."""
+    file = paths.stat(path)
+    if file is not None and file.size > MAX_BYTES:
+        raise CatalogError(f"{path} has {file.size:,} bytes, more than {MAX_BYTES:,}; make several catalogs")
+    return paths.read(path)
 
 
 def _from_json(data: bytes) -> list[Any]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 
 import pyarrow as pa
@@ -162,6 +163,31 @@ def test_bad_file_gives_one_line(name, tmp_path, flexroad):
     ):
         said = flexroad(*command).expected(2)
         assert len(said.errors) == 1
+
+
+def test_many_bad_entries_are_no_catalog(tmp_path, monkeypatch):
+    monkeypatch.setattr("flexroad.catalog.entries.MAX_FAULTS", 10)
+    (tmp_path / "c.json").write_text(json.dumps({"features": [{}] * 12}))
+    with pytest.raises(CatalogError, match="more than 10 entries cannot be used"):
+        Catalog.read(tmp_path / "c.json")
+
+
+def test_large_file_is_not_read(tmp_path):
+    path = tmp_path / "c.json"
+    path.touch()
+    os.truncate(path, 2**40)
+    with pytest.raises(CatalogError, match="has 1,099,511,627,776 bytes, more than"):
+        Catalog.read(path)
+
+
+def test_table_that_unpacks_to_much_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "c.parquet"
+    column = pa.array(["a" * 1_000_000] * 300)
+    pq.write_table(pa.table({"id": column}), path, compression="zstd", use_dictionary=False)
+    assert path.stat().st_size < 1_000_000
+    monkeypatch.setattr("flexroad.catalog.geoparquet.MAX_UNPACKED", 2**28)
+    with pytest.raises(CatalogError, match=r"it has 300 rows, which unpack to 0\.3 GiB"):
+        Catalog.read(path)
 
 
 def test_other_table_gives_one_line(tmp_path):
