@@ -53,6 +53,8 @@ MARK = re.compile(rb"<[A-Za-z]{3}")
 ASCII_GRID = re.compile(rb"\s*(ncols|nrows|xll|yll|cellsize|dx|dy|nodata)", re.IGNORECASE)
 APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
 REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
+ERRORS = (RasterioError, OSError, UnicodeDecodeError)
+"""What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 MAX_DEPTH = 4
 """Largest depth of VRTs that name VRTs."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
@@ -73,7 +75,7 @@ def open_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterat
     ------
     Refused
         If the file is of another format, is not a regular file, or names files that may not be read.
-    RasterioError, OSError
+    RasterioError, OSError, UnicodeDecodeError
         If it cannot be read.
     """
     if not isinstance(path, Path):
@@ -146,7 +148,7 @@ def _require_plain(path: Path, driver: str, size: int, mtime_ns: int) -> None:
         env = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE", **OFFLINE)
         with env, rasterio.open(str(path), driver=driver) as dataset:
             _require_no_link(dataset)
-    except RasterioError as error:
+    except (RasterioError, UnicodeDecodeError) as error:
         raise Refused(f"cannot be read: {error}; fetch it again") from error
 
 

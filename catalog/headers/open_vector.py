@@ -34,6 +34,8 @@ WITH = re.compile(r"\bwith\b", re.IGNORECASE)
 """Word with which recursive queries begin; SQLite does not require the word RECURSIVE."""
 MAX_CRS_BYTES = 65536
 """Longest text of a CRS in GeoJSON."""
+ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
+"""What pyogrio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 LINKS = ("link", "url")
 
 

@@ -12,12 +12,12 @@ from itertools import islice
 from pathlib import Path
 
 import rasterio
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import NotGeoreferencedWarning
 
 from flexroad.catalog.crs import bounds_in, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.settings import gdal_options
@@ -168,7 +168,7 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
     except Refused as error:
         raise _Skip(f"it {error}") from error
-    except (RasterioError, OSError) as error:
+    except ERRORS as error:
         raise _Skip("not a raster that GDAL can read") from error
     if transform.is_identity:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.tile import REACH_M, Layer, Tile
@@ -77,7 +77,7 @@ def opened(path: Path, crs: str | None) -> VectorFile:
             infos = [pyogrio.read_info(file, layer=name, force_total_bounds=True) for name in names]
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
-    except (RuntimeError, ValueError, OSError) as error:
+    except ERRORS as error:
         raise CatalogError(f"--roads {path} is not a vector file: {error}") from error
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")

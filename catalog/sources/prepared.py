@@ -26,7 +26,7 @@ from rasterio.errors import CRSError, RasterioIOError
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
@@ -193,7 +193,7 @@ def _read(path: Path) -> _File:
         with open_raster(path) as dataset:
             tags, transform, crs = dataset.tags(), dataset.transform, dataset.crs
             width, height = dataset.width, dataset.height
-    except (RasterioIOError, OSError) as error:
+    except ERRORS as error:
         raise CatalogError(f"{path} is not a GeoTIFF: {error}") from error
     missing = [tag for tag in (TILE_TAG, LAYER_TAG) if not tags.get(tag)]
     if missing or crs is None:

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
@@ -182,7 +181,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with open_raster(path) as source:
             yield source
-    except (RasterioError, OSError) as error:
+    except ERRORS as error:
         raise CatalogError(f"{path} cannot be read as a raster: {error}; run OpenDroneMap again") from error
 
 

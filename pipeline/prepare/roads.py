@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from rasterio.errors import RasterioError
 from rasterio.warp import Resampling, reproject
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.vectors import VectorFile, opened
 from flexroad.catalog.to_metres import MetricTransform
@@ -144,7 +143,7 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
                 dst_crs=grid.crs,
                 resampling=Resampling.nearest,
             )
-    except (RasterioError, OSError):
+    except ERRORS:
         return None
     road: Bools = mask != 0
     return road

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from affine import Affine
 from rasterio.enums import MaskFlags, Resampling
-from rasterio.errors import RasterioError
 from rasterio.warp import reproject
 from rasterio.windows import Window
 
 from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import Location, is_remote, stat
@@ -218,7 +217,7 @@ def opened(path: Location, name: str, allowed: AllowedFolders | None = None) -> 
         raise _missing(path, name) from error
     except Refused as error:
         raise Unreadable(f"{name} {error}", str(path)) from error
-    except (RasterioError, OSError) as error:
+    except ERRORS as error:
         if not is_remote(path) and stat(path) is None:
             raise _missing(path, name) from error
         reason = str(error.__cause__ or error).partition("\n")[0]

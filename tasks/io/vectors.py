@@ -24,7 +24,7 @@ from pyproj.exceptions import ProjError
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -140,7 +140,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
         if not names or (len(names) > 1 and names != list(OSM)):
             raise _error(request, f"has the layers {', '.join(kinds)}; name one with segment.layer")
         return tuple(_described(request, name, pyogrio.read_info(file, layer=name)) for name in names)
-    except (RuntimeError, ValueError) as error:
+    except ERRORS as error:
         raise _error(request, f"cannot be read as vectors: {error}") from error
 
 

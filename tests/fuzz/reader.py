@@ -12,6 +12,7 @@ import resource
 import selectors
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,18 +50,26 @@ class Reader:
     def __init__(self, module: str, function: str) -> None:
         self._command = [sys.executable, "-c", START, module, function]
         self._process: subprocess.Popen[bytes] | None = None
+        # Libraries warn of most damaged files.
+        self._printed = tempfile.TemporaryFile()  # noqa: SIM115
 
     def __enter__(self) -> "Reader":
         return self
 
     def __exit__(self, *_: object) -> None:
         self._end()
+        self._printed.close()
 
     def read(self, path: Path) -> Result:
         """Read a file; after a fault the process is started again."""
         if self._process is None:
             self._process = subprocess.Popen(
-                self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, bufsize=0
+                self._command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._printed,
+                cwd=ROOT,
+                bufsize=0,
             )
             assert self._line(START_SECONDS) == b"ready\n"
         assert self._process.stdin is not None
@@ -70,7 +79,13 @@ class Reader:
             fault, message = json.loads(line)
             return Result(path, fault, message)
         code = self._end()
-        return Result(path, f"hang of {SECONDS} s" if code is None else f"end of the process: {code}", "")
+        if code is None:
+            return Result(path, f"hang of {SECONDS} s", "")
+        return Result(path, f"end of the process: {code} {self._last_words()}", "")
+
+    def _last_words(self) -> str:
+        self._printed.seek(0)
+        return " ".join(self._printed.read()[-500:].decode(errors="replace").split())
 
     def _line(self, seconds: float) -> bytes:
         """Return the next line; empty if none comes in time, or the process has ended."""

@@ -377,6 +377,12 @@ def test_load_file_in_local_crs_fails(tmp_path, dtm):
     assert "dsm dsm.tif is in my site, the tile in EPSG:25832; reproject it" in fails(tile(tmp_path))[0]
 
 
+def test_load_file_whose_crs_is_no_text_fails(tmp_path, dtm):
+    path = write(tmp_path / "dsm.tif", relief(), **NORTH, crs='LOCAL_CS["my site",UNIT["metre",1]]')
+    path.write_bytes(path.read_bytes().replace(b"my site", b"my s\xf3te"))
+    assert "dsm dsm.tif cannot be read: 'utf-8' codec can't decode" in fails(tile(tmp_path))[0]
+
+
 def test_load_file_without_crs_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, crs=None)
     assert "dsm dsm.tif has no CRS; build the catalog again with --crs" in fails(tile(tmp_path))[0]

@@ -95,6 +95,14 @@ def test_segment_unusable_file_raises_one_line(tmp_path, make, options, message)
     assert caught.value.layer == "roads"
 
 
+def test_segment_crs_that_is_no_text_raises_one_line(tmp_path):
+    path = write(tmp_path / "r.shp", [LINE])
+    crs = path.with_suffix(".prj")
+    crs.write_bytes(crs.read_bytes().replace(b"ETRS", b"\xd8TRS"))
+    with pytest.raises(TaskError, match="cannot be read as vectors"):
+        segment(tile(path), Options())
+
+
 def test_segment_truncated_file_raises(tmp_path):
     whole = write(tmp_path / "whole.geojson", [LINE] * 50)
     path = tmp_path / "r.geojson"
