@@ -6,6 +6,8 @@ import reprlib
 
 MAX_SHOWN = 160
 """Longest text of a value in a message."""
+MAX_REASON = 500
+"""Longest message of a library in a message."""
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -23,6 +25,12 @@ def shown(value: object) -> str:
     """Return a value from a file in a short form, for messages."""
     text = printable(_REPR.repr(value))
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+def reason(error: BaseException) -> str:
+    """Return the first line of an error's message in a short form: libraries repeat what a file contains."""
+    text = printable(str(error).strip().partition("\n")[0])
+    return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}..."
 
 
 def _escaped(character: str) -> str:

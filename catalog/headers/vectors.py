@@ -16,6 +16,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.text import reason
 from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 MARGIN_M = 1.0
@@ -78,7 +79,7 @@ def opened(path: Path, crs: str | None) -> VectorFile:
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:
-        raise CatalogError(f"--roads {path} is not a vector file: {error}") from error
+        raise CatalogError(f"--roads {path} is not a vector file: {reason(error)}") from error
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
     has_crs = all(info["crs"] for info in infos)

@@ -69,7 +69,7 @@ def _names(path: Path, size: int, mtime_ns: int) -> tuple[str, ...]:
     for element in root.iter():
         unknown = [element.tag] if element.tag not in ELEMENTS else sorted({*element.attrib} - ATTRIBUTES)
         if unknown:
-            raise Refused(f"is a VRT with {unknown[0]}; {ONLY}")
+            raise Refused(f"is a VRT with {unknown[0][:60]}; {ONLY}")
     return tuple(dict.fromkeys(_name(element) for element in root.iter("SourceFilename")))
 
 

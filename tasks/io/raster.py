@@ -20,6 +20,7 @@ from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import Location, is_remote, stat
+from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
@@ -220,10 +221,10 @@ def opened(path: Location, name: str, allowed: AllowedFolders | None = None) -> 
     except ERRORS as error:
         if not is_remote(path) and stat(path) is None:
             raise _missing(path, name) from error
-        reason = str(error.__cause__ or error).partition("\n")[0]
+        why = reason(error.__cause__ or error)
         if is_remote(path):
-            raise TaskError(f"{name} cannot be read: {reason}; run again, or repair it", str(path)) from error
-        raise Unreadable(f"{name} cannot be read: {reason}; fetch it again", str(path)) from error
+            raise TaskError(f"{name} cannot be read: {why}; run again, or repair it", str(path)) from error
+        raise Unreadable(f"{name} cannot be read: {why}; fetch it again", str(path)) from error
 
 
 def _missing(path: Location, name: str) -> Unreadable:

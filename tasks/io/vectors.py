@@ -28,6 +28,7 @@ from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import reason
 from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools
@@ -141,7 +142,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
             raise _error(request, f"has the layers {', '.join(kinds)}; name one with segment.layer")
         return tuple(_described(request, name, pyogrio.read_info(file, layer=name)) for name in names)
     except ERRORS as error:
-        raise _error(request, f"cannot be read as vectors: {error}") from error
+        raise _error(request, f"cannot be read as vectors: {reason(error)}") from error
 
 
 def _file(request: Query, version: FileStat) -> str:
@@ -199,7 +200,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
         # A failed transformation also raises RuntimeError.
         hint = "; check segment.where" if request.where else ""
-        raise _error(request, f"cannot be read as roads: {error}{hint}") from error
+        raise _error(request, f"cannot be read as roads: {reason(error)}{hint}") from error
     table = table.rename(columns={name: name.lower() for name in layer.columns})
     # Coordinates that cannot be transformed to the tiles' CRS become infinite.
     table = table[~(table.geometry.isna() | table.geometry.is_empty)]

@@ -383,6 +383,17 @@ def test_load_file_whose_crs_is_no_text_fails(tmp_path, dtm):
     assert "dsm dsm.tif cannot be read: 'utf-8' codec can't decode" in fails(tile(tmp_path))[0]
 
 
+@pytest.mark.parametrize("name", ["dataType", "band"])
+def test_load_long_words_of_a_vrt_are_cut_in_the_message(tmp_path, dtm, name):
+    """GDAL repeats a wrong value, the check of the VRT a wrong name."""
+    word = "a" * 5000
+    band = f'<VRTRasterBand {name}="{word}"/>' if name == "dataType" else f"<{word}/>"
+    (tmp_path / "dsm.tif").write_text(f'<VRTDataset rasterXSize="20" rasterYSize="20">{band}</VRTDataset>')
+    message, _ = fails(tile(tmp_path))
+    assert "aaaa" in message
+    assert len(message) < 1000
+
+
 def test_load_file_without_crs_fails(tmp_path, dtm):
     write(tmp_path / "dsm.tif", relief(), **NORTH, crs=None)
     assert "dsm dsm.tif has no CRS; build the catalog again with --crs" in fails(tile(tmp_path))[0]
