@@ -15,6 +15,8 @@ from flexroad.catalog.errors import CatalogError
 Bounds = tuple[float, float, float, float]
 """West, south, east, north in metres."""
 
+FARTHEST = 1e9
+"""Largest coordinate, in any unit: beyond it are no places on Earth, but damaged numbers."""
 LATTICE_TOLERANCE = 0.01
 """Two lattices coincide when they are off by less than this part of a cell."""
 

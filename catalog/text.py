@@ -8,6 +8,8 @@ MAX_SHOWN = 160
 """Longest text of a value in a message."""
 MAX_REASON = 500
 """Longest message of a library in a message."""
+MAX_LINE = 200
+"""Longest line of an error of a decoder in a message."""
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -31,6 +33,11 @@ def reason(error: BaseException) -> str:
     """Return the first line of an error's message in a short form: libraries repeat what a file contains."""
     text = printable(str(error).strip().partition("\n")[0])
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}..."
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's whole message as one short line, or its type if it has none."""
+    return " ".join(str(error).split())[:MAX_LINE] or type(error).__name__
 
 
 def _escaped(character: str) -> str:

@@ -10,9 +10,40 @@ from flexroad.tasks.errors import TaskError
 
 SHARE = 0.8
 """Share of the machine's memory that one command may plan to use."""
-CGROUP = Path("/sys/fs/cgroup/memory.max")
-"""The limit of a container or of a systemd unit."""
+MOUNT = Path("/sys/fs/cgroup")
+OWN = Path("/proc/self/cgroup")
 GIB = 2**30
+
+
+def group_limits(mount: Path = MOUNT, own: Path = OWN) -> list[int]:
+    """Return the memory limits of this process's control group and of the groups around it (bytes).
+
+    These are the limits of a container, of a systemd unit (``MemoryMax=``) or of a SLURM job; empty if there
+    are none.
+
+    Parameters
+    ----------
+    mount, own : Path
+        Where the control groups are, and the file with the name of the process's own one.
+    """
+    limits: list[int] = []
+    with contextlib.suppress(OSError, ValueError):
+        for line in own.read_text().splitlines():
+            _, kinds, name = line.split(":", 2)
+            if kinds in ("", "memory"):
+                group = mount / kinds / name.strip("/")
+                limits += [limit for folder in (group, *group.parents) for limit in _limits(folder)]
+    return limits
+
+
+def _limits(group: Path) -> list[int]:
+    """Return the limits of one control group (bytes): of version 2, or of version 1."""
+    found = []
+    for name in ("memory.max", "memory.high", "memory.limit_in_bytes"):
+        # "max" is no limit.
+        with contextlib.suppress(OSError, ValueError):
+            found.append(int((group / name).read_text()))
+    return [limit for limit in found if limit > 0]
 
 
 @cache
@@ -20,11 +51,7 @@ def limit() -> int:
     """Return the memory that a command may plan to use (bytes)."""
     import psutil
 
-    whole = int(psutil.virtual_memory().total)
-    # Without a limit, there is no such file, or it has the word "max".
-    with contextlib.suppress(OSError, ValueError):
-        whole = min(whole, int(CGROUP.read_text()))
-    return int(SHARE * whole)
+    return int(SHARE * min([psutil.virtual_memory().total, *group_limits()]))
 
 
 def check(needed: float, what: str, remedy: str, file: str = "") -> None:

@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from flexroad.catalog.grid import FARTHEST
 from flexroad.catalog.headers import laz_chunks
 
 SIGNATURE = b"LASF"
@@ -24,8 +25,6 @@ RECORD, EXTENDED_RECORD = 54, 60
 """Length of the headers of a variable length record (VLR) and of an extended one (bytes)."""
 LASZIP = 22204, b"laszip encoded"
 """Number and user of the record that describes the compression."""
-FARTHEST = 1e9
-"""Largest coordinate, in any unit."""
 COARSEST = 1000.0
 """Largest step of coordinates, in any unit."""
 

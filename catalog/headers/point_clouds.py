@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers import las_header
+from flexroad.catalog.text import one_line
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]
@@ -198,9 +199,8 @@ def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
         # For a damaged file, laspy raises exceptions of many types, and lazrs one that is no `Exception`.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise CatalogError(
-            f"{path} cannot be read as a point cloud{when}: {reason}; download it again"
+            f"{path} cannot be read as a point cloud{when}: {one_line(error)}; download it again"
         ) from error
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from rasterio.enums import ColorInterp
 
+from flexroad.catalog.grid import FARTHEST
+
 AGAIN = "give it its georeference with gdal_translate -a_ullr"
-FARTHEST = 1e9
-"""Largest coordinate and cell, in any unit."""
 
 
 def georeference_fault(dataset: Any) -> str | None:

@@ -91,9 +91,8 @@ class TileGraph:
     @property
     def readable(self) -> Tile:
         """The tile with only the layers that its stages read: files of others may lie anywhere."""
-        return replace(
-            self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in self.reads)
-        )
+        reads = self.reads
+        return replace(self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in reads))
 
     def chain(self, variant: str) -> list[Node]:
         """Return the variant's nodes in the paper's order."""

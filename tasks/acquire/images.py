@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexroad.catalog.text import one_line
 from flexroad.tasks.errors import TaskError
 
 if TYPE_CHECKING:
@@ -60,8 +61,7 @@ def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
     except TaskError:
         raise
     except Exception as error:  # Pillow raises many types for damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise TaskError(f"{failure}: {reason}; {remedy}", file=str(file)) from error
+        raise TaskError(f"{failure}: {one_line(error)}; {remedy}", file=str(file)) from error
 
 
 def check_pixels(image: Image, name: str, remedy: str, file: Path) -> None:

@@ -23,7 +23,7 @@ from pyproj.exceptions import ProjError
 
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
@@ -44,8 +44,6 @@ OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highw
 """Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
 """Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
-FARTHEST = 1e9
-"""Largest coordinate of a place (m or degrees)."""
 WHOLE = 8
 """Memory that all features of a file take, as a multiple of its size."""
 TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')

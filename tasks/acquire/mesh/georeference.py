@@ -11,6 +11,7 @@ import numpy as np
 
 from flexroad.catalog.crs import in_plan
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import FARTHEST
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
 
@@ -19,8 +20,6 @@ Offset = tuple[float, float, float]
 
 LOCAL_BELOW = 10_000.0
 """If all plan coordinates are smaller than this, they are taken as local, not as coordinates of a CRS."""
-FARTHEST = 1e9
-"""Largest offset, in any unit."""
 MOST_CHARACTERS = 2**20
 """Longest sidecar file that is read."""
 SEARCHED_FOLDERS = 3

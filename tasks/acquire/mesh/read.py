@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.grid import FARTHEST
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import bounded
 from flexroad.tasks.acquire.mesh import gltf
@@ -30,8 +31,6 @@ SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 UPRIGHT = 2.0
 """Limit of side area to plan area; above it the upward axis of the mesh is wrong."""
 AXES = "xyz"
-FARTHEST = 1e9
-"""Largest coordinate, in any unit: beyond it are no places on Earth, but damaged numbers."""
 MOST_REPEATS = 1e6
 """Largest texture coordinate: how often a texture is repeated across a mesh."""
 FACE_BYTES = 200

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.text import one_line
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.segment.pixels.features import Features
@@ -124,8 +125,8 @@ def _read(path: Path, size: int, mtime_ns: int) -> Model:
         trained = f"made with scikit-learn {about.scikit_learn}: "
         return Model(assemble(nodes, baseline, len(about.features)), about)
     except Exception as error:  # zip, JSON, NumPy and pydantic raise many types for damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = f"{trained}{one_line(error)}"
         raise TaskError(
-            f"{path} is not a model for segment: pixels, or is damaged ({trained}{reason}); {REMEDY}",
+            f"{path} is not a model for segment: pixels, or is damaged ({reason}); {REMEDY}",
             str(path),
         ) from error
