@@ -168,7 +168,6 @@ def load_border(ground: Tile, core: Grid) -> TileData:
         road_mask=_road(ground, "road_mask", mosaics),
         dop=_optional(_source(ground, "dop")),
         roads=_optional(_source(ground, "roads")),
-        border=True,
     )
 
 

@@ -57,12 +57,10 @@ class TileData:
     """The orthophoto, or None if the tile has none."""
     roads: Source | None = None
     """Roads as vectors, or None if the tile has none."""
-    border: bool = False
-    """Whether this is not a tile but the ground around a corner or edge, which may be without roads."""
 
     def lacks_road(self, mask: Bools) -> bool:
-        """Return whether no cell of the tile's core is road in a mask, ``(H, W)``, although one should be."""
-        return not (self.border or mask[self.grid.window(self.core)].any())
+        """Return whether no cell of the tile's core is road in a mask, ``(H, W)``."""
+        return not mask[self.grid.window(self.core)].any()
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +199,7 @@ class Quality:
     """Mean distance of the surface to the nearer of scan and DTM: an estimate of its error."""
     suspect_m2: float
     """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
-    ground (m2), or 0."""
+    ground (m2); 0 if the road has none."""
     flags: tuple[str, ...]
     """Names of problems, from `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]

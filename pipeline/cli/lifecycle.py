@@ -41,9 +41,10 @@ class Outcome:
 
 def format_summary(summary: Summary) -> str:
     """Return the state of a run in one line."""
-    states = (
-        f"{summary.done} done ({summary.cached} cached), {summary.failed} failed, {summary.pending} pending"
-    )
+    parts = [f"{summary.cached} cached"]
+    if summary.without_roads:
+        parts.append(f"{summary.without_roads} without roads")
+    states = f"{summary.done} done ({', '.join(parts)}), {summary.failed} failed, {summary.pending} pending"
     changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
     return f"{summary.tiles} tiles: {states}; {changes}; {summary.seconds:.0f} s"
 

@@ -230,6 +230,11 @@ def _run_tiles(
     echo(f"{outcome.text}; results in {run.path}")
     if set(display.status) == {"cached"}:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
+    if summary.done and summary.without_roads == summary.done:
+        warn(
+            "no tile of this run has a road; if there are roads, check the road source of the catalog and "
+            "the options of segment"
+        )
     if summary.failed:
         echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
     elif not summary.exit_code:

@@ -124,7 +124,6 @@ def _cut(data: TileData, grid: Grid) -> TileData:
         dsm=data.dsm[part],
         dtm=data.dtm[part],
         road_mask=None if data.road_mask is None else data.road_mask[part],
-        border=True,
     )
 
 

@@ -15,7 +15,7 @@ from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.records import TileRecord
 
 NAME = "tiles.geojson"
-COLUMNS = ("id", "state", "error", "seconds", "error_estimate_m", "finished")
+COLUMNS = ("id", "state", "error", "seconds", "error_estimate_m", "flags", "finished")
 
 
 def write_states(run: Run, where: Location) -> None:
@@ -23,7 +23,8 @@ def write_states(run: Run, where: Location) -> None:
 
     Columns: ``id``; ``state`` (``done``: computed by the last run; ``cached``: done before it; ``failed``;
     ``pending``); ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``,
-    the error estimate of the surface exported first (m); ``finished``, the time of completion.
+    the error estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``;
+    ``finished``, the time of completion.
 
     Raises
     ------
@@ -67,4 +68,5 @@ def _row(tile_id: str, state: TileState, record: TileRecord | None, variant: str
         for metrics in record.rows:
             if metrics["variant"] == variant:
                 row["error_estimate_m"] = metrics.get("error_estimate_m")
+                row["flags"] = metrics.get("flags") or None
     return row

@@ -34,6 +34,7 @@ class ProgressDisplay:
         self.console = console
         self.status: Counter[str] = Counter()
         self.stages: Counter[str] = Counter()
+        self.without_roads = 0
         self.start = self.last_line = time.monotonic()
         self.progress = Progress(
             SpinnerColumn(),
@@ -68,6 +69,7 @@ class ProgressDisplay:
         """Add a tile's result."""
         self.status[result.status] += 1
         self.stages.update(result.computed)
+        self.without_roads += result.entry.without_roads
         for failure in result.failures:
             self.say(f"failed {failure.notice}")
         self.progress.update(self.bar, advance=1)
@@ -79,6 +81,8 @@ class ProgressDisplay:
     def counts(self) -> str:
         """Return the counts of tiles by status and of computed results by stage."""
         parts = [f"{self.status[name]} {name}" for name in ("done", "cached", "failed")]
+        if self.without_roads:
+            parts.append(f"{self.without_roads} without roads")
         stages = " ".join(f"{stage}:{count}" for stage, count in self.stages.items())
         return ", ".join(parts) + (f" [{stages}]" if stages else "")
 

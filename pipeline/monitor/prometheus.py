@@ -45,6 +45,7 @@ class Textfile:
         self.start = time.time()
         self.total = 0
         self.states: Counter[str] = Counter()
+        self.without_roads = 0
         self.seconds: Counter[str] = Counter()
         self.peak_mb = 0.0
         self.end: tuple[float, int] | None = None
@@ -69,6 +70,7 @@ class Textfile:
         """Add a tile's result."""
         with self._lock:
             self.states[result.status] += 1
+            self.without_roads += result.entry.without_roads
             self.seconds.update(result.seconds)
             self.peak_mb = max(self.peak_mb, *(span.peak_mb for span in result.spans.values()), 0.0)
 
@@ -79,6 +81,7 @@ class Textfile:
             self.total = summary.tiles
             done = summary.done - summary.cached
             self.states = Counter(done=done, cached=summary.cached, failed=summary.failed)
+            self.without_roads = summary.without_roads
 
     def write(self) -> None:
         """Write the file.
@@ -116,6 +119,7 @@ class Textfile:
         pending = max(0, self.total - sum(self.states.values()))
         for state, count in {**dict.fromkeys(STATES, 0), **self.states, "pending": pending}.items():
             gauge("tiles", "Tiles by state; done does not include cached.", count, state=state)
+        gauge("tiles_without_roads", "Done and cached tiles that have no road.", self.without_roads)
         for stage, seconds in self.seconds.items():
             gauge("stage_seconds", "Time spent computing in this run, by stage.", seconds, stage=stage)
         gauge("worker_peak_bytes", "Peak memory of a worker process.", self.peak_mb * 2**20)

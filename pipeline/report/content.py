@@ -12,6 +12,7 @@ from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import summary
+from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.tables import read_metrics
 
 FIGURES = {
@@ -31,6 +32,8 @@ FURTHER = {
     "seconds": "seconds",
 }
 """Further columns."""
+WITH_ROADS = "with roads"
+"""Column with the number of tiles that the figures of roads are over; only if it is not that of all tiles."""
 WORST = 10
 """Rows in the tables of the worst tiles."""
 
@@ -89,7 +92,7 @@ def gather(run: Run) -> Content:
     )
     return Content(
         title=f"FlexRoad: {run.config.name} over {counts.tiles} tile{'s' * (counts.tiles != 1)}",
-        state=f"Tiles: {counts.done} done, {counts.failed} failed, {counts.pending} pending",
+        state=_state(counts),
         reference=_reference(run, set(done.tile_id)),
         main=_over_tiles(done, variants, FIGURES, "mean"),
         median=_over_tiles(done, variants, FIGURES, "median"),
@@ -107,11 +110,24 @@ def gather(run: Run) -> Content:
     )
 
 
+def _state(counts: Summary) -> str:
+    without = (
+        f" ({counts.without_roads} of them without roads: they have no figures of roads)"
+        if counts.without_roads
+        else ""
+    )
+    return f"Tiles: {counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
+
+
 def _over_tiles(
     done: pd.DataFrame, variants: list[str], columns: dict[str, str], statistic: str
 ) -> pd.DataFrame:
-    table = done.groupby("variant")[list(columns)].agg(statistic).reindex(variants).rename(columns=columns)
-    table.insert(0, "tiles", done.groupby("variant").size().reindex(variants))
+    tiles = done.groupby("variant")
+    table = tiles[list(columns)].agg(statistic).reindex(variants).rename(columns=columns)
+    table.insert(0, "tiles", tiles.size().reindex(variants))
+    # Tiles without road have no figures of roads (NaN), and the statistic leaves them out.
+    if done.l2_road_m.isna().any():
+        table.insert(1, WITH_ROADS, tiles.l2_road_m.count().reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})
 
 
@@ -128,7 +144,7 @@ def _per_stratum(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
 
 
 def _worst(done: pd.DataFrame, variant: str) -> pd.DataFrame:
-    table = done[done.variant == variant].nlargest(WORST, "l2_road_m")
+    table = done[(done.variant == variant) & done.l2_road_m.notna()].nlargest(WORST, "l2_road_m")
     columns = {"tile_id": "tile"} | FIGURES | {"p95_road_m": FURTHER["p95_road_m"]}
     return table[list(columns)].rename(columns=columns)
 

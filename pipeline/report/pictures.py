@@ -67,7 +67,7 @@ def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
             ),
         ),
-        (*_flags(quality), *data.notes),
+        (*_flags(quality), *data.notes, *road.notes),
     )
 
 

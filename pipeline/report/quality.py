@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 
+from flexroad.tasks.quality.assess import NO_ROAD
+
 FIGURES = {
     "error_estimate_m": "error estimate (m)",
     "suspect_m2": "largest suspect patch (m²)",
@@ -25,11 +27,14 @@ MEANING = (
 
 
 def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
-    """Return the means over tiles and the number of flagged tiles per variant; empty without estimates."""
+    """Return the means over tiles and the number of flagged tiles per variant; empty without estimates.
+
+    A tile whose only flag is that it has no road is no problem, and is not counted as flagged.
+    """
     if not done["error_estimate_m"].notna().any():
         return pd.DataFrame()
     table = done.groupby("variant")[[*FIGURES, *SUPPORT]].mean().reindex(variants)
-    flagged = (done["flags"].fillna("") != "").groupby(done.variant).sum()
+    flagged = (~done["flags"].fillna("").isin(["", NO_ROAD])).groupby(done.variant).sum()
     table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
     return table.reset_index().rename(columns={"variant": "method"})

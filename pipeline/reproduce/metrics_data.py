@@ -56,7 +56,16 @@ class MetricsData:
         parts = f" ({', '.join(f'{n} {name}' for name, n in strata.items())})" if len(strata) else ""
         failed = len(self.tiles) - len(done)
         left_out = f"; {failed} failed tile{'s' * (failed != 1)} left out" if failed else ""
-        return f"Data: {self.dataset}, {len(done)} tile{'s' * (len(done) != 1)}{parts}{left_out}."
+        return (
+            f"Data: {self.dataset}, {len(done)} tile{'s' * (len(done) != 1)}{parts}{left_out}{self._roads}."
+        )
+
+    @property
+    def _roads(self) -> str:
+        """The number of tiles without figures of roads, as a part of a sentence; empty if all have them."""
+        figures = self.part(self.classes[0]).l2_road_m.unstack()
+        without = int(figures.isna().any(axis=1).sum())
+        return f"; {without} without roads, left out of the figures of roads" if without else ""
 
     def part(self, classes: str) -> pd.DataFrame:
         """Return the figures of the complete tiles, one row per ``(tile_id, variant)``."""

@@ -211,19 +211,21 @@ def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summa
     listed = database.listed((tile.id for tile in run.catalog.tiles), since)
     if listed is None:
         return _checked(run, database, since)
-    return summarise(len(run.catalog.tiles), listed.counts, database.failures()), listed.finished
+    current = summarise(len(run.catalog.tiles), listed.counts, database.failures(), listed.without_roads)
+    return current, listed.finished
 
 
 def _checked(run: Run, database: RunDatabase, since: str | None = None) -> tuple[Summary, int]:
     """Return what `recorded_summary` returns, from the tiles' folders and source files."""
-    counts, failures, finished = Counter[TileState](), list[Failure](), 0
+    counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
     for status, state in tile_states(run, database, since):
         counts[state] += 1
         record = status.last_record
         finished += record is not None and record.finished >= (since or "")
+        without_roads += status.done and record is not None and record.without_roads
         if state == "failed" and record and len(failures) < MAX_FAILURES:
             failures += record.failures
-    return summarise(len(run.catalog.tiles), counts, failures), finished
+    return summarise(len(run.catalog.tiles), counts, failures, without_roads), finished
 
 
 def progress(run: Run, owner: Owner) -> tuple[Summary, str]:

@@ -44,6 +44,8 @@ class Summary:
     """Whether the last execution was interrupted by the user."""
     refused: str = ""
     """Error that stopped the last execution as a whole; empty if there was none."""
+    without_roads: int = 0
+    """Done tiles that have no road: their surface is that of the terrain."""
     failures: tuple[Failure, ...] = ()
     """The first `MAX_FAILURES` failures, in the catalog's order."""
 
@@ -55,11 +57,21 @@ class Summary:
         return 2 if self.refused else int(self.failed + self.pending > 0)
 
 
-def summarise(tiles: int, counts: Counter[TileState], failures: Iterable[Failure]) -> Summary:
+def summarise(
+    tiles: int, counts: Counter[TileState], failures: Iterable[Failure], without_roads: int = 0
+) -> Summary:
     """Return the summary of a run with ``tiles`` tiles from the number of tiles in each state."""
     done, first = counts["done"] + counts["cached"], tuple(islice(failures, MAX_FAILURES))
     pending = tiles - done - counts["failed"]
-    return Summary(tiles, done, counts["failed"], counts["cached"], pending, failures=first)
+    return Summary(
+        tiles,
+        done,
+        counts["failed"],
+        counts["cached"],
+        pending,
+        without_roads=without_roads,
+        failures=first,
+    )
 
 
 def write_summary(run: Location, summary: Summary, flushed: bool = False, **about: Any) -> None:

@@ -6,7 +6,8 @@ One run writes the database; other processes may read it at the same time. Table
 keeps read locks short and memory use small. ::
 
     entry   one row per tile that was ever processed: `TileRecord`
-    asked   the tiles of the catalog, in its order, each with its state and the checksum of its entry
+    asked   the tiles of the catalog, in its order, each with its state, time, lack of roads, and the checksum
+            of its entry
     total   the checksums of all rows of `asked`, combined by exclusive or
 
 Every row has a checksum, and nothing is returned that does not agree with it. A damaged, lost or old entry is
@@ -41,7 +42,7 @@ from flexroad.pipeline.store.sqlite_file import (
 )
 
 NAME = "database.sqlite"
-VERSION = 2
+VERSION = 3
 TileState = Literal["cached", "done", "failed", "pending"]
 """cached: already done when the last run started; pending: no result for the current files and options."""
 Recover = Callable[[str], TileRecord | None]
@@ -55,7 +56,7 @@ CHECKSUM_BYTES = 16
 TABLES = (
     "CREATE TABLE entry (tile TEXT PRIMARY KEY, finished TEXT, record TEXT, checksum BLOB)",
     "CREATE TABLE asked (position INTEGER PRIMARY KEY, tile TEXT UNIQUE, standing TEXT, finished TEXT,"
-    " record BLOB, checksum BLOB)",
+    " roadless INTEGER, record BLOB, checksum BLOB)",
     "CREATE TABLE total (checksum BLOB)",
 )
 T = TypeVar("T")
@@ -68,6 +69,8 @@ class Listed:
     counts: Counter[TileState] = field(default_factory=Counter)
     finished: int = 0
     """Number of tiles finished (done or failed) since the time asked for."""
+    without_roads: int = 0
+    """Number of done tiles without roads."""
 
 
 class RunDatabase:
@@ -193,11 +196,12 @@ class RunDatabase:
             Count the tiles finished since this time (ISO 8601, UTC).
         """
         self.flush()
-        counts, finished = Counter[TileState](), 0
+        counts, finished, without_roads = Counter[TileState](), 0, 0
         combined, total = 0, bytes(CHECKSUM_BYTES)
         # One query sees one state of the file, also while a run writes it.
         query = (
-            "SELECT position, tile, standing, finished, record, checksum, (SELECT checksum FROM total)"
+            "SELECT position, tile, standing, finished, roadless, record, checksum,"
+            " (SELECT checksum FROM total)"
             " FROM asked ORDER BY position"
         )
         try:
@@ -208,10 +212,11 @@ class RunDatabase:
                     return None
                 counts[fields[2]] += 1
                 finished += bool(fields[3]) and str(fields[3]) >= since
+                without_roads += fields[2] in ("done", "cached") and fields[4]
                 combined ^= int.from_bytes(checksum)
         except (*Damage, ValueError):
             return None
-        return Listed(counts, finished) if total == _bytes(combined) else None
+        return Listed(counts, finished, without_roads) if total == _bytes(combined) else None
 
     def states(self) -> Iterator[TileState]:
         """Yield the state of every tile as set by the last run, in the catalog's order.
@@ -259,7 +264,7 @@ class RunDatabase:
             yield from record.failures if record else ()
 
     def _entries(self, condition: str) -> Iterator[tuple[str, TileState, TileRecord | None]]:
-        for _, tile, state, _, link, _ in self._asked(condition):
+        for _, tile, state, _, _, link, _ in self._asked(condition):
             # No join: where an entry cannot be read, the rest of the page can.
             row = self._row("SELECT finished, record FROM entry WHERE tile = ?", tile) if link else None
             record = _record(tile, row[0], row[1], link) if row else None
@@ -269,13 +274,13 @@ class RunDatabase:
         """Yield rows of `asked`, read in pages."""
         self.flush()
         query = (
-            "SELECT position, tile, standing, finished, record, checksum FROM asked"
+            "SELECT position, tile, standing, finished, roadless, record, checksum FROM asked"
             f" WHERE position > ? {condition} ORDER BY position LIMIT {PAGE}"
         )
         last = 0
         while page := self._page(query, last):
             for row in page:
-                if digest(*row[:5]) != row[5] or row[0] <= last:
+                if digest(*row[:6]) != row[6] or row[0] <= last:
                     raise OSError(errno.EIO, "the list of tiles is damaged", str(self._staged.where))
                 last = row[0]
                 yield row
@@ -299,10 +304,11 @@ class RunDatabase:
         combined = 0
         for position, (tile, state) in enumerate(tiles, 1):
             entry = execute("SELECT finished, record, checksum FROM entry WHERE tile = ?", (tile,)).fetchone()
-            intact = entry is not None and digest(tile, *entry[:2]) == entry[2]
-            fields = (position, tile, state, *((entry[0], entry[2]) if intact else ("", b"")))
+            record = _record(tile, *entry) if entry else None
+            about = (entry[0], int(record.without_roads), entry[2]) if record else ("", 0, b"")
+            fields = (position, tile, state, *about)
             checksum = digest(*fields)
-            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?)", (*fields, checksum))
+            execute("INSERT INTO asked VALUES (?, ?, ?, ?, ?, ?, ?)", (*fields, checksum))
             combined ^= int.from_bytes(checksum)
         execute("DELETE FROM total")
         execute("INSERT INTO total VALUES (?)", (_bytes(combined),))
@@ -335,17 +341,21 @@ class RunDatabase:
 
         It is None if the tile has no row, or a damaged one, which stays as it is.
         """
-        query = "SELECT position, standing, finished, record, checksum FROM asked WHERE tile = ?"
+        query = "SELECT position, standing, finished, roadless, record, checksum FROM asked WHERE tile = ?"
         row = self._connection.execute(query, (entry.tile_id,)).fetchone()
-        if row is None or digest(row[0], entry.tile_id, *row[1:4]) != row[4]:
+        if row is None or digest(row[0], entry.tile_id, *row[1:5]) != row[5]:
             return None
-        fields = (row[0], entry.tile_id, entry.state, entry.finished, link)
+        fields = (
+            *(row[0], entry.tile_id, entry.state, entry.finished),
+            *(int(entry.without_roads), link),
+        )
         checksum = digest(*fields)
         self._connection.execute(
-            "UPDATE asked SET standing = ?, finished = ?, record = ?, checksum = ? WHERE position = ?",
+            "UPDATE asked SET standing = ?, finished = ?, roadless = ?, record = ?, checksum = ?"
+            " WHERE position = ?",
             (*fields[2:], checksum, row[0]),
         )
-        return int.from_bytes(row[4]) ^ int.from_bytes(checksum)
+        return int.from_bytes(row[5]) ^ int.from_bytes(checksum)
 
     def _write(self, change: Callable[[], T]) -> T:
         """Write in one transaction, into a new and empty file if the old one turns out to be damaged."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from flexroad.tasks.quality.assess import NO_ROAD
+
 MetricsRow = dict[str, Any]
 """One row of metrics.parquet, by column."""
 State = Literal["done", "failed"]
@@ -59,6 +61,12 @@ class TileRecord:
     """Computing time in the worker (s)."""
     marker: MarkerStat | None = None
     """None if the marker could not be written, for example on a full disk."""
+
+    @property
+    def without_roads(self) -> bool:
+        """Whether the tile is done and no variant has a road on it."""
+        flags = [(row.get("flags") or "").split(", ") for row in self.rows]
+        return self.state == "done" and bool(flags) and all(NO_ROAD in names for names in flags)
 
 
 def from_item(item: dict[str, Any], marker: MarkerStat | None) -> TileRecord:

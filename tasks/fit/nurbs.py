@@ -40,7 +40,8 @@ class Options(BaseOptions):
     )
     terrain: bool = Field(
         True,
-        description="false: no DTM support: no terrain term, and the start is a plane through the road",
+        description="false: no DTM support: no terrain term, and the start is a plane through the road; "
+        "a tile without roads gets the plane through the DTM",
     )
     weights: Literal["free", "unit"] = Field(
         "free", description="free: weights are optimised between 1/10 and 10; unit: all are 1"
@@ -83,7 +84,10 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
     data, space = without_invalid_dtm(data, clusters), space_of(data, options)
     start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
-    z, weights = _adam(loss, start - datum, options)
+    z, weights = start - datum, np.ones_like(start)
+    # Without terrain term and road only the regulariser is left, which would flatten the plane of the start.
+    if options.terrain or (clusters.mask & np.isfinite(data.dsm)).any():
+        z, weights = _adam(loss, z, options)
     return surface_on(space, data.grid, data.grid.hull, weights * z, weights, datum)
 
 

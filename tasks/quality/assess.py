@@ -20,7 +20,7 @@ from flexroad.tasks.roads.dtm_validity import AGREE_M, rise
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
-VERSION = 1
+VERSION = 2
 
 SCATTER_M = 5.0
 """Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
@@ -37,7 +37,8 @@ FLAGS = {
 }
 """Figure of each flag; the flag is raised if the figure exceeds the option with the figure's name."""
 NO_ROAD = "no-road"
-"""The only flag of a tile whose mask has no road."""
+"""The flag of a tile without road: its mask has none, or the filter dropped all of it. With an empty mask it
+is the only flag."""
 
 
 class Options(base.Options):
@@ -122,10 +123,15 @@ def assess(
         "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _share_at_bound(surface),
         "error_estimate_m": mean(_finite(estimate[on_road])),
-        "suspect_m2": _largest_patch(on_road & (estimate > options.agree_m)) * cell**2,
+        "suspect_m2": _largest_patch(on_road & (estimate > options.agree_m)) * cell**2
+        if on_road.any()
+        else float("nan"),
     }
-    flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
-    return Quality(**figures, flags=tuple(flags if on_road.any() else [NO_ROAD]), support=classes)
+    # Without road cells all figures but the surface's weights are NaN, and none exceeds a threshold.
+    flags = [] if kept.any() else [NO_ROAD]
+    if on_road.any():
+        flags += [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
+    return Quality(**figures, flags=tuple(flags), support=classes)
 
 
 def error_estimate(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from flexroad.tasks import options
-from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
@@ -21,20 +22,15 @@ class Options(options.Options):
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the road cells of the catalog's mask layer.
 
-    Raises
-    ------
-    TaskError
-        If the tile has no road mask, or no cell of its core is road.
+    A tile that no mask reaches has no road cell, like the cells that a mask leaves out; a note says so.
     """
+    mask = np.zeros(data.grid.shape, np.bool_) if data.road_mask is None else data.road_mask
+    note = None
     if data.road_mask is None:
-        raise LayerMissing(
-            "no road mask layer in the catalog and none configured: "
-            "give --road-mask to `flexroad catalog rasters`"
+        note = "segment: no road mask reaches this tile, so it counts as a tile without roads"
+    elif data.lacks_road(mask):
+        note = (
+            "segment: the road mask has no road cell on this tile; if there are roads, give the values that "
+            "mean road with --road-value of `flexroad catalog rasters`"
         )
-    if data.lacks_road(data.road_mask):
-        raise TaskError(
-            "the road mask has no road cell on this tile: leave the tile out, or give the values that mean "
-            "road with --road-value of `flexroad catalog rasters`",
-            layer="road_mask",
-        )
-    return RoadMask(grid=data.grid, core=data.core, mask=data.road_mask, outside=beyond_extent(data))
+    return RoadMask(data.grid, data.core, mask, beyond_extent(data), notes=(note,) if note else ())

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
-from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
@@ -26,19 +26,25 @@ class Options(rasterise.Options):
 def segment(data: TileData, options: Options) -> RoadMask:
     """Return the cells whose centre lies on a road of the catalog's vectors, with those on bridges flagged.
 
+    A tile that no file reaches has no road cell; a note says so.
+
     Raises
     ------
     TaskError
-        If the tile has no vectors, they cannot be read, or no cell of its core is road.
+        If the vectors cannot be read.
     """
+    if data.roads is None:
+        note = "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads"
+        nowhere = np.zeros(data.grid.shape, np.bool_)
+        return RoadMask(data.grid, data.core, nowhere, beyond_extent(data), bridge=nowhere, notes=(note,))
     roads = rasterise.roads(data.roads, data.grid, options)
     mask = clean(rasterise.cells(roads.areas, data.grid), data, options.cleanup)
+    notes = roads.notes
     if data.lacks_road(mask):
-        files = ", ".join(path.name for path in data.roads.paths) if data.roads else ""
-        raise TaskError(
-            f"no road of {files} lies on this tile: leave the tile out, or check segment.layer, "
+        files = ", ".join(path.name for path in data.roads.paths)
+        notes += (
+            f"segment: no road of {files} lies on this tile; if there are roads, check segment.layer, "
             "segment.where and segment.left_out",
-            layer="roads",
         )
     return RoadMask(
         grid=data.grid,
@@ -46,5 +52,5 @@ def segment(data: TileData, options: Options) -> RoadMask:
         mask=mask,
         outside=beyond_extent(data),
         bridge=rasterise.cells(roads.areas[roads.bridge], data.grid) & mask,
-        notes=roads.notes,
+        notes=notes,
     )

@@ -117,7 +117,8 @@ def start_heights(
     """Return the control heights to start from, ``(m, n)`` with row 0 in the south, and their mean (m).
 
     With DTM support they are the DTM at the Greville abscissae, else the least-squares plane through the
-    road: the start may not depend on the DTM then.
+    road: the start may not depend on the DTM then. Without a road it is the plane through the DTM, since
+    there is nothing else.
 
     Raises
     ------
@@ -132,11 +133,13 @@ def start_heights(
             _nearest_filled(dtm), np.meshgrid(rows, cols, indexing="ij"), order=1, mode="nearest"
         )
     else:
-        r, c = np.nonzero(road & np.isfinite(dsm))
+        ground = np.where(road, dsm, np.nan)
+        if not np.isfinite(ground).any():
+            ground = dtm
+        r, c = np.nonzero(np.isfinite(ground))
         if not len(r):
-            reason = "empty too" if terrain else "not to be used (fit.terrain)"
-            raise TaskError(f"no filtered road cell has a DSM height to start from, and the DTM is {reason}")
-        level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), dsm[r, c])
+            raise TaskError("no filtered road cell has a DSM height to start from, and the DTM is empty too")
+        level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), ground[r, c])
         heights = level + by_col * cols[None, :] + by_row * rows[:, None]
     return heights, float(heights.mean())
 

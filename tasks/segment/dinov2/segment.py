@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options
-from flexroad.tasks.errors import LayerMissing, TaskError
+from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
@@ -76,8 +76,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     Raises
     ------
     TaskError
-        If the tile has no orthophoto, no cell of its core is road, or head or backbone are missing, damaged
-        or do not fit each other.
+        If the tile has no orthophoto, or head or backbone are missing, damaged or do not fit each other.
     """
     if data.dop is None:
         raise LayerMissing(
@@ -92,11 +91,12 @@ def segment(data: TileData, options: Options) -> RoadMask:
     row, col = photo.grid.cells(*_centres(data.grid))
     threshold = options.threshold or head.about.threshold
     mask = clean(probability[row, col] >= threshold, data, options.cleanup)
+    notes = _notes(photo.known[row, col], coregistration.note(data, photo))
     if data.lacks_road(mask):
-        raise TaskError(
-            f"no road on this tile: probabilities reach {probability[row, col].max():.2f}, the threshold is "
-            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",
-            layer="dop",
+        notes += (
+            f"segment: no road on this tile: probabilities reach {probability[row, col].max():.2f}, the "
+            f"threshold is {threshold:g}; if there are roads, lower segment.threshold, or train on similar "
+            "tiles",
         )
     return RoadMask(
         grid=data.grid,
@@ -104,7 +104,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
         mask=mask,
         outside=beyond_extent(data),
         probability=_mean(probability, photo.grid, data.grid),
-        notes=_notes(photo.known[row, col], coregistration.note(data, photo)),
+        notes=notes,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from flexroad.tasks import options
-from flexroad.tasks.errors import LayerMissing, TaskError
+from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
@@ -47,8 +47,7 @@ def segment(data: TileData, options: Options) -> RoadMask:
     Raises
     ------
     TaskError
-        If the model is missing or damaged, it needs an orthophoto and the tile has none, or no cell of the
-        core is road.
+        If the model is missing or damaged, or it needs an orthophoto and the tile has none.
     """
     model = read_model(options.model)
     photo = _photo(data, model.about, options.model)
@@ -56,14 +55,13 @@ def segment(data: TileData, options: Options) -> RoadMask:
     probability = model.probability(features(data, photo), ~beyond)
     threshold = options.threshold or model.about.threshold
     mask = clean(probability >= threshold, data, options.cleanup)
+    notes = _notes(data, photo, model.about)
     if data.lacks_road(mask):
         highest = probability[data.grid.window(data.core)].max()
-        raise TaskError(
-            f"no road on this tile: probabilities reach {highest:.2f}, the threshold is "
-            f"{threshold:g}; leave the tile out, lower segment.threshold, or train on similar tiles",
-            layer="dop" if photo else "dsm",
+        notes += (
+            f"segment: no road on this tile: probabilities reach {highest:.2f}, the threshold is "
+            f"{threshold:g}; if there are roads, lower segment.threshold, or train on similar tiles",
         )
-    notes = _notes(data, photo, model.about)
     return RoadMask(data.grid, data.core, mask, beyond, probability=probability, notes=notes)
 
 

@@ -23,7 +23,7 @@ def run(made_survey, quick_config, tmp_path) -> Run:
     one, two, three, four = (tile.id for tile in catalog.tiles)
     states = [(one, "done"), (two, "cached"), (three, "failed"), (four, "pending")]
     rows = tuple(
-        {"variant": name, "error_estimate_m": estimate}
+        {"variant": name, "error_estimate_m": estimate, "flags": "patch" if name == "flexroad" else ""}
         for name, estimate in (("rgt", 9.0), ("flexroad", 0.25))
     )
     with RunDatabase.open(run.path / NAME) as database:
@@ -44,7 +44,7 @@ def test_write_states_is_read_by_gdal(run, tmp_path):
     assert table.state.tolist() == ["done", "cached", "failed", "pending"]
     done, _, failed, pending = table.itertuples()
     # The error estimate is that of the exported surface, not of the baselines.
-    assert (done.error_estimate_m, done.seconds) == (0.25, 1.5)
+    assert (done.error_estimate_m, done.flags, done.seconds) == (0.25, "patch", 1.5)
     assert done.finished.isoformat() == "2026-11-21T02:00:00+00:00"
     assert failed.error == "load: TaskError: no, file"
     assert table.loc[pending.Index, ["error", "seconds", "error_estimate_m", "finished"]].isna().all()

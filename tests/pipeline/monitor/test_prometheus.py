@@ -50,12 +50,14 @@ def test_textfile_shows_states_during_and_after_run(tmp_path):
         assert running["flexroad_stage_seconds", "fit"] == 3
         assert running["flexroad_worker_peak_bytes", ""] == 100 * 2**20
         assert ("flexroad_run_exit_code", "") not in running
-        textfile.ended(1, Summary(7, 5, 1, 3, 1, 0, 0, 0, 1.0, ()))
+        assert running["flexroad_tiles_without_roads", ""] == 0
+        textfile.ended(1, Summary(7, 5, 1, 3, 1, without_roads=2))
     ended = read(path)
     assert ended["flexroad_run_running", ""] == 0
     assert ended["flexroad_run_exit_code", ""] == 1
     assert ended["flexroad_run_end_time_seconds", ""] >= ended["flexroad_run_start_time_seconds", ""]
     assert tiles(ended) == {"done": 2, "cached": 3, "failed": 1, "pending": 1}
+    assert ended["flexroad_tiles_without_roads", ""] == 2
     assert [file.name for file in tmp_path.iterdir()] == ["run.prom"]
 
 

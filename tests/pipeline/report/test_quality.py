@@ -42,7 +42,8 @@ def test_highest_error_estimates_are_sorted_and_without_nan():
 
 
 def test_over_tiles_gives_means_and_counts_flagged_tiles():
-    row = over_tiles(rows([0.1, 0.2, 0.6], ["", "spike", "error-estimate"]), ["flexroad"]).iloc[0]
+    metrics = rows([0.1, 0.2, 0.6, np.nan], ["", "spike", "error-estimate", "no-road"])
+    row = over_tiles(metrics, ["flexroad"]).iloc[0]
     assert row["error estimate (m)"] == pytest.approx(0.3)
     assert row["flagged tiles"] == 2
 

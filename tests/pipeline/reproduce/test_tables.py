@@ -67,6 +67,19 @@ def as_published(tiles: int = 3, classes: str = "segmented") -> MetricsData:
     )
 
 
+def test_tiles_without_roads_are_left_out_of_road_figures_and_counted():
+    whole = as_published(4)
+    assert "without roads" not in whole.line
+    rows = whole.rows.copy()
+    rows.loc[rows.tile_id == "t0", ["l2_road_m", "mad_road_deg"]] = np.nan
+    part = MetricsData(rows)
+    assert part.line == whole.line[:-1] + "; 1 without roads, left out of the figures of roads."
+    ours = compare(part).numbers.set_index(["table", "variant", "figure"]).ours
+    theirs = compare(whole).numbers.set_index(["table", "variant", "figure"]).ours
+    pd.testing.assert_series_equal(ours, theirs)
+    assert part.line in pages(part)["tables.md"]
+
+
 def test_bootstrap_means_ignore_nan():
     means = bootstrap(figures({"a": [1.0, 3.0, np.nan], "b": [2.0, 2.0, 5.0]}))
     assert means.mean["a", "l2_road_m"] == 2

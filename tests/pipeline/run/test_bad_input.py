@@ -139,10 +139,6 @@ def _rotated(tile: Tile) -> None:
     rewrite(tile, "dsm", values(layer(tile, "dsm")), transform=turned)
 
 
-def _no_road(tile: Tile) -> None:
-    rewrite(tile, "road_mask", np.zeros(tile.grid.shape, np.uint8))
-
-
 @dataclass(frozen=True)
 class Fault:
     damage: object
@@ -170,7 +166,6 @@ FAULTS = (
     Fault(_absurd, "dsm", "has only nodata on this tile; leave the tile out"),
     Fault(_bare_mask, "road_mask", "no georeference and has 30 x 30 cells, the tile 60 x 60; give it"),
     Fault(_rotated, "dsm", "is rotated; turn it north up with gdalwarp"),
-    Fault(_no_road, "road_mask", "no road cell on this tile: leave the tile out", stage="segment"),
 )
 
 
@@ -233,7 +228,6 @@ def test_truncated_file_fails_only_its_tile_of_several_that_list_it(name, run, f
 @pytest.mark.parametrize(
     ("name", "stage", "message"),
     [
-        ("road_mask", "segment", "no road mask layer in the catalog and none configured: give --road-mask"),
         ("dsm", "load", "the tile has no dsm; give its files to `flexroad catalog` with --dsm"),
         ("dtm", "load", "the tile has no dtm; give its files to `flexroad catalog` with --dtm"),
     ],
@@ -242,23 +236,8 @@ def test_tile_without_layer_fails_alone(name, stage, message, run, flexroad, sur
     tiles = list(Catalog.read(survey).tiles)
     tiles[1] = replace(tiles[1], layers=tuple(layer for layer in tiles[1].layers if layer.name != name))
     Catalog(tuple(tiles)).write(survey)
-    kind = "LayerMissing" if name == "road_mask" else "TaskError"
-    fault = Fault(None, name, message, stage, kind)
+    fault = Fault(None, name, message, stage)
     assert_only_tile_failed(run(), tiles[1], fault, flexroad, tmp_path / "run", "")
-
-
-def test_road_only_in_halo_fails_tile(run, survey, tmp_path):
-    tile = Catalog.read(survey).tiles[1]
-    mask = np.zeros((100, 100), np.uint8)
-    mask[:, :15] = 1
-    rewrite(tile, "road_mask", mask, west=tile.grid.west - 20, north=tile.grid.north + 20)
-    config = tmp_path / "halo.yaml"
-    config.write_text("load: {halo_m: 20}\nfit: {control_points: [8, 8], iterations: 3}\n")
-    result = run(config=config)
-    assert result.code == 1
-    (line,) = result.errors
-    assert line.startswith(f"failed {tile.id}: segment: TaskError: the road mask has no road cell")
-    assert line.endswith(f"[{layer(tile, 'road_mask')}]")
 
 
 # --- unusual but valid input --------------------------------------------------------------------------

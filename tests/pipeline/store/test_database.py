@@ -148,6 +148,7 @@ def test_entry_of_earlier_write_is_not_taken(full):
         "UPDATE asked SET standing = 'done' WHERE tile = '3_3'",
         "UPDATE asked SET standing = CAST(x'ff' AS TEXT) WHERE tile = '3_3'",
         "UPDATE asked SET finished = '' WHERE tile = '3_3'",
+        "UPDATE asked SET roadless = 1 WHERE tile = '3_3'",
         "UPDATE asked SET position = 5000 WHERE tile = '3_3'",
         "UPDATE asked SET checksum = x'00' WHERE tile = '3_3'",
         "DELETE FROM asked WHERE tile = '3_3'",
@@ -179,7 +180,7 @@ def test_list_of_earlier_write_is_noticed(full):
         assert database.listed(TILES) is not None
         assert list(database.states())[4] == "failed"
     with contextlib.closing(sqlite3.connect(full)) as connection, connection:
-        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?)", old)
+        connection.execute("INSERT OR REPLACE INTO asked VALUES (?, ?, ?, ?, ?, ?, ?)", old)
     with RunDatabase.open_readonly(full) as database:
         assert database.listed(TILES) is None
 

@@ -35,7 +35,7 @@ def made_world(stratum):
 def part(world, grid, core):
     window = world.grid.window(grid)
     dsm, dtm, road = (values[window] for values in (world.dsm, world.dtm, world.road_mask))
-    return TileData("part", grid, core, dsm, dtm, road, border=True)
+    return TileData("part", grid, core, dsm, dtm, road)
 
 
 def filtered(data):
@@ -79,7 +79,7 @@ def joined(surfaces):
 
 def fit_together(world):
     """Return the control heights of one precise fit of the whole world, on the same lattice."""
-    data = replace(world, border=True)
+    data = world
     options = OPTIONS.model_copy(update={"stop_tolerance": 1e-8})
     lattice = smoothing_spline._lattice((250, 250), 1.0, options)
     (n, m), (k, j) = lattice.intervals, lattice.lines_within(AROUND_M)

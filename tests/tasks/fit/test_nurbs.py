@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.fit import nurbs
+from flexroad.tasks.fit import nurbs, plane
 from flexroad.tasks.spline import adam, torch_engine
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space
@@ -272,6 +272,15 @@ def test_fit_without_terrain_ignores_dtm():
     np.testing.assert_allclose(on_cells(fitted(data, one, terrain=False), data), data.dsm[50, 50], atol=1e-9)
 
 
+def test_fit_without_terrain_and_road_is_plane_through_dtm():
+    data, clusters, _ = tile(noise=0.02)
+    empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
+    flat = plane.fit(data, empty, plane.Options())
+    np.testing.assert_allclose(
+        on_cells(fitted(data, empty, terrain=False), data), on_cells(flat, data), atol=1e-9
+    )
+
+
 def test_fit_missing_dtm_starts_from_road():
     data, clusters, truth = tile(noise=0.02)
     data.dtm[:] = np.nan
@@ -298,9 +307,6 @@ def test_fit_impossible_input_raises():
     no_heights = replace(data, dsm=np.full((10, 10), np.nan), dtm=np.full((10, 10), np.nan))
     with pytest.raises(TaskError, match="no filtered road cell has a DSM height to start from.* empty too"):
         fitted(no_heights, clusters, control_points=(4, 4))
-    empty = RoadClusters(data.grid, np.zeros_like(clusters.labels))
-    with pytest.raises(TaskError, match=r"the DTM is not to be used \(fit.terrain\)"):
-        fitted(data, empty, terrain=False, control_points=(4, 4))
     row, road, _ = tile(shape=(1, 400))
     with pytest.raises(TaskError, match="at least 2 x 2 cells, not 400 x 1"):
         fitted(row, road, control_points=(4, 4))

@@ -151,11 +151,17 @@ def test_assess_plane_has_all_figures_but_weights():
 def test_assess_without_road_or_data():
     no_road = assessed(tile(), GivenHeights(TRUTH), road=NOWHERE)
     assert no_road.flags == (NO_ROAD,)
-    assert np.isnan([getattr(no_road, name) for name in FLOATS if name != "suspect_m2"]).all()
+    assert np.isnan([getattr(no_road, name) for name in FLOATS]).all()
     no_heights = np.full(GRID.shape, np.nan)
     no_data = assessed(tile(no_heights, no_heights), GivenHeights(TRUTH), kept=NOWHERE)
-    assert {"inferred", "error-estimate", "dropped"} <= set(no_data.flags)
+    assert {NO_ROAD, "inferred", "error-estimate", "dropped"} <= set(no_data.flags)
     assert assessed(tile(), GivenHeights(no_heights)).error_estimate_m != 0
+
+
+def test_assess_road_dropped_by_filter_has_figures_and_both_flags():
+    dropped = assessed(tile(), None, kept=NOWHERE)
+    assert dropped.flags == (NO_ROAD, "dropped")
+    assert (dropped.dropped_road, dropped.suspect_m2) == (1, 0)
 
 
 def test_assess_ignores_reference():

@@ -1,10 +1,8 @@
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
 from flexroad.catalog import Grid
-from flexroad.tasks import TaskError
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.segment.mask import Options, segment
 from flexroad.tasks.types import TileData
@@ -29,18 +27,24 @@ def test_segment_returns_mask_unchanged():
     assert not road.outside.any()
 
 
-def test_segment_no_mask_names_remedy():
-    with pytest.raises(TaskError, match="give --road-mask"):
-        segment(data(), Options())
+def test_segment_tile_beyond_mask_has_no_road_and_a_note():
+    road = segment(data(), Options())
+    assert road.mask.shape == CORE.shape
+    assert not road.mask.any()
+    assert road.notes == ("segment: no road mask reaches this tile, so it counts as a tile without roads",)
 
 
-def test_segment_road_only_in_halo_raises():
+def test_segment_road_only_in_halo_is_kept_with_a_note():
     mask = np.zeros((10, 12), bool)
     mask[0] = True
-    with pytest.raises(TaskError, match="no road cell on this tile: .* --road-value"):
-        segment(data(mask=mask, halo=2), Options())
+    road = segment(data(mask=mask, halo=2), Options())
+    np.testing.assert_array_equal(road.mask, mask)
+    (note,) = road.notes
+    assert "no road cell on this tile; " in note
+    assert "--road-value" in note
     mask[5, 5] = True
-    assert segment(data(mask=mask, halo=2), Options()).mask.sum() == 13
+    road = segment(data(mask=mask, halo=2), Options())
+    assert (road.mask.sum(), road.notes) == (13, ())
 
 
 def test_beyond_extent_is_void_connected_to_edge():

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from shapely import LineString, box
@@ -60,12 +62,20 @@ def test_segment_line_beside_tile_covers_cells_within_half_width(tmp_path):
     assert segment(tile(path), Options()).mask.sum() == 200
 
 
-def test_segment_road_only_in_halo_raises(tmp_path):
+def test_segment_road_only_in_halo_is_kept_with_a_note(tmp_path):
     core = GRID
     path = write(tmp_path / "r.gpkg", [LineString(on_grid((0, -10), (100, -10)))], width=[6])
-    with pytest.raises(TaskError, match="no road of r.gpkg lies on this tile: .*segment.where") as caught:
-        segment(tile(path, grid=core.buffered(20), core=core), Options())
-    assert caught.value.layer == "roads"
+    road = segment(tile(path, grid=core.buffered(20), core=core), Options())
+    assert road.mask.sum() == 600
+    assert re.match("segment: no road of r.gpkg lies on this tile; .*segment.where", road.notes[-1])
+
+
+@pytest.mark.parametrize(("crs", "options"), [("EPSG:25832", {"where": "id = 7"}), ("EPSG:3857", {})])
+def test_segment_no_road_on_tile_gives_empty_mask_and_note(tmp_path, crs, options):
+    path = write(tmp_path / "r.gpkg", [LINE], crs)
+    road = segment(tile(path), Options(**options))
+    assert not road.mask.any()
+    assert "no road of r.gpkg lies on this tile" in road.notes[-1]
 
 
 def test_segment_several_files_are_merged(tmp_path):
@@ -81,8 +91,6 @@ def test_segment_several_files_are_merged(tmp_path):
         (lambda path: path.write_text("roads"), {}, "is not a vector file"),
         (lambda path: write(path, [LINE]), {"layer": "ways"}, "has no layer 'ways'; there are r"),
         (lambda path: write(path, [LINE]), {"where": "kind = 1"}, "cannot be read as roads: .*segment.where"),
-        (lambda path: write(path, [LINE]), {"where": "id = 7"}, "no road of r.gpkg lies on this tile"),
-        (lambda path: write(path, [LINE], "EPSG:3857"), {}, "no road of r.gpkg lies on this tile"),
         (lambda path: path.write_bytes(b"SQLite format 3\0" + bytes(4000)), {}, "is not a vector file"),
     ],
 )  # fmt: skip
@@ -111,9 +119,13 @@ def test_segment_truncated_file_raises(tmp_path):
         segment(tile(path), Options())
 
 
-def test_segment_no_vectors_names_remedy():
-    with pytest.raises(TaskError, match="no roads layer in the catalog: give a vector file with --roads"):
-        segment(tile(), Options())
+def test_segment_tile_that_no_file_reaches_has_no_road_and_a_note():
+    road = segment(tile(), Options())
+    assert not road.mask.any()
+    assert not road.bridge.any()
+    assert road.notes == (
+        "segment: no file of the roads layer reaches this tile, so it counts as a tile without roads",
+    )
 
 
 def test_segment_golden(tmp_path):

@@ -281,12 +281,13 @@ def test_segment_shifted_photo_adds_note(heads, sample, monkeypatch):
     assert note == f"{sample.data.tile_id}: {read_head(heads[0]).about.gsd_m:g} m"
 
 
-def test_segment_no_road_raises(heads, sample):
+def test_segment_no_road_gives_empty_mask_and_note(heads, sample):
     head = read_head(heads[0])
     blind = heads[0].with_name("blind.safetensors")
     blind.write_bytes(Head(head.weight * 0, head.bias * 0 - 1, head.about).encode())
-    with pytest.raises(TaskError, match=r"no road on this tile: probabilities reach 0.27, the threshold"):
-        segmented(sample.data, blind)
+    road = segmented(sample.data, blind)
+    assert not road.mask.any()
+    assert "no road on this tile: probabilities reach 0.27, the threshold" in road.notes[-1]
 
 
 # --- missing or incompatible files --------------------------------------------------------------------

@@ -147,10 +147,15 @@ def test_segment_void_beyond_survey_is_no_road(samples, model):
     assert result.outside[:, :40].all()
 
 
+def test_segment_no_road_gives_empty_mask_and_note(samples, model):
+    road = segment(samples[5].data, Options(model=model, threshold=0.9999))
+    assert not road.mask.any()
+    assert "no road on this tile: probabilities reach" in road.notes[-1]
+
+
 def test_segment_and_train_unusable_tile_raises(samples, model):
     error = fails("no orthophoto .* was trained with colours", without_photo(samples[5]).data, model=model)
     assert error.layer == "dop"
-    fails("no road on this tile: probabilities reach", samples[5].data, model=model, threshold=0.9999)
     with pytest.raises(TaskError, match="has no orthophoto"):
         training.train([samples[0], without_photo(samples[1])], samples[2:3], QUICK)
     with pytest.raises(TaskError, match="no labels of both road and other ground"):

@@ -1,0 +1,162 @@
+"""Tiles without roads are done: they have the terrain's surface, a flag, and no figures of roads."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+import trimesh
+
+from flexroad.catalog import Catalog
+from flexroad.catalog.sources import rasters
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.report.content import WITH_ROADS, gather
+from flexroad.pipeline.report.steps import edge_steps
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.status import open_database, recorded_summary, summary
+from flexroad.pipeline.store.tables import read_metrics
+from flexroad.pipeline.worker.tile import QUALITY
+from flexroad.tasks.export import npz
+from flexroad.tasks.quality.assess import NO_ROAD
+from tests.conftest import QUICK
+from tests.whole_run import LIGHT
+
+BARE = (0, 3)
+"""Numbers of the tiles without roads: opposite corners of the survey, each beside two tiles with roads."""
+OF_ROADS = ("l2_road_m", "rmse_road_m", "nmad_road_m", "p95_road_m", "mad_road_deg", *QUALITY)
+ENDS = (".glb", ".ply", "_height.tif", "_road.tif", "_surface.npz")
+MASKS = ("road_mask", "reference_road")
+
+
+def clear(tile, names=MASKS):
+    """Take the road from the masks of a tile."""
+    for name in names:
+        (path,) = tile.paths(tile.layer(name).reaching(tile.grid.bounds))
+        with rasterio.open(path, "r+") as raster:
+            raster.write(np.zeros((1, *raster.shape), raster.dtypes[0]))
+
+
+@pytest.fixture
+def half(survey) -> Catalog:
+    """A survey of four tiles, two of them without roads."""
+    catalog = Catalog.read(survey)
+    for number in BARE:
+        clear(catalog.tiles[number])
+    return catalog
+
+
+def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, executor):
+    run = Run.create(tmp_path / "run", compose(QUICK, "quick"), half)
+    for cached in (0, 4):
+        result = run_tiles(run, executor)
+        assert (result.done, result.cached, result.without_roads, result.exit_code) == (4, cached, 2, 0)
+    assert summary(run).without_roads == 2
+    with open_database(run) as database:
+        assert recorded_summary(run, database, "")[0].without_roads == 2
+    rows = read_metrics(run.path)
+    bare = rows.tile_id.isin([half.tiles[number].id for number in BARE])
+    assert set(rows.status) == {"done"}
+    assert set(rows[bare]["flags"]) == {NO_ROAD}
+    assert not rows[~bare]["flags"].str.contains(NO_ROAD).any()
+    assert rows[bare][[*OF_ROADS]].drop(columns="bounded_weights").isna().all(axis=None)
+    assert rows[bare][["l2_terrain_m", "mad_terrain_deg", "triangles"]].notna().all(axis=None)
+    assert (rows[bare].road_fraction == 0).all()
+    assert rows[~bare].l2_road_m.notna().all()
+    content = gather(run)
+    assert content.state.startswith("Tiles: 4 done (2 of them without roads")
+    table = content.main.set_index("method")
+    assert set(table.tiles) == {4}
+    assert set(table[WITH_ROADS]) == {2}
+    mine = rows[~bare & (rows.variant == "flexroad")]
+    assert table["L2 road (m)"]["flexroad"] == pytest.approx(mine.l2_road_m.mean())
+    assert len(content.worst) == 2
+
+
+def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
+    run = Run.create(tmp_path / "run", load_config("nightly"), half)
+    assert run_tiles(run, SerialExecutor()).exit_code == 0
+    tile = half.tiles[BARE[0]]
+    product = {end: run.folder(tile.id).path / f"{tile.id}_flexroad{end}" for end in ENDS}
+    assert set(trimesh.load(product[".glb"]).geometry) == {"terrain"}
+    faces = len(trimesh.load(product[".ply"]).faces)
+    assert faces == read_metrics(run.path).set_index("tile_id").triangles[tile.id]
+    heights, road = (rasterio.open(product[f"_{kind}.tif"]).read(1) for kind in ("height", "road"))
+    assert not road.any()
+    (path,) = tile.paths(tile.layer("dtm").reaching(tile.grid.bounds))
+    assert np.abs(heights - rasterio.open(path).read(1)).mean() < 0.05
+    east, north = np.meshgrid(tile.grid.eastings, tile.grid.northings)
+    surface = npz.decode(product["_surface.npz"].read_bytes())
+    np.testing.assert_allclose(surface.height(east, north), heights, atol=1e-3)
+    # The tile and its neighbours with roads are one surface.
+    steps = edge_steps(run)
+    assert list(steps.check.result) == ["one surface: all differences are exactly 0"]
+    assert list(steps.check.edges) == [4]
+
+
+def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
+    config, out = tmp_path / "light.yaml", tmp_path / "run"
+    config.write_text(json.dumps(LIGHT))
+    where = half.tiles[0].root + "/catalog.parquet"
+    words = ["run", "--config", config, "--catalog", where, "--out", out, "--executor", "serial"]
+    alone = flexroad(*words, "--tile", half.tiles[BARE[0]].id).expected(0)
+    assert "warning: no tile of this run has a road; if there are roads, check the road source" in alone.err
+    prometheus = tmp_path / "run.prom"
+    said = flexroad(*words, "--prometheus", prometheus).expected(0)
+    line = "4 tiles: 4 done (1 cached, 2 without roads), 0 failed, 0 pending"
+    assert line in said.out
+    assert "warning" not in said.err
+    assert line in flexroad("status", out).out
+    assert json.loads(flexroad("status", out, "--json").out)["without_roads"] == 2
+    written = json.loads((out / "summary.json").read_text())
+    assert (written["without_roads"], written["exit_code"]) == (2, 0)
+    assert "flexroad_tiles_without_roads{" in prometheus.read_text()
+    states = json.loads((out / "tiles.geojson").read_text())["features"]
+    assert [state["properties"]["flags"] == NO_ROAD for state in states] == [
+        number in BARE for number in range(4)
+    ]
+    flexroad("report", out, "--format", "md").expected(0)
+    assert "| method | tiles | with roads |" in (out / "report.md").read_text()
+
+
+@pytest.mark.parametrize("method", ["paper", "planar"])
+def test_tile_whose_road_the_filter_drops_is_done_and_flagged(method, survey, tmp_path):
+    filtered = {**LIGHT, "ecsrc": {"method": method, "min_area_m2": 1e6}}
+    filtered["variants"] = {"flexroad": {}, "wo_dtm": {"fit": {"terrain": False}}, "plane": {"fit": "plane"}}
+    catalog = Catalog.read(survey)
+    run = Run.create(tmp_path / "run", compose(filtered, "light"), replace(catalog, tiles=catalog.tiles[:1]))
+    result = run_tiles(run, SerialExecutor())
+    assert (result.done, result.without_roads, result.exit_code) == (1, 1, 0)
+    rows = read_metrics(run.path)
+    assert rows["flags"].str.startswith(f"{NO_ROAD}, ").all()
+    assert rows["flags"].str.contains("dropped").all()
+    # The raw mask still classes the cells, so that no filter looks better for what it drops.
+    assert rows.l2_road_m.notna().all()
+
+
+def test_tiles_that_no_mask_reaches_are_done_and_meet_the_others(survey, tmp_path):
+    folder = survey.parent
+    for number in BARE:
+        (folder / "road_mask" / f"{Catalog.read(survey).tiles[number].id}.tif").unlink()
+    patterns = {name: f"{name}/*.tif" for name in ("dsm", "dtm", "road_mask")}
+    tiles = rasters.index(folder, patterns, tile_size_m=60).tiles
+    assert [tile.layer("road_mask") is None for tile in tiles] == [number in BARE for number in range(4)]
+    run = Run.create(tmp_path / "run", load_config("nightly"), Catalog(tiles))
+    result = run_tiles(run, SerialExecutor())
+    assert (result.done, result.without_roads, result.exit_code) == (4, 2, 0)
+    assert list(edge_steps(run).check.result) == ["one surface: all differences are exactly 0"]
+
+
+def test_tile_that_no_mask_reaches_is_done_with_a_note(survey, tmp_path):
+    tile = Catalog.read(survey).tiles[0]
+    tile = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "road_mask"))
+    run = Run.create(tmp_path / "run", compose(LIGHT, "light"), Catalog((tile,)))
+    results = []
+    assert run_tiles(run, SerialExecutor(), watch=results.append).without_roads == 1
+    assert results[0].notes == (
+        "segment: no road mask reaches this tile, so it counts as a tile without roads",
+    )
+    # A road of the true mask that no segmenter found is measured.
+    assert read_metrics(run.path).l2_road_m.notna().all()
