@@ -111,11 +111,7 @@ def gather(run: Run) -> Content:
 
 
 def _state(counts: Summary) -> str:
-    without = (
-        f" ({counts.without_roads} of them without roads: they have no figures of roads)"
-        if counts.without_roads
-        else ""
-    )
+    without = f" ({counts.without_roads} of them without roads)" if counts.without_roads else ""
     return f"Tiles: {counts.done} done{without}, {counts.failed} failed, {counts.pending} pending"
 
 

@@ -123,14 +123,14 @@ def assess(
         "off_dtm_road": mean(np.abs(to_dtm) > options.agree_m),
         "bounded_weights": _share_at_bound(surface),
         "error_estimate_m": mean(_finite(estimate[on_road])),
-        "suspect_m2": _largest_patch(on_road & (estimate > options.agree_m)) * cell**2
-        if on_road.any()
-        else float("nan"),
+        "suspect_m2": _largest_patch(on_road & (estimate > options.agree_m)) * cell**2,
     }
-    # Without road cells all figures but the surface's weights are NaN, and none exceeds a threshold.
-    flags = [] if kept.any() else [NO_ROAD]
-    if on_road.any():
-        flags += [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
+    flags = [flag for flag, name in FLAGS.items() if figures[name] > getattr(options, name)]
+    if not on_road.any():
+        figures["suspect_m2"] = float("nan")
+        flags = []
+    if not kept.any():
+        flags = [NO_ROAD, *flags]
     return Quality(**figures, flags=tuple(flags), support=classes)
 
 
