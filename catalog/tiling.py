@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from flexroad.catalog.cover import MIN_COVER, height_share
 from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
@@ -61,7 +62,7 @@ def cut(
     tile_size_m: float = 250,
     date: datetime | None = None,
     crs: str | None = None,
-    min_cover: float = 0.25,
+    min_cover: float = MIN_COVER,
     dataset: str = "",
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
@@ -82,7 +83,8 @@ def cut(
     crs : str, optional
         CRS of files without one.
     min_cover : float
-        Tiles of which the DSM files cover less than this share (0 to 1) are left out.
+        Tiles with a DSM height in less than this share (0 to 1) of their cells are left out, as
+        `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
     dataset : str
         Name of the data in reports.
 
@@ -98,7 +100,7 @@ def cut(
     notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs)]
 
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
-    grids, left_out = _covered(grids, _near(grids, placed["dsm"]), min_cover)
+    grids, left_out = _covered(root, grids, _near(grids, placed["dsm"]), min_cover)
     near = {name: _near(grids, files) for name, files in placed.items()}
     # Of the whole layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
@@ -177,22 +179,38 @@ def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, 
 
 
 def _covered(
-    grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float
+    root: Path, grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float
 ) -> tuple[dict[str, Grid], list[str]]:
-    """Return the tiles of which the DSM files cover at least ``min_cover``, and a note on the others."""
-    cover = {
-        tile_id: _area(near[tile_id].shared) / (grid.width * grid.cell) ** 2
-        for tile_id, grid in grids.items()
-    }
-    kept = {tile_id: grid for tile_id, grid in grids.items() if cover[tile_id] >= max(min_cover, 1e-9)}
-    thin = [tile_id for tile_id in grids if 0 < cover[tile_id] < min_cover]
+    """Return the tiles of which the DSM covers at least ``min_cover``, and notes on the others."""
+    kept, thin, risky = dict[str, Grid](), list[str](), list[str]()
+    for tile_id, grid in grids.items():
+        cover = _cover(root, grid, near[tile_id], min_cover)
+        if cover >= max(min_cover, 1e-9):
+            kept[tile_id] = grid
+            risky += [tile_id] if min_cover and cover < MIN_COVER else []
+        elif cover:
+            thin.append(tile_id)
     note = (
-        f"left out {_count(thin)} covered less than {min_cover:.0%} by the DSM "
+        f"left out {_count(thin)} with a DSM height in less than {min_cover:.0%} of the cells "
         f"(--min-cover 0 keeps them): {some(thin)}"
     )
     if not kept:
         raise CatalogError(f"no tile is left: {note}")
-    return kept, [note] if thin else []
+    below = (
+        f"{_count(risky)} with a DSM height in less than {MIN_COVER:.0%} of the cells will fail, "
+        f"unless the configuration sets load: {{min_valid: {min_cover:g}}}: {some(risky)}"
+    )
+    return kept, [note] * bool(thin) + [below] * bool(risky)
+
+
+def _cover(root: Path, grid: Grid, near: _NearFiles, min_cover: float) -> float:
+    """Return the share of a tile that the DSM covers: by heights, or by the extents of the files."""
+    by_extents = _area(near.shared) / (grid.width * grid.cell) ** 2
+    if not min_cover or by_extents < min_cover or any(not same(file.crs, grid.crs) for file in near.in_core):
+        return by_extents
+    # What a VRT names was checked when the files were found.
+    by_heights = height_share(grid, [root / file.name for file in near.in_core])
+    return by_extents if by_heights is None else by_heights
 
 
 def _area(boxes: NDArray[np.float64]) -> float:

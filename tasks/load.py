@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import Unit, height_unit
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import HEIGHTS
@@ -30,6 +31,8 @@ VERSION = 3
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES
 """Layers that are read; of other layers the result holds only the file names."""
+NEEDS = ("dsm", "dtm")
+"""Layers without which a tile fails."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights outside this range are taken as undeclared nodata."""
@@ -59,7 +62,10 @@ class Options(options.Options):
         "0 in the paper; catalogs of rasters and of prepared tiles list the files up to 200 m around a tile",
     )
     min_valid: float = Field(
-        0.25, ge=0, le=1, description="share of the tile's cells that need a DSM height, or the tile fails"
+        MIN_COVER,
+        ge=0,
+        le=1,
+        description="share of the tile's cells that need a DSM height, or the tile fails",
     )
 
 
@@ -93,7 +99,7 @@ def load(tile: Tile, options: Options) -> TileData:
     """
     if tile.fault:
         raise TaskError(tile.fault)
-    for name in ("dsm", "dtm"):
+    for name in NEEDS:
         if tile.layer(name) is None:
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")
     from flexroad.catalog.headers.rasters import quiet

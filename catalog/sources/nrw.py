@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flexroad.catalog.bridges import deck_raster
+from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
@@ -66,9 +67,10 @@ def index(
     road_values: tuple[int, ...] = (),
     tile_size_m: float = 250,
     date: datetime | None = None,
-    min_cover: float = 0.25,
+    min_cover: float = MIN_COVER,
     derived: Path | None = None,
     roads: str | None = None,
+    allow: Sequence[str] = (),
 ) -> TilingResult:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one is used.
 
@@ -85,12 +87,14 @@ def index(
     date : datetime, optional
         Date of the survey; overrides the dates in names and tags.
     min_cover : float
-        Tiles of which the surface model covers less than this share (0 to 1) are left out.
+        Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
     derived : Path, optional
         Folder for rasters of the bridge points (class 17) of the point clouds; together with the terrain
         model they are the paper's extended DTM. If None, the clouds are not read, and a note is added.
     roads : str, optional
         Vector files of roads: a file, or a glob pattern relative to ``root``.
+    allow : sequence of str
+        Folders besides ``root`` that the files named by a VRT of the mask may lie below.
 
     Raises
     ------
@@ -116,7 +120,7 @@ def index(
             f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {_hint(root, notes)}"
         )
     if road_mask is not None:
-        layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS)
+        layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
         notes += skipped
     indexed = cut(
         root,

@@ -7,6 +7,7 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
+from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
@@ -22,7 +23,7 @@ def index(
     tile_size_m: float = 250,
     date: datetime | None = None,
     crs: str | None = None,
-    min_cover: float = 0.25,
+    min_cover: float = MIN_COVER,
     allow: Sequence[str] = (),
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
@@ -43,7 +44,7 @@ def index(
     crs : str, optional
         CRS of files without one.
     min_cover : float
-        Tiles of which the DSM files cover less than this share (0 to 1) are left out.
+        Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
     allow : sequence of str
         Folders besides ``root`` that the files named by a VRT may lie below.
 

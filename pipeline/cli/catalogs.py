@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexroad.pipeline.cli.command import Allow, Command
-from flexroad.pipeline.cli.run import next_run
+from flexroad.catalog.cover import MIN_COVER
+from flexroad.pipeline.cli.command import MIN_COVER_HELP, Allow, Command
+from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 
 if TYPE_CHECKING:
@@ -25,9 +26,7 @@ Roads = Annotated[
     str | None, typer.Option(help="Vector files of roads: a file, or a pattern relative to ROOT.")
 ]
 TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
-MinCover = Annotated[
-    float, typer.Option(min=0, max=1, help="Leave out tiles with less than this fraction of data.")
-]
+MinCover = Annotated[float, typer.Option(min=0, max=1, help=MIN_COVER_HELP)]
 Date = Annotated[datetime | None, typer.Option(help="Date of the survey.")]
 
 
@@ -48,7 +47,7 @@ def catalog_rasters(
         str | None, typer.Option(help="Files of the reference road mask, for the evaluation.")
     ] = None,
     tile_size: TileSize = 250,
-    min_cover: MinCover = 0.25,
+    min_cover: MinCover = MIN_COVER,
     date: Date = None,
     crs: Annotated[str | None, typer.Option(help="CRS of files without one: EPSG:25832.")] = None,
     allow: Allow = None,
@@ -86,8 +85,9 @@ def catalog_nrw(
     road_value: RoadValue = None,
     roads: Roads = None,
     tile_size: TileSize = 250,
-    min_cover: MinCover = 0.25,
+    min_cover: MinCover = MIN_COVER,
     date: Date = None,
+    allow: Allow = None,
 ) -> None:
     """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
     from flexroad.catalog.sources import nrw
@@ -101,6 +101,7 @@ def catalog_nrw(
         min_cover=min_cover,
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
+        allow=allow or (),
     )
     _write_catalog(result, output)
 
@@ -118,7 +119,7 @@ def catalog_gerod(
     from flexroad.catalog.sources import gerod
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output)
+    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output, layout)
 
 
 @catalogs.command("dsc3d")
@@ -134,10 +135,10 @@ def catalog_dsc3d(
     from flexroad.catalog.sources import dsc3d
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output)
+    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output, layout)
 
 
-def _write_catalog(result: TilingResult, output: Path) -> None:
+def _write_catalog(result: TilingResult, output: Path, config: str | None = None) -> None:
     from flexroad.catalog import Catalog
 
     for note in result.notes:
@@ -145,7 +146,7 @@ def _write_catalog(result: TilingResult, output: Path) -> None:
     catalog = Catalog(result.tiles)
     catalog.write(output)
     echo(f"{len(catalog.tiles)} tiles in {output}")
-    echo(f"next: {next_run(output)}")
+    echo(after_catalog(output, config))
 
 
 @catalogs.command("synthetic")
@@ -170,7 +171,7 @@ def catalog_synthetic(
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     echo(f"{len(Catalog.read(path).tiles)} tiles in {path}")
-    echo(f"next: {next_run(path)}")
+    echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 
 
 @catalogs.command("show")
@@ -192,13 +193,21 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
 
 
 @catalogs.command("check")
-def catalog_check(path: Annotated[Path, typer.Argument(metavar="CATALOG")], allow: Allow = None) -> None:
-    """Check a catalog: layers, missing files, and the shift between photo and heights."""
+def catalog_check(
+    path: Annotated[Path, typer.Argument(metavar="CATALOG")],
+    config: Annotated[
+        str | None, typer.Option(help="Configuration of the run; default: the one that fits the layers.")
+    ] = None,
+    allow: Allow = None,
+) -> None:
+    """Check a catalog: layers, what would fail in a run, and the shift between photo and heights."""
     from flexroad.catalog import Catalog
+    from flexroad.pipeline.config.loading import load_config
+    from flexroad.pipeline.graph.layers import fitting_config
     from flexroad.pipeline.inspect.catalog import check
 
-    faults = 0
-    for remark in check(Catalog.read(path, allow or ())):
+    catalog, faults = Catalog.read(path, allow or ()), 0
+    for remark in check(catalog, load_config(config or fitting_config(catalog))):
         echo(f"warning: {remark.text}" if remark.fault else remark.text)
         faults += remark.fault
     if faults:

@@ -15,6 +15,8 @@ Allow = Annotated[
     typer.Option(metavar="DIR|URL", help="Allow source files in this folder, too; repeatable."),
 ]
 
+MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
+
 
 class Command(TyperCommand):
     """A command whose repeatable options take several values: ``--tile a b`` is ``--tile a --tile b``.

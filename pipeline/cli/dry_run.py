@@ -5,25 +5,30 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
+from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Location
+from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.graph.graph import TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
+from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
 
 
-def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterator[str]:
-    """Yield one line per tile and stage node, then the totals.
+def plan(graphs: Iterable[TileGraph], store: Location, run: Location, config: Config) -> Iterator[str]:
+    """Yield one line per tile and stage node, then the totals, then what would fail of the tiles to do.
 
     A node is ``stored`` if its result is in the store, else ``to do``. Nodes that are never stored (the
     rasters that `load` reads) are computed again when a later node needs them.
     """
     artefacts, totals, tiles = ArtefactStore(store), Counter[tuple[str, str]](), 0
+    todo: list[Tile] = []
     counted: set[str] = set()
     for graph in graphs:
         tiles += 1
         done = TileProducts.of(run, graph.tile.id).done(graph) is not None
+        todo += [] if done else [graph.tile]
         yield f"{graph.tile.id}: {'done' if done else 'to do'}"
         users = _users(graph)
         for node in graph.nodes.values():
@@ -43,6 +48,8 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location) -> Iterato
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
         if counts:
             yield f"  {stage:9}{counts}"
+    for finding in expected_failures(todo, config, layers_read(config)):
+        yield f"warning: {finding.text}"
 
 
 def _users(graph: TileGraph) -> dict[str, list[str]]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexroad.pipeline.cli.command import Command
-from flexroad.pipeline.cli.run import next_run
+from flexroad.pipeline.cli.command import MIN_COVER_HELP, Command
+from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.prepare.options import PrepareOptions
 
@@ -53,6 +53,7 @@ COMMON: dict[str, Any] = {
     "tile_size_m": Annotated[
         float, typer.Option("--tile-size", help="Side of a tile in m; a smaller area is one tile.")
     ],
+    "min_cover": Annotated[float, typer.Option("--min-cover", min=0, max=1, help=MIN_COVER_HELP)],
     "date": Annotated[datetime | None, typer.Option("--date", help="Acquisition date.")],
     "dataset": Annotated[
         str | None, typer.Option("--name", help="Name of the data in reports; default: the input's name.")
@@ -139,7 +140,7 @@ def _run(make: Callable[[], PreparedDataset]) -> None:
     for note in dataset.notes:
         echo(f"note: {note}", err=True)
     echo(f"{dataset.tiles} tile{'s' * (dataset.tiles != 1)} in {dataset.catalog}")
-    echo(f"next: {next_run(dataset.catalog)}")
+    echo(after_catalog(dataset.catalog))
 
 
 @prepare.command("points", cls=Command)

@@ -48,9 +48,11 @@ Prometheus = Annotated[
 
 @ignore_write_errors()
 def run(
-    config: Annotated[str, typer.Option(help="Configuration: a YAML file or a shipped name (paper).")],
     catalog: Annotated[Path, typer.Option(help="Catalog of tiles.")],
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder of the run; an existing run is resumed.")],
+    config: Annotated[
+        str, typer.Option(help="Configuration: a YAML file or a shipped name (`flexroad config show`).")
+    ] = "production",
     tile: Annotated[list[str] | None, typer.Option(help="Only these tiles.")] = None,
     bbox: Annotated[
         tuple[float, float, float, float] | None,
@@ -70,7 +72,9 @@ def run(
     verify: Verify = False,
     on_failure: OnFailure = None,
     prometheus: Prometheus = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the graph, compute nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the graph and what would fail, compute nothing.")
+    ] = False,
 ) -> None:
     """Bring every tile up to date; after an interruption the same command resumes the run."""
     from flexroad.catalog import Catalog
@@ -78,7 +82,7 @@ def run(
     from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.graph import layers_read
-    from flexroad.pipeline.run.record import Run
+    from flexroad.pipeline.run.record import Run, check_inputs
     from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
 
     path, catalog_path = parse_location(out), parse_location(catalog)
@@ -93,22 +97,26 @@ def run(
             raise ConfigError(f"catalog {catalog} has no tiles")
         return whole, selected
 
+    def of_run(whole: Catalog, selected: Catalog) -> Catalog:
+        """Return the tiles of the run, also those of earlier partial runs."""
+        return merged_catalog(path, whole, selected) if tile or bbox is not None else whole
+
     if dry_run:
         from flexroad.pipeline.cli.dry_run import plan
         from flexroad.pipeline.graph.graph import tile_graphs
 
         settings = load_config(config)
-        graphs = tile_graphs(read_catalog(settings)[1], settings, checksum)
-        for line in plan(graphs, root or path / "store", path):
+        whole, selected = read_catalog(settings)
+        check_inputs(settings, of_run(whole, selected))
+        graphs = tile_graphs(selected, settings, checksum)
+        for line in plan(graphs, root or path / "store", path, settings):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         settings = load_config(config)
         whole, selected = read_catalog(settings)
-        partial_run = bool(tile) or bbox is not None
         with _locked(path, create=True):
-            merged = merged_catalog(path, whole, selected) if partial_run else whole
-            opened = Run.create(path, settings, merged, root, checksum)
+            opened = Run.create(path, settings, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
             make_executor = partial(_executor, executor, workers, scheduler, settings.cluster, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
@@ -256,19 +264,6 @@ def _exit(outcome: Outcome) -> None:
     if outcome.exit_code and outcome.summary is None:
         echo(outcome.text if outcome.exit_code == 130 else f"error: {outcome.text}", err=True)
     raise typer.Exit(outcome.exit_code)
-
-
-def next_run(catalog: Path) -> str:
-    """Return the command that runs a catalog, with ``--allow`` options for all folders that it reads."""
-    from flexroad.catalog import Catalog
-    from flexroad.catalog.allowlist import needed
-    from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.graph.graph import layers_read
-
-    read = layers_read(load_config("paper"))
-    folders = needed(Catalog.read(catalog), catalog.parent, read)
-    allowed = "".join(f" --allow {shlex.quote(folder)}" for folder in folders)
-    return f"flexroad run --config paper --catalog {shlex.quote(str(catalog))} --out RUN{allowed}"
 
 
 def status(

@@ -1,16 +1,18 @@
-"""Check of a catalog: layers per tile, missing files, shift of the orthophoto against the heights."""
+"""Check of a catalog: layers per tile, what would fail, shift of the orthophoto against the heights."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short
-from flexroad.catalog.storage.paths import Location, StatCache
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import check_layers
+from flexroad.pipeline.inspect.failures import Finding, expected_failures
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
@@ -18,21 +20,10 @@ from flexroad.tasks.roads import coregistration
 
 MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
-MAX_SHOWN = 5
-"""Number of missing files, and of entries that cannot be used, that are named."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line about a catalog."""
-
-    text: str
-    fault: bool = False
-    """Whether this should be corrected before a run."""
-
-
-def check(catalog: Catalog) -> Iterator[Finding]:
-    """Yield the contents and the faults of a catalog, the fast checks first.
+def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
+    """Yield the contents of a catalog, and what would fail in a run with a configuration.
 
     Raises
     ------
@@ -45,33 +36,13 @@ def check(catalog: Catalog) -> Iterator[Finding]:
     systems = sorted({short(tile.grid.crs) for tile in tiles})
     yield Finding(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
     counts = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
-    faults = [tile for tile in catalog.tiles if tile.fault]
-    for tile in faults[:MAX_SHOWN]:
-        yield Finding(f"{tile.id}: {tile.fault}", fault=True)
-    if len(faults) > MAX_SHOWN:
-        yield Finding(f"{len(faults) - MAX_SHOWN} more entries cannot be used", fault=True)
     yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in counts.items() if count))
-    for name in ("dsm", "dtm"):
-        if counts[name] < len(tiles):
-            yield Finding(f"{len(tiles) - counts[name]} tiles have no {name}: they will fail", fault=True)
-    yield from _missing(tiles)
+    try:
+        check_layers(config, catalog)
+    except ConfigError as error:
+        yield Finding(f"a run would not start: {error}", fault=True)
+    yield from expected_failures(catalog.tiles, config, LAYERS)
     yield from _photos([tile for tile in tiles if tile.layer("dop")])
-
-
-def _missing(tiles: Sequence[Tile]) -> Iterator[Finding]:
-    """Name the missing files, each with the number of tiles that it lies on."""
-    files: Counter[Location] = Counter()
-    for tile in tiles:
-        for layer in tile.all_layers:
-            files.update(dict.fromkeys(tile.paths(layer), 0))
-            on_tile = layer.reaching(tile.grid.bounds)
-            files.update(tile.paths(on_tile) if on_tile else ())
-    stat = StatCache()
-    missing = [(path, count) for path, count in files.items() if stat(path) is None]
-    for path, count in missing[:MAX_SHOWN]:
-        yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
-    if len(missing) > MAX_SHOWN:
-        yield Finding(f"missing: {len(missing) - MAX_SHOWN} more files", fault=True)
 
 
 def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:

@@ -26,7 +26,7 @@ def fit(
     dsm: xr.DataArray,
     dtm: xr.DataArray,
     road_mask: xr.DataArray,
-    config: str | Path = "nightly",
+    config: str | Path = "production",
     variant: str | None = None,
 ) -> Surface:
     """Fit a smooth surface to the road and the terrain of one area.
@@ -47,7 +47,7 @@ def fit(
         Road where True or not 0, in the same CRS. If its cells do not coincide with those of the DSM, the
         nearest cell is taken, with a warning. It replaces the configuration's ``segment``.
     config : str or Path
-        A shipped configuration (``nightly`` for production, ``paper``) or a YAML file.
+        A shipped configuration (``production``, ``paper``) or a YAML file.
     variant : str, optional
         A variant of the configuration; by default the first one exported.
 
@@ -70,7 +70,7 @@ def fit(
     >>> scene = flexroad.example(size_m=60)
     >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
     >>> surface
-    <flexroad.Surface: nurbs of 20 x 20 control points, config nightly>
+    <flexroad.Surface: nurbs of 20 x 20 control points, config production>
     EPSG:25832, 60 x 60 m, bounds 500200 5600000 500260 5600060
     road: 1576 cells given, 1445 kept by the filter
     """

@@ -336,7 +336,7 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     >>> import flexroad
     >>> flexroad.open_run("runs/city")
     <flexroad.RunView: runs/city>
-    config nightly, variant flexroad
+    config production, variant flexroad
     2 tiles: 1 done, 1 pending
     """
     run = Run.open(parse_location(path), allow)

@@ -145,7 +145,7 @@ def publish_mesh(
         if has_mask:
             _write_reference(writer)
             dataset = f"{dataset}; {reference.CIRCULAR}"
-        published = writer.publish(common.tile_size_m, common.date, dataset)
+        published = writer.publish(common.tile_size_m, common.date, dataset, common.min_cover)
     return published.with_notes(*mesh.notes, *frame.notes)
 
 

@@ -117,7 +117,7 @@ def _from_rasters(
             log(f"resampling {photo} to {common.dop_cell_m:g} m")
             _resample_photo(writer, photo, frame)
         add_roads(writer, common)
-        published = writer.publish(common.tile_size_m, common.date, common.dataset or name)
+        published = writer.publish(common.tile_size_m, common.date, common.dataset or name, common.min_cover)
     present = {DTM: has_dtm, PHOTO: dop_cell is not None}
     missing = [f"{folder} has no {name}" for name, exists in present.items() if not exists]
     return published.with_notes(*frame.notes, *missing)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from flexroad.catalog.cover import MIN_COVER
 from flexroad.pipeline.errors import ConfigError
 
 
@@ -31,6 +32,8 @@ class PrepareOptions:
     """SQL condition that selects features of ``roads``: ``class = 'road'``."""
     tile_size_m: float = 250
     """Side of a tile (m)."""
+    min_cover: float = MIN_COVER
+    """Tiles with a DSM height in less than this share (0 to 1) of their cells are left out."""
     date: datetime | None = None
     """Acquisition date; takes precedence over the files."""
     dataset: str | None = None

@@ -106,7 +106,9 @@ def prepare_points(
             write_blocks(writer, bucketed, options, executor, log)
             add_roads(writer, common)
             dataset = common.dataset or _name(files)
-            return writer.publish(common.tile_size_m, common.date, dataset).with_notes(*notes)
+            return writer.publish(common.tile_size_m, common.date, dataset, common.min_cover).with_notes(
+                *notes
+            )
 
 
 def _frame(clouds: Sequence[Cloud], common: PrepareOptions) -> MetricTransform:

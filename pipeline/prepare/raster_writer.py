@@ -25,6 +25,7 @@ from rasterio.errors import CRSError, RasterioError
 from rasterio.windows import Window
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
+from flexroad.catalog.cover import MIN_COVER, height_share
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.storage.outputs import output_file
@@ -42,8 +43,6 @@ CATALOG = "catalog.parquet"
 HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
 MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
 PHOTO_PROFILE = {"dtype": "uint8", "nodata": None, "count": 3, "photometric": "RGB", "interleave": "pixel"}
-MIN_COVER = 0.25
-"""Tiles with heights in less than this share of their cells are left out: `load` would reject them."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,11 @@ class RasterWriter:
         return values.astype(np.float64) if layer in HEIGHTS else values.astype(bool)
 
     def publish(
-        self, tile_size_m: float = 250, date: datetime | None = None, dataset: str = ""
+        self,
+        tile_size_m: float = 250,
+        date: datetime | None = None,
+        dataset: str = "",
+        min_cover: float = MIN_COVER,
     ) -> PreparedDataset:
         """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
@@ -175,6 +178,8 @@ class RasterWriter:
             Acquisition date.
         dataset : str
             Name of the data in reports.
+        min_cover : float
+            Tiles with heights in less than this share (0 to 1) of their cells are left out.
 
         Raises
         ------
@@ -188,7 +193,7 @@ class RasterWriter:
             with self._writing(layer):
                 self._open[layer].close()
                 _to_cog(self.scratch / f"{layer}.tmp.tif", self.scratch / f"{layer}.tif", layer)
-        tiles, notes = self._tiles(names, tile_size_m, date, dataset)
+        tiles, notes = self._tiles(names, tile_size_m, date, dataset, min_cover)
         tiles = with_roads(tiles, self._roads, None)
         self._replace(names)
         Catalog(tiles).write(self.out / CATALOG)
@@ -202,7 +207,7 @@ class RasterWriter:
             (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
 
     def _tiles(
-        self, names: list[str], size_m: float, date: datetime | None, dataset: str
+        self, names: list[str], size_m: float, date: datetime | None, dataset: str, min_cover: float
     ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
         """Return the tiles with enough heights, and notes on the others."""
         if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
@@ -215,16 +220,16 @@ class RasterWriter:
             tiles = tuple(replace(tile, root=str(self.out.resolve())) for tile in indexed.tiles)
             # `publish` adds the note on assumed dates once, for the tiles that are kept.
             notes = tuple(note for note in indexed.notes if "--date" not in note)
-        with rasterio.open(self.scratch / "dsm.tif") as dsm:
-            enough = [_valid_share(dsm, self.grid, tile.grid) >= MIN_COVER for tile in tiles]
+        shares = (height_share(tile.grid, [self.scratch / "dsm.tif"]) or 0.0 for tile in tiles)
+        enough = [share >= max(min_cover, 1e-9) for share in shares]
         kept = tuple(compress(tiles, enough))
         sparse = [tile.id for tile, is_kept in zip(tiles, enough, strict=True) if not is_kept]
         if not kept:
             raise ConfigError(
-                f"no tile of {self.out} would have heights in {MIN_COVER:.0%} of its cells; "
-                "use larger cells (--cell) or smaller tiles (--tile-size)"
+                f"no tile of {self.out} would have heights in {min_cover:.0%} of its cells; "
+                "use larger cells (--cell), smaller tiles (--tile-size) or a lower --min-cover"
             )
-        left_out = f"left out {some(sparse)}: heights in less than {MIN_COVER:.0%} of the cells"
+        left_out = f"left out {some(sparse)}: heights in less than {min_cover:.0%} of the cells"
         return kept, (*notes, left_out) if sparse else notes
 
     def _one_tile(self, names: list[str], date: datetime | None, dataset: str) -> Tile:
@@ -288,13 +293,6 @@ def _to_cog(source: Path, target: Path, layer: str) -> None:
 def _window(whole: Grid, part: Grid) -> Window:
     rows, cols = whole.window(part)
     return Window.from_slices(rows, cols)
-
-
-def _valid_share(dsm: Any, whole: Grid, tile: Grid) -> float:
-    """Return the share of a tile's cells that have a height; the tile may extend beyond the raster."""
-    row, col = round((whole.north - tile.north) / whole.cell), round((tile.west - whole.west) / whole.cell)
-    window = Window(col, row, tile.width, tile.height).intersection(Window(0, 0, whole.width, whole.height))
-    return float(np.isfinite(dsm.read(1, window=window)).sum()) / (tile.width * tile.height)
 
 
 def _remove_stale(out: Path) -> None:

@@ -43,6 +43,7 @@ from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import Pattern, TileGraph
+from flexroad.pipeline.graph.layers import check_layers
 from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.run.seal import seal, sealed
@@ -92,13 +93,11 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder or the store cannot be written, a model is missing, no tile can be used, or tiles
-            that meet cannot have one surface (`check_tiles`).
+            If the folder or the store cannot be written, no tile can be used, or `check_inputs` raises.
         """
-        check_models(config)
         if not catalog.usable:
             raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
-        check_tiles(config, catalog)
+        check_inputs(config, catalog)
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
         origin = (old or read_summary(path)).get("origin") or _origin(catalog)
@@ -201,6 +200,20 @@ class Run:
         write(self.path / "run.json", checked_json.dumps(record), flushed=True)
         # The run's folder may be new.
         flush_names(self.path, self.path.parent)
+
+
+def check_inputs(config: Config, catalog: Catalog) -> None:
+    """Check, without reading the tiles' files, that a run of a catalog can give results.
+
+    Raises
+    ------
+    ConfigError
+        If a model is missing, no tile has a layer that all need (`check_layers`), or tiles that meet cannot
+        have one surface (`check_tiles`).
+    """
+    check_models(config)
+    check_layers(config, catalog)
+    check_tiles(config, catalog)
 
 
 def check_models(config: Config) -> None:

@@ -15,10 +15,9 @@ from flexroad.catalog.storage.paths import exists, flush_names, parse_location
 from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.graph.borders import check_tiles
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.event_log import EventLog
-from flexroad.pipeline.run.record import Run, check_models
+from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import open_database, recorded_summary, tile_states, tile_statuses
 from flexroad.pipeline.run.summary import Summary, summarise, write_summary
 from flexroad.pipeline.store.artefacts import check_writable
@@ -65,12 +64,11 @@ def run_tiles(
     Raises
     ------
     ConfigError
-        If a model is missing, tiles that meet cannot have one surface, or each of several tiles lacks a file.
+        If `check_inputs` raises, or each of several tiles lacks a file.
     OSError
         If the database or the tables cannot be written, for example on a full disk.
     """
-    check_models(run.config)
-    check_tiles(run.config, run.catalog)
+    check_inputs(run.config, run.catalog)
     remove_abandoned()
     with open_database(run, write=True) as database, EventLog(run.path) as log:
         log.note("run", tiles=len(run.catalog.tiles), config=run.config.name, versions=run.versions)

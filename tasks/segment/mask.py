@@ -11,6 +11,8 @@ from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
+NEEDS = ("road_mask",)
+"""Layers without which a tile fails, in every segmentation method."""
 
 
 class Options(options.Options):

@@ -14,6 +14,7 @@ from flexroad.tasks.types import RoadMask, TileData
 
 VERSION = 1
 READS = ("roads",)
+NEEDS = ("roads",)
 
 
 class Options(rasterise.Options):

@@ -44,7 +44,7 @@ TILE_M = 20
 PATCH_M = 400
 """Size of the made scene of which the rasters are repeated copies."""
 SLEEP_S = 0.3
-"""Time of a tile with configs/nightly.yaml."""
+"""Time of a tile with configs/production.yaml."""
 SLEEPERS = 4
 ASLEEP = 2000
 """Tiles of the sleeping run: enough for a mean."""

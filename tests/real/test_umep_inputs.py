@@ -31,7 +31,7 @@ def test_barbican_corner_off_by_rounding_is_copied(unpack):
     assert result.tiles[4].id == "532250_181500"
     assert {t.grid.crs for t in result.tiles} == {"EPSG:27700"}
     assert {t.grid.cell for t in result.tiles} == {1.0}
-    assert result.notes[0].startswith("left out 3 tiles covered less than 25%")
+    assert result.notes[0].startswith("left out 3 tiles with a DSM height in less than 25%")
     data = [load(t, Options()) for t in result.tiles]
     assert all(d.notes == () for d in data)
     full = data[4]

@@ -28,6 +28,7 @@ from flexroad.tasks.types import Bools, Orthophoto, RoadMask, TileData
 VERSION = 1
 READS = ("dop", "roads")
 """``roads`` is read only if the cleanup uses it."""
+NEEDS = ("dop",)
 TIE_M = 1e-6
 """Shift of the cell centres to the south-east: of pixels equally near, every tile takes the same one."""
 

@@ -96,12 +96,28 @@ def test_tiles_below_min_cover_are_left_out_with_note(tmp_path):
     write(tmp_path / "a.tif", np.ones((250, 300), np.float32))
     result = index(tmp_path, {"dsm": "a.tif"})
     assert ids(result) == ["295500_5629250"]
-    assert "left out 1 tile covered less than 25% by the DSM (--min-cover 0 keeps them): 295750_5629250" in (
-        result.notes
+    (note,) = (note for note in result.notes if note.startswith("left out"))
+    assert note == (
+        "left out 1 tile with a DSM height in less than 25% of the cells (--min-cover 0 keeps them): "
+        "295750_5629250"
     )
     assert len(index(tmp_path, {"dsm": "a.tif"}, min_cover=0).tiles) == 2
     with pytest.raises(CatalogError, match=r"no tile is left: .*--min-cover 0 keeps"):
         index(tmp_path, {"dsm": "a.tif"}, min_cover=1.1)
+
+
+@pytest.mark.parametrize("declared", [-9999.0, None])
+def test_cover_counts_cells_with_heights_and_not_extents(declared, tmp_path):
+    heights = np.full((250, 500), -9999.0, np.float32)
+    heights[:, :250] = 7
+    heights[:50, 250:] = 7
+    write(tmp_path / "a.tif", heights, nodata=declared)
+    assert ids(index(tmp_path, {"dsm": "a.tif"})) == ["295500_5629250"]
+    result = index(tmp_path, {"dsm": "a.tif"}, min_cover=0.1)
+    assert len(result.tiles) == 2
+    (note,) = (note for note in result.notes if "will fail" in note)
+    assert note.startswith("1 tile with a DSM height in less than 25%")
+    assert note.endswith("load: {min_valid: 0.1}: 295750_5629250")
 
 
 def test_cover_counts_overlapping_files_once(tmp_path):

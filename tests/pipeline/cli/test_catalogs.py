@@ -31,7 +31,7 @@ def test_catalog_nrw_can_be_run(tmp_path, quick_config):
     words = ("--tile-size", 50, "--road-mask", "road.tif", "--road-value", 2, 3, "-o", out)
     out_text, err_text = flexroad("catalog", "nrw", root, *words)
     assert f"1 tiles in {out}" in out_text
-    assert "note: left out 3 tiles covered less than 25%" in err_text
+    assert "note: left out 3 tiles with a DSM height in less than 25%" in err_text
     assert Catalog.read(out).tiles[0].layer("road_mask").values == (2, 3)
     words = ("--config", quick_config, "--catalog", out, "--out", tmp_path / "run", "--executor", "serial")
     assert "1 tiles: 1 done" in flexroad("run", *words)[0]

@@ -1,0 +1,77 @@
+"""The share of a tile's cells that have a height in the surface model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from flexroad.catalog.grid import Grid
+    from flexroad.catalog.storage.paths import Location
+    from flexroad.catalog.trust import AllowedFolders
+
+MIN_COVER = 0.25
+"""Default share below which catalogs leave a tile out and `load` fails on it."""
+LOWEST, HIGHEST = -9000.0, 1e6
+"""Values outside are undeclared nodata (-9999, 3e38) in any unit; `load` knows the unit and is stricter."""
+AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
+"""Endings of formats that cannot be read in parts: their files count as without gaps."""
+
+
+def height_share(
+    grid: Grid, paths: Iterable[Location], allowed: AllowedFolders | None = None
+) -> float | None:
+    """Return the share (0 to 1) of a grid's cells whose centre has a height in one of the rasters.
+
+    Parameters
+    ----------
+    grid : Grid
+    paths : iterable of Location
+        Rasters of heights, north up and in the grid's CRS.
+    allowed : AllowedFolders, optional
+        Where the files that a VRT names may lie; None: anywhere on disk.
+
+    Returns
+    -------
+    float or None
+        None if a raster cannot be read, or not in parts.
+    """
+    import numpy as np
+    from rasterio.errors import RasterioError
+
+    from flexroad.catalog.headers.open_raster import open_raster
+    from flexroad.catalog.headers.rasters import quiet
+
+    known = np.zeros(grid.shape, np.bool_)
+    for path in paths:
+        if Path(str(path)).suffix.lower() in AS_TEXT:
+            return None
+        try:
+            with quiet(), open_raster(path, allowed) as raster:
+                _add(known, grid, raster)
+        except (RasterioError, OSError):
+            return None
+    return float(known.mean())
+
+
+def _add(known: NDArray[Any], grid: Grid, raster: Any) -> None:
+    """Set the cells of a grid that have a height in an open raster."""
+    import numpy as np
+    from rasterio.windows import Window
+
+    affine = raster.transform
+    columns = np.floor((grid.eastings - affine.c) / affine.a).astype(int)
+    rows = np.floor((grid.northings - affine.f) / affine.e).astype(int)
+    across, down = (columns >= 0) & (columns < raster.width), (rows >= 0) & (rows < raster.height)
+    if not (across.any() and down.any()):
+        return
+    columns, rows = columns[across], rows[down]
+    left, top = columns.min(), rows.min()
+    window = Window(left, top, columns.max() - left + 1, rows.max() - top + 1)
+    values = raster.read(1, window=window, masked=True)[np.ix_(rows - top, columns - left)]
+    heights = np.ma.filled(values * raster.scales[0] + raster.offsets[0], np.nan)
+    with np.errstate(invalid="ignore"):
+        known[np.ix_(down, across)] |= (heights > LOWEST) & (heights < HIGHEST)

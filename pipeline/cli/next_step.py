@@ -1,0 +1,40 @@
+"""The line ``next: ...`` that commands print when they have written a catalog."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from flexroad.pipeline.errors import ConfigError
+
+
+def after_catalog(path: Path, config: str | None = None) -> str:
+    """Return the command that runs a catalog, ready to be pasted, or what a run lacks.
+
+    Parameters
+    ----------
+    path : Path
+        The catalog's file.
+    config : str, optional
+        The configuration; default: the one for production that fits the catalog's layers.
+    """
+    from flexroad.catalog import Catalog
+    from flexroad.catalog.allowlist import needed
+    from flexroad.pipeline.config.loading import load_config
+    from flexroad.pipeline.graph.graph import layers_read
+    from flexroad.pipeline.graph.layers import fitting_config
+    from flexroad.pipeline.run.record import check_inputs
+
+    catalog = Catalog.read(path)
+    name = config or fitting_config(catalog)
+    settings = load_config(name)
+    try:
+        check_inputs(settings, catalog)
+    except ConfigError as error:
+        return f"before a run: {error}"
+    # Many catalogs are called catalog.parquet: their folder tells them apart.
+    title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
+    words = ["flexroad", "run", "--config", name, "--catalog", str(path), "--out", f"runs/{title}"]
+    for folder in needed(catalog, path.parent, layers_read(settings)):
+        words += ["--allow", folder]
+    return f"next: {shlex.join(words)}"

@@ -1,0 +1,127 @@
+"""What would fail in a run, as far as the catalog, the headers of its files and the DSM show it."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+from rasterio.errors import RasterioError
+
+from flexroad.catalog import Layer, Tile
+from flexroad.catalog.cover import height_share
+from flexroad.catalog.crs import in_plan, same, short
+from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.rasters import quiet, some
+from flexroad.catalog.storage.paths import Location, StatCache
+from flexroad.catalog.trust import AllowedFolders
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.graph.layers import lacking
+from flexroad.tasks.load import READS
+
+MAX_SHOWN = 5
+"""Number of missing files, and of entries that cannot be used, that are named."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line about a catalog."""
+
+    text: str
+    fault: bool = False
+    """Whether this should be corrected before a run."""
+
+
+def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[str]) -> Iterator[Finding]:
+    """Yield what would fail in a run of these tiles: the count and the first examples of each reason.
+
+    The reasons are entries that cannot be used, missing layers and files, rasters in another CRS than their
+    tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
+    is read.
+
+    Parameters
+    ----------
+    tiles : sequence of Tile
+    config : Config
+    layers : collection of str
+        The layers whose files are looked up.
+    """
+    faults = [tile for tile in tiles if tile.fault]
+    for tile in faults[:MAX_SHOWN]:
+        yield Finding(f"{tile.id}: {tile.fault}", fault=True)
+    if len(faults) > MAX_SHOWN:
+        yield Finding(f"{len(faults) - MAX_SHOWN} more entries cannot be used", fault=True)
+    usable = [tile for tile in tiles if not tile.fault]
+    for layer, stage, ids in lacking(usable, config):
+        yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")
+    yield from _missing(usable, layers)
+    yield from _unfit(usable, config)
+
+
+def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Finding:
+    return Finding(f"{len(ids)} of {len(tiles)} tiles would fail: {reason}: {some(ids)}", fault=True)
+
+
+def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding]:
+    """Name the missing files, each with the number of tiles that it lies on."""
+    files: Counter[Location] = Counter()
+    for tile in tiles:
+        for layer in (layer for layer in tile.all_layers if layer.name in layers):
+            files.update(dict.fromkeys(tile.paths(layer), 0))
+            on_tile = layer.reaching(tile.grid.bounds)
+            files.update(tile.paths(on_tile) if on_tile else ())
+    stat = StatCache()
+    missing = [(path, count) for path, count in files.items() if stat(path) is None]
+    for path, count in missing[:MAX_SHOWN]:
+        yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
+    if len(missing) > MAX_SHOWN:
+        yield Finding(f"missing: {len(missing) - MAX_SHOWN} more files", fault=True)
+
+
+def _unfit(tiles: Sequence[Tile], config: Config) -> Iterator[Finding]:
+    """Name the tiles with a raster in another CRS, and those whose DSM has too few heights."""
+    min_valid = max(chain["load"].min_valid for chain in config.chains.values())
+    known: dict[Location, str | None] = {}
+    by_reason: dict[str, list[str]] = defaultdict(list)
+    for tile in tiles:
+        if reason := _other_crs(tile, known) or _few_heights(tile, min_valid):
+            by_reason[reason].append(tile.id)
+    for reason, ids in by_reason.items():
+        yield _would_fail(ids, tiles, reason)
+
+
+def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[Location, ...]]]:
+    """Yield the rasters of some layers that lie on a tile."""
+    for layer in tile.layers:
+        if layer.name in names and (on_tile := layer.reaching(tile.grid.bounds)):
+            yield on_tile, tile.paths(on_tile)
+
+
+def _other_crs(tile: Tile, known: dict[Location, str | None]) -> str:
+    """Return why a tile would fail if a raster on it is in another CRS; ``known`` has those read before."""
+    for layer, paths in _on_tile(tile, READS):
+        for path in paths:
+            if path not in known:
+                known[path] = _crs(path, tile.allowed)
+            crs = known[path] or layer.crs
+            if crs and not same(crs, tile.grid.crs):
+                return f"{layer.name} is in {short(crs)}, not {short(tile.grid.crs)}"
+    return ""
+
+
+def _crs(path: Location, allowed: AllowedFolders | None) -> str | None:
+    """Return the horizontal CRS of a raster, None if it has none or cannot be read."""
+    try:
+        with quiet(), open_raster(path, allowed) as raster:
+            return in_plan(raster.crs.to_wkt()) if raster.crs else None
+    except (RasterioError, OSError):
+        return None
+
+
+def _few_heights(tile: Tile, min_valid: float) -> str:
+    """Return why a tile would fail if its DSM covers too little of it."""
+    paths = [path for _, paths in _on_tile(tile, ("dsm",)) for path in paths]
+    share = height_share(tile.grid, paths, tile.allowed) if paths else None
+    if share is None or share >= max(min_valid, 1e-9):
+        return ""
+    return f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"

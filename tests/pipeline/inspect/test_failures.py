@@ -1,0 +1,76 @@
+"""What would fail is named before the run, with counts and examples, and then does fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+
+from flexroad.catalog import LAYERS, Catalog
+from flexroad.catalog.tile import faulty
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.inspect.failures import expected_failures
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.load import Options, load
+
+FEW = "a DSM height in less than 25% of the cells (load.min_valid)"
+
+
+def without_road_mask(tile):
+    return replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "road_mask"))
+
+
+def own_file(tile, layer):
+    (path,) = tile.paths(tile.layer(layer).reaching(tile.grid.bounds))
+    return path
+
+
+def change(tile, layer, change_raster):
+    with rasterio.open(own_file(tile, layer), "r+") as raster:
+        change_raster(raster)
+
+
+def empty(raster):
+    heights = raster.read(1)
+    heights[: int(0.8 * len(heights))] = np.nan
+    raster.write(heights, 1)
+
+
+def elsewhere(raster):
+    raster.crs = "EPSG:25833"
+
+
+def test_expected_failures_name_count_and_examples_of_each_reason(survey):
+    one, two, three, four = Catalog.read(survey).tiles
+    change(two, "dsm", empty)
+    change(three, "dtm", elsewhere)
+    missing = own_file(four, "dtm")
+    missing.unlink()
+    tiles = (without_road_mask(one), two, three, four, faulty("fifth", "its entry is damaged", ""))
+    said = [finding.text for finding in expected_failures(tiles, load_config("production"), LAYERS)]
+    assert said == [
+        "fifth: its entry is damaged",
+        f"1 of 4 tiles would fail: no road_mask, which segment: mask needs: {one.id}",
+        f"missing: {missing} (1 tile)",
+        f"1 of 4 tiles would fail: {FEW}: {two.id}",
+        f"1 of 4 tiles would fail: dtm is in EPSG:25833, not EPSG:25832: {three.id}",
+    ]
+    for tile in (two, three, four):
+        with pytest.raises(TaskError):
+            load(tile, Options())
+
+
+def test_expected_failures_follow_min_valid_of_the_configuration(survey, tmp_path):
+    tiles = Catalog.read(survey).tiles
+    change(tiles[1], "dsm", empty)
+    (tmp_path / "low.yaml").write_text("extends: production\nload: {min_valid: 0.1}\n")
+    assert not list(expected_failures(tiles, load_config(tmp_path / "low.yaml"), LAYERS))
+    load(tiles[1], Options(min_valid=0.1))
+
+
+def test_dry_run_and_check_say_what_would_fail(survey, flexroad, tmp_path):
+    change(Catalog.read(survey).tiles[1], "dsm", empty)
+    said = flexroad("run", "--catalog", survey, "--out", tmp_path / "run", "--dry-run").expected(0)
+    line = f"warning: 1 of 4 tiles would fail: {FEW}: {Catalog.read(survey).tiles[1].id}"
+    assert said.out.splitlines()[-1] == line
+    assert line in flexroad("catalog", "check", survey).expected(1).out.splitlines()
