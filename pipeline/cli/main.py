@@ -13,6 +13,7 @@ from flexroad.pipeline.cli.catalogs import catalogs
 from flexroad.pipeline.cli.clean import clean
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.configs import configs
+from flexroad.pipeline.cli.init import init
 from flexroad.pipeline.cli.prepare import prepare
 from flexroad.pipeline.cli.results import figures, query, report, tables
 from flexroad.pipeline.cli.run import rerun, run, status
@@ -31,7 +32,7 @@ app = typer.Typer(
 app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
-for command in (run, rerun, status, clean, report, query, tables, figures, train):
+for command in (init, run, rerun, status, clean, report, query, tables, figures, train):
     app.command(cls=Command)(command)
 
 

@@ -1,0 +1,70 @@
+"""``flexroad init`` tells downloads by name and content, and its commands run as they are printed."""
+
+import shlex
+
+import numpy as np
+import pytest
+from shapely import LineString, box
+
+from tests.make_rasters import write
+from tests.make_roads import write as write_roads
+
+WEST, NORTH = 400_020.0, 5_700_060.0
+
+
+@pytest.fixture
+def downloads(tmp_path, monkeypatch):
+    """A folder of heights in two subfolders, vector roads and an orthophoto."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "my downloads"
+    ground = np.full((60, 60), 100, np.float32)
+    for name in ("DOM/a_1.tif", "DGM/a_1.tif"):
+        write(folder / name, ground, WEST, NORTH)
+        write(folder / name.replace("1", "2"), ground, WEST + 60, NORTH)
+    write_roads(folder / "roads.gpkg", [box(WEST, NORTH - 35, WEST + 120, NORTH - 25)])
+    return folder
+
+
+def test_init_commands_run_as_printed(downloads, flexroad, tmp_path):
+    said = flexroad("init", downloads, "--write", "own.yaml").expected(0).out
+    assert "surface models (DSM): 2" in said
+    assert "  DOM/a_1.tif: 1 band float32, 60 x 60, values 100 to 100, EPSG:25832" in said
+    assert "question:" not in said
+    commands = [line for line in said.splitlines() if line.startswith("flexroad ")]
+    catalog, check, run = (shlex.split(line)[1:] for line in commands)
+    assert (tmp_path / "own.yaml").read_text().endswith("extends: production_vector\n")
+    flexroad(*catalog, "--tile-size", 60).expected(0)
+    flexroad(*check).expected(0)
+    assert "--config own.yaml" in " ".join(run)
+    flexroad(*run, "--allow", downloads, "--dry-run").expected(0)
+
+
+def test_init_never_overwrites_configuration(downloads, flexroad, tmp_path):
+    (tmp_path / "own.yaml").write_text("mine\n")
+    assert "exists and is kept" in flexroad("init", downloads, "--write", "own.yaml").expected(2).err
+    assert (tmp_path / "own.yaml").read_text() == "mine\n"
+
+
+def test_init_names_unclear_files_with_their_question(downloads, flexroad):
+    colours = np.zeros((60, 60), np.uint8)
+    write(downloads / "what.tif", np.full((60, 60), 7.5, np.float32), WEST, NORTH)
+    write(downloads / "ndsm.tif", np.full((60, 60), 7.5, np.float32), WEST, NORTH)
+    write(downloads / "landcover.tif", colours + np.arange(60, dtype=np.uint8) % 3, WEST, NORTH)
+    write(downloads / "dop.tif", np.full((60, 60), 7.5, np.float32), WEST, NORTH, crs=None)
+    (downloads / "more.zip").write_bytes(b"PK")
+    write_roads(downloads / "roads.gpkg", [LineString([(WEST, NORTH), (WEST + 9, NORTH)])], layer="lines")
+    said = flexroad("init", downloads).expected(0).out
+    for question in (
+        "question: what.tif: is it a DSM (--dsm)",
+        "question: ndsm.tif: heights above the ground",
+        "question: landcover.tif: which of its values are road (--road-value)? It has 0, 1, 2",
+        "question: dop.tif: it is named like an orthophoto, but has one band",
+        "question: more.zip: unpack it first",
+        "question: roads.gpkg: which layer are the roads",
+    ):
+        assert question in said
+
+
+def test_init_empty_folder_is_one_line(tmp_path, flexroad):
+    (line,) = flexroad("init", tmp_path).expected(2).err.splitlines()
+    assert line.startswith(f"error: {tmp_path} has no rasters")
