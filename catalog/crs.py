@@ -10,6 +10,7 @@ from functools import lru_cache
 
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
+from pyproj.crs import CompoundCRS
 from pyproj.database import query_crs_info, query_utm_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
@@ -66,6 +67,46 @@ def height_unit(text: str) -> Unit | None:
     plan, height = _parts(text)
     axes = plan.axis_info[2:3] if height is None else height.axis_info[:1]
     return (axes[0].unit_name, axes[0].unit_conversion_factor) if axes else None
+
+
+@lru_cache(maxsize=256)
+def vertical(text: str) -> str | None:
+    """Return the vertical CRS of heights in metres: ``EPSG:7837``, or WKT where there is no code.
+
+    Of heights in feet it is the CRS of the same datum in metres. None if the CRS is not compound, or counts
+    depths.
+    """
+    height = _parts(text)[1]
+    if height is None:
+        return None
+    height = height.source_crs if height.is_bound and height.source_crs else height
+    axis = height.axis_info[0]
+    if axis.direction.lower() != "up":
+        return None
+    if axis.unit_conversion_factor != 1:
+        height = _in_metres(height)
+    code = height.to_epsg()
+    return f"EPSG:{code}" if code else height.to_wkt()
+
+
+def _in_metres(height: CRS) -> CRS:
+    """Return the vertical CRS of the same datum in metres, of the EPSG register if it has one."""
+    name = height.name.partition(" (")[0]
+    for info in query_crs_info("EPSG", PJType.VERTICAL_CRS):
+        if info.name == name:
+            return CRS.from_epsg(info.code)
+    definition = height.to_json_dict()
+    definition.pop("id", None)
+    definition["name"] = name
+    definition["coordinate_system"]["axis"][0]["unit"] = "metre"
+    return CRS.from_json_dict(definition)
+
+
+@lru_cache(maxsize=256)
+def compound(plan: str, height: str) -> str:
+    """Return the compound CRS of a horizontal and a vertical one as WKT."""
+    parts = [CRS.from_user_input(plan), CRS.from_user_input(height)]
+    return str(CompoundCRS(" + ".join(part.name for part in parts), parts).to_wkt())
 
 
 def is_geographic(text: str) -> bool:

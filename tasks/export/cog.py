@@ -2,39 +2,91 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
 
-VERSION = 2
+VERSION = 3
 NAME_HEIGHT = "_height.tif"
 NAME_ROAD = "_road.tif"
 NAME_SUPPORT = "_support.tif"
 MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
+BLOCK = 512
+"""Width and height of the blocks of a file (cells)."""
 
 
-def encode_height(height: Floats, grid: Grid) -> bytes:
+@dataclass(frozen=True)
+class RasterClass:
+    """A value of a raster with classes."""
+
+    value: int
+    name: str
+    """One word, as the STAC classification extension requires."""
+    meaning: str
+    colour: tuple[int, int, int]
+    """Red, green, blue: 0 to 255."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """What the cells of a raster mean."""
+
+    name: str
+    meaning: str
+    dtype: str
+    unit: str = ""
+    nodata: float | None = None
+    classes: tuple[RasterClass, ...] = ()
+    """All values, in ascending order from 0; empty for heights."""
+
+
+HEIGHT = Band("height", "Height of the surface at the cell centre", "float32", "m", float("nan"))
+ROAD = Band(
+    "road",
+    "Road mask after the filter",
+    "uint8",
+    classes=(
+        RasterClass(0, "other", "No road, or road that the filter removed", (232, 232, 226)),
+        RasterClass(1, "road", "Road that the surface follows", (70, 70, 80)),
+    ),
+)
+SUPPORT = Band(
+    "support",
+    "Source of the surface's height",
+    "uint8",
+    nodata=float(Support.NONE),
+    classes=(
+        RasterClass(Support.NONE, "outside", "Beyond the survey", (255, 255, 255)),
+        RasterClass(Support.MEASURED, "measured", "The surface model shows the ground", (90, 160, 90)),
+        RasterClass(Support.DTM, "dtm", "Hidden ground: the height comes from the DTM", (240, 190, 70)),
+        RasterClass(Support.INFERRED, "inferred", "No height: extrapolated from around", (205, 80, 70)),
+    ),
+)
+
+
+def encode_height(height: Floats, grid: Grid, vertical: str | None = None) -> bytes:
     """Return heights at the cell centres of a grid, ``(H, W)``, m, as GeoTIFF: float32, nodata NaN.
+
+    Parameters
+    ----------
+    vertical : str, optional
+        Vertical CRS of the heights; the file's CRS is then compound.
 
     Raises
     ------
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(
-        height.astype(np.float32),
-        grid,
-        "height",
-        "m",
-        nodata=np.nan,
-        predictor=3,
-        overview_resampling="average",
-    )
+    crs = compound(grid.crs, vertical) if vertical else grid.crs
+    return _encode(height.astype(np.float32), grid, crs, HEIGHT, predictor=3, overview_resampling="average")
 
 
 def encode_mask(road: Bools, grid: Grid) -> bytes:
@@ -45,7 +97,8 @@ def encode_mask(road: Bools, grid: Grid) -> bytes:
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(road.astype(np.uint8), grid, "road", "", predictor=2, overview_resampling="mode")
+    values = road.astype(np.uint8)
+    return _encode(values, grid, grid.crs, ROAD, predictor=2, overview_resampling="mode")
 
 
 def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
@@ -56,28 +109,35 @@ def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
     TaskError
         If the array does not have the grid's shape.
     """
-    return _encode(support, grid, "support", "", nodata=0, predictor=2, overview_resampling="mode")
+    return _encode(support, grid, grid.crs, SUPPORT, predictor=2, overview_resampling="mode")
 
 
-def _encode(values: NDArray[Any], grid: Grid, name: str, unit: str, **options: Any) -> bytes:
+def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:
     from rasterio.io import MemoryFile
 
     if values.shape != grid.shape:
-        raise TaskError(f"{name} of {values.shape} cells does not fit a grid of {grid.shape}")
+        raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
     profile = {
         "driver": "COG",
-        "dtype": values.dtype,
+        "dtype": band.dtype,
         "count": 1,
         "width": grid.width,
         "height": grid.height,
-        "crs": grid.crs,
+        "crs": crs,
         "transform": grid.transform,
         "compress": "deflate",
+        "nodata": band.nodata,
+        "blocksize": BLOCK,
     }
     with MemoryFile() as file:
         with file.open(**profile, **options) as raster:
             raster.write(values, 1)
-            raster.set_band_description(1, name)
-            raster.set_band_unit(1, unit)
+            raster.set_band_description(1, band.name)
+            raster.set_band_unit(1, band.unit)
+            raster.update_tags(1, MEANING=band.meaning)
+            if band.classes:
+                raster.write_colormap(1, {c.value: (*c.colour, 255) for c in band.classes})
+                # GDAL keeps names of classes in a side-car file, which viewers write anew.
+                raster.update_tags(1, **{f"CLASS_{c.value}": f"{c.name}: {c.meaning}" for c in band.classes})
         encoded: bytes = file.read()
     return encoded

@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 from pyproj import CRS
+from rasterio.enums import ColorInterp
 from rasterio.io import MemoryFile
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cog
+from flexroad.tasks.quality.support import Support
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 600, 250)
 
@@ -34,6 +36,36 @@ def test_encode_mask_reads_back():
     with MemoryFile(cog.encode_mask(road, GRID)) as file, file.open() as raster:
         assert raster.dtypes == ("uint8",)
         np.testing.assert_array_equal(raster.read(1), road)
+
+
+def test_encode_height_with_vertical_crs_has_compound_crs():
+    with MemoryFile(cog.encode_height(plane(GRID), GRID, "EPSG:7837")) as file, file.open() as raster:
+        plan, height = CRS(raster.crs.to_wkt()).sub_crs_list
+        assert (plan.to_epsg(), height.to_epsg()) == (25832, 7837)
+        assert raster.bounds == GRID.bounds
+
+
+@pytest.mark.parametrize("band", [cog.HEIGHT, cog.ROAD, cog.SUPPORT], ids=lambda band: band.name)
+def test_encoded_raster_declares_what_its_band_means(band):
+    encoded = {
+        "height": lambda: cog.encode_height(plane(GRID), GRID),
+        "road": lambda: cog.encode_mask(plane(GRID) > 104, GRID),
+        "support": lambda: cog.encode_support(np.full(GRID.shape, Support.DTM, np.uint8), GRID),
+    }[band.name]()
+    with MemoryFile(encoded) as file, file.open() as raster:
+        assert raster.dtypes == (band.dtype,)
+        assert raster.descriptions == (band.name,)
+        assert raster.units == (band.unit or None,)
+        tags = raster.tags(1)
+        assert tags["MEANING"] == band.meaning
+        if not band.classes:
+            return
+        assert raster.colorinterp == (ColorInterp.palette,)
+        colours = raster.colormap(1)
+        assert [c.value for c in band.classes] == list(range(len(band.classes)))
+        for c in band.classes:
+            assert colours[c.value][:3] == c.colour
+            assert tags[f"CLASS_{c.value}"].startswith(f"{c.name}: ")
 
 
 def test_encode_height_is_cloud_optimised():

@@ -1,0 +1,30 @@
+import pytest
+from pyproj import CRS
+
+from flexroad.catalog.crs import compound, in_plan, vertical
+
+
+@pytest.mark.parametrize(
+    ("crs", "expected"),
+    [
+        ("EPSG:25832", None),
+        ("EPSG:25832+7837", "EPSG:7837"),
+        ("EPSG:2994+6360", "EPSG:5703"),  # NAVD88 in US survey feet: the same datum in metres
+        ("EPSG:25832+5715", None),  # depths
+    ],
+)
+def test_vertical_is_the_datum_of_heights_in_metres(crs, expected):
+    assert vertical(crs) == expected
+
+
+def test_vertical_without_a_code_is_wkt_in_metres():
+    definition = CRS("EPSG:6360").to_json_dict() | {"name": "heights of a site (ftUS)"}
+    definition.pop("id")
+    found = CRS(vertical(compound("EPSG:25832", CRS.from_json_dict(definition).to_wkt())))
+    assert found.name == "heights of a site"
+    assert found.axis_info[0].unit_name == "metre"
+
+
+def test_compound_has_both_parts():
+    assert in_plan(compound("EPSG:25832", "EPSG:7837")) == "EPSG:25832"
+    assert vertical(compound("EPSG:25832", "EPSG:7837")) == "EPSG:7837"
