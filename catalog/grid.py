@@ -61,6 +61,11 @@ class Grid:
         return cls(crs, west, north, cell, width, height)
 
     @property
+    def has_code(self) -> bool:
+        """Whether the CRS is given by its code, not by WKT."""
+        return self.crs.upper().startswith("EPSG:")
+
+    @property
     def east(self) -> float:
         """Easting of the right edge (m)."""
         return self.west + self.width * self.cell

@@ -193,7 +193,7 @@ def item(tile: Tile, root: str = "") -> Item:
         Folder that file names are relative to; empty: the folder of the file that the item is written to.
     """
     properties: Item = {
-        "datetime": tile.datetime.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
+        "datetime": datetime_text(tile.datetime),
         **_placed(tile.grid, known=not tile.fault),
         "flexroad:stratum": tile.stratum,
         "flexroad:dataset": tile.dataset,
@@ -210,6 +210,11 @@ def item(tile: Tile, root: str = "") -> Item:
         "assets": {layer.name: _asset(layer, root) for layer in tile.all_layers},
         "links": [],
     }
+
+
+def datetime_text(time: datetime) -> str:
+    """Return a time as STAC writes it: RFC 3339 in UTC."""
+    return time.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 def _outline(grid: Grid) -> Item:
@@ -229,10 +234,9 @@ def _outline(grid: Grid) -> Item:
 
 def _placed(grid: Grid, known: bool) -> Item:
     """Return the fields of the projection extension, None if the grid is not known."""
-    is_code = grid.crs.upper().startswith("EPSG:")
     fields = {
-        "proj:code": grid.crs if is_code else None,
-        "proj:wkt2": None if is_code else grid.crs,
+        "proj:code": grid.crs if grid.has_code else None,
+        "proj:wkt2": None if grid.has_code else grid.crs,
         "proj:bbox": list(grid.bounds),
         "proj:shape": [grid.height, grid.width],
         "proj:transform": [grid.cell, 0.0, grid.west, 0.0, -grid.cell, grid.north],

@@ -28,6 +28,7 @@ from flexroad.catalog.borders import border_of
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
 from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, BorderTask, has_borders
+from flexroad.pipeline.graph.products import product_versions
 from flexroad.pipeline.graph.sources import Recorded, SourceFiles, Stat, hashed, to_json
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
@@ -129,7 +130,7 @@ class Pattern:
     """Variant -> stage -> index of its step."""
     export: Export
     exported: str
-    """The export options as the JSON that is hashed."""
+    """The export options and the versions of the products as the JSON that is hashed."""
     halo_m: float
     """The largest halo of the variants (m)."""
 
@@ -149,7 +150,7 @@ class Pattern:
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
-        exported = to_json(config.export.model_dump(mode="json"))
+        exported = to_json([config.export.model_dump(mode="json"), product_versions(config.export)])
         halo_m = max(chain["load"].halo_m for chain in config.chains.values())
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 

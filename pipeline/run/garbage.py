@@ -25,7 +25,7 @@ from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED
-from flexroad.pipeline.worker.exports import SUFFIXES
+from flexroad.pipeline.worker.exports import KINDS
 
 Kind = Literal["artefacts", "products", "tiles", "temporary files"]
 MEANING: dict[Kind, str] = {
@@ -159,7 +159,7 @@ def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
 def _in_tiles(run: Run) -> Iterator[Garbage]:
     tiles = {safe_name(tile.id): tile for tile in run.catalog.tiles}
     current = _ends(run.config.export.variants, run.config.export.formats)
-    ever = _ends(run.exported, SUFFIXES) | current
+    ever = _ends(run.exported, KINDS) | current
     with open_database(run) as database:
         for folder, files in _folders(run.path / "tiles"):
             yield from _temporary(folder, files)
@@ -178,7 +178,7 @@ def _in_tiles(run: Run) -> Iterator[Garbage]:
 
 def _ends(variants: Iterable[str], formats: Iterable[str]) -> set[str]:
     """Return the ends of product file names, after the tile's name."""
-    return {f"_{variant}{end}" for variant in variants for kind in formats for end in SUFFIXES[kind]}
+    return {f"_{variant}{kind.suffix}" for variant in variants for name in formats for kind in KINDS[name]}
 
 
 def _temporary(folder: Location, files: dict[str, int]) -> Iterator[Garbage]:

@@ -10,6 +10,8 @@
     RUN/metrics.parquet  one row per (tile, variant)
     RUN/failures.csv     one row per failure
     RUN/log.jsonl        one event per line
+    RUN/collection.json  STAC collection of the done tiles
+    RUN/*.vrt            their rasters as mosaics
 """
 
 from __future__ import annotations
@@ -75,6 +77,8 @@ class Run:
     """Folders and addresses that sources may be read from, as sealed when the run was made."""
     exported: tuple[str, ...] = ()
     """Variants exported by this or an earlier configuration of the run."""
+    collection: str = ""
+    """Id of the run's STAC collection: the name of its folder when it was made."""
 
     @classmethod
     def create(
@@ -104,7 +108,8 @@ class Run:
         store = store or (parse_location(old["store"]) if old and old["shared_store"] else path / "store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
-        run = cls(path, config, catalog, store, origin, checksum, versions(), folders_of(catalog), exported)
+        folders, collection = folders_of(catalog), _collection(old, path)
+        run = cls(path, config, catalog, store, origin, checksum, versions(), folders, exported, collection)
         try:
             for folder in (path, store):
                 check_writable(folder)
@@ -156,6 +161,7 @@ class Run:
             record["versions"],
             allowed,
             _exported(record, config),
+            _collection(record, path),
         )
 
     @cached_property
@@ -176,7 +182,7 @@ class Run:
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""
         run, store = str(absolute(self.path)), str(absolute(self.store))
-        return TileJob(graph, run, store, self.origin, force, self.config.cluster.flush)
+        return TileJob(graph, run, store, self.origin, self.collection, force, self.config.cluster.flush)
 
     def folder(self, tile_id: str) -> TileProducts:
         """Return the folder of a tile's products."""
@@ -196,6 +202,7 @@ class Run:
             "allowed": list(self.allowed),
             "seal": seal(self.allowed),
             "exported": list(self.exported),
+            "collection": self.collection,
         }
         write(self.path / "run.json", checked_json.dumps(record), flushed=True)
         # The run's folder may be new.
@@ -268,6 +275,10 @@ def _origin(catalog: Catalog) -> tuple[float, float]:
 def _exported(record: dict[str, Any] | None, config: Config) -> tuple[str, ...]:
     earlier = (record or {}).get("exported", ())
     return tuple(dict.fromkeys([*earlier, *config.export.variants]))
+
+
+def _collection(record: dict[str, Any] | None, path: Location) -> str:
+    return (record or {}).get("collection") or absolute(path).name or "run"
 
 
 def _config(path: Location) -> Config:

@@ -16,6 +16,7 @@ from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
+from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import open_database, recorded_summary, tile_states, tile_statuses
@@ -187,9 +188,10 @@ def _close(
     plan: Plan | None,
     error: BaseException | None = None,
 ) -> Summary:
-    """Write the tables, the event ``end`` and the summary; also after an error, with the results so far.
+    """Write tables, mosaics, collection, the event ``end`` and the summary; also after an error.
 
-    ``start`` is the start time (ISO 8601), ``start_s`` the value of `time.perf_counter` at the start.
+    They have the results so far. ``start`` is the start time (ISO 8601), ``start_s`` the value of
+    `time.perf_counter` at the start.
     """
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
@@ -201,6 +203,8 @@ def _close(
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         write_tables(run.path, database.rows(), database.failures(), run.config.cluster.flush)
+        states = zip(run.catalog.tiles, database.states(), strict=True)
+        write_collection(run, [tile for tile, state in states if state in ("done", "cached")])
     summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
     log.note("end", **{name: value for name, value in asdict(summary).items() if name != "failures"})
     about = {"start": start, "end": utc_now(), "config": run.config.name, "origin": list(run.origin)}

@@ -3,23 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.tasks.export import cog, glb, npz, ply
+from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
 
-Product = tuple[bytes, str]
-"""Content (bytes) and media type of a file."""
-SUFFIXES = {
-    "glb": (glb.NAME,),
-    "ply": (ply.NAME,),
-    "cog": (cog.NAME_HEIGHT, cog.NAME_ROAD, cog.NAME_SUPPORT),
-    "npz": (npz.NAME,),
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of product, the same for all tiles."""
+
+    key: str
+    """Key of the STAC asset."""
+    suffix: str
+    """End of the file name, after tile and variant."""
+    media_type: str
+    title: str
+    band: cog.Band | None = None
+    """The band of a raster, None if it is no raster."""
+
+
+@dataclass(frozen=True)
+class Product:
+    """One file of a tile."""
+
+    kind: Kind
+    variant: str
+    data: bytes
+    vertical: str | None = None
+    """Vertical CRS of heights, None if it is not known."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What coordinates of products refer to."""
+
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) that mesh translations are relative to."""
+    vertical: str | None
+    """Vertical CRS of heights, None if it is not known."""
+
+
+GLB = Kind("mesh", glb.NAME, glb.MEDIA_TYPE, "Mesh for viewers: small coordinates, Y up")
+PLY = Kind("ply", ply.NAME, ply.MEDIA_TYPE, "Mesh in coordinates of the CRS, with class and support per face")
+HEIGHT = Kind("height", cog.NAME_HEIGHT, cog.MEDIA_TYPE, "Height of the surface", cog.HEIGHT)
+ROAD = Kind("road", cog.NAME_ROAD, cog.MEDIA_TYPE, "Road mask after the filter", cog.ROAD)
+SUPPORT = Kind("support", cog.NAME_SUPPORT, cog.MEDIA_TYPE, "Source of each height", cog.SUPPORT)
+NPZ = Kind("surface", npz.NAME, npz.MEDIA_TYPE, "NURBS surface, as NumPy archive")
+KINDS: dict[str, tuple[Kind, ...]] = {
+    "glb": (GLB,),
+    "ply": (PLY,),
+    "cog": (HEIGHT, ROAD, SUPPORT),
+    "npz": (NPZ,),
 }
-"""Ends of the file names of each format, after tile and variant."""
+"""The kinds of product of each format."""
+
+
+def file_name(tile_id: str, variant: str, kind: Kind) -> str:
+    """Return the name of a product in the tile's folder."""
+    return f"{safe_name(tile_id)}_{variant}{kind.suffix}"
 
 
 def products(
@@ -36,50 +83,52 @@ def products(
     origin : tuple of float
         Origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
     """
+    vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
+    reference = Reference(origin, vertical)
     files: dict[str, Product] = {}
-    tile = safe_name(graph.tile.id)
     for variant in graph.export.variants:
-        for kind in graph.export.formats:
-            by_suffix = _ENCODERS[kind](graph, graph.variants[variant], evaluate, origin)
-            files |= {f"{tile}_{variant}{suffix}": product for suffix, product in by_suffix.items()}
+        for name in graph.export.formats:
+            for kind, data in _ENCODERS[name](graph, graph.variants[variant], evaluate, reference).items():
+                known = vertical if kind is HEIGHT else None
+                files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
     return files
 
 
 def _glb(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
-) -> dict[str, Product]:
-    return {glb.NAME: (glb.encode(evaluate(nodes["sample"]), (*origin, 0.0)), glb.MEDIA_TYPE)}
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+) -> dict[Kind, bytes]:
+    return {GLB: glb.encode(evaluate(nodes["sample"]), (*reference.origin, 0.0))}
 
 
 def _ply(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
-) -> dict[str, Product]:
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+) -> dict[Kind, bytes]:
     mesh = evaluate(nodes["sample"])
     support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
-    return {ply.NAME: (ply.encode(mesh, support), ply.MEDIA_TYPE)}
+    return {PLY: ply.encode(mesh, support)}
 
 
 def _cog(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
-) -> dict[str, Product]:
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+) -> dict[Kind, bytes]:
     core, road, surface = graph.tile.grid, evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
     kept = evaluate(nodes["ecsrc"]).mask[window]
     return {
-        cog.NAME_HEIGHT: (cog.encode_height(heights, core), cog.MEDIA_TYPE),
-        cog.NAME_ROAD: (cog.encode_mask(kept, core), cog.MEDIA_TYPE),
-        cog.NAME_SUPPORT: (cog.encode_support(evaluate(nodes["assess"]).support, core), cog.MEDIA_TYPE),
+        HEIGHT: cog.encode_height(heights, core, reference.vertical),
+        ROAD: cog.encode_mask(kept, core),
+        SUPPORT: cog.encode_support(evaluate(nodes["assess"]).support, core),
     }
 
 
 def _npz(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], origin: tuple[float, float]
-) -> dict[str, Product]:
+    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+) -> dict[Kind, bytes]:
     surface = evaluate(nodes["fit"])
     # Planes and rasters have no NURBS form, and their npz would only repeat the input.
-    return {npz.NAME: (npz.encode(surface), npz.MEDIA_TYPE)} if isinstance(surface, NurbsSurface) else {}
+    return {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
 
 
 _ENCODERS = {"glb": _glb, "ply": _ply, "cog": _cog, "npz": _npz}

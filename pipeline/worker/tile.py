@@ -17,7 +17,7 @@ from flexroad.catalog.storage.paths import parse_location, stat
 from flexroad.pipeline.graph.graph import Node, TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.products import TileProducts, file_entry, no_nan
+from flexroad.pipeline.store.products import TileProducts, no_nan
 from flexroad.pipeline.store.records import (
     MARKERS,
     Failure,
@@ -29,8 +29,9 @@ from flexroad.pipeline.store.records import (
     to_failed,
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
-from flexroad.pipeline.worker.exports import products
+from flexroad.pipeline.worker.exports import Product, products
 from flexroad.pipeline.worker.profiling import StageCost, utc_now
+from flexroad.pipeline.worker.stac import EXTENSIONS, assets, links
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
@@ -47,6 +48,8 @@ class TileJob:
     store: str
     origin: tuple[float, float]
     """Origin of the run: whole-metre (easting, northing) that mesh translations are relative to."""
+    collection: str
+    """Id of the run's STAC collection."""
     force: frozenset[str] = frozenset()
     """Stages to compute even if their results are in the store."""
     flushed: bool = False
@@ -210,25 +213,29 @@ def _finish(job: TileJob, evaluator: Evaluator, rows: list[MetricsRow], notes: t
     with span.measure():
         files = products(job.graph, evaluator, job.origin)
         seconds = round(_seconds(evaluator), 4)
-        written = _item(job.graph, rows, files, notes, seconds)
-        job.folder.finish(written, {name: data for name, (data, _) in files.items()}, job.flushed)
+        written = _item(job, rows, files, notes, seconds)
+        job.folder.finish(written, {name: file.data for name, file in files.items()}, job.flushed)
     span.computed += 1
-    span.bytes += sum(len(data) for data, _ in files.values())
+    span.bytes += sum(len(file.data) for file in files.values())
     return from_item(written, marker_stat(job.folder, "done"))
 
 
 def _item(
-    graph: TileGraph,
+    job: TileJob,
     rows: list[MetricsRow],
-    files: Mapping[str, tuple[bytes, str]],
+    files: Mapping[str, Product],
     notes: tuple[str, ...],
     seconds: float,
 ) -> dict[str, Any]:
+    graph = job.graph
     content = item(graph.tile)
-    content["stac_extensions"].append("https://stac-extensions.github.io/file/v2.1.0/schema.json")
-    content["assets"] = {name: file_entry(name, data, kind) for name, (data, kind) in files.items()}
+    content["collection"] = job.collection
+    content["links"] = links(job.collection)
+    content["stac_extensions"] += EXTENSIONS
+    content["assets"] = assets(files, graph.export.variants, graph.tile.grid)
     content["properties"] |= {
         "created": utc_now(),
+        "gsd": graph.tile.grid.cell,
         "flexroad:fingerprint": graph.fingerprint,
         "flexroad:rows": rows,
         "flexroad:notes": list(notes),

@@ -7,7 +7,7 @@ import pytest
 from flexroad.catalog import CatalogError
 from flexroad.catalog.ids import MAX_BYTES, check, problem, safe_name
 from flexroad.catalog.text import printable, shown
-from flexroad.pipeline.worker.exports import SUFFIXES
+from flexroad.pipeline.worker.exports import KINDS
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_equal_ids_are_named_with_a_remedy():
 
 def test_longest_id_gives_file_names_below_255_bytes():
     names = [safe_name(tile_id) for tile_id in ("x" * MAX_BYTES, "/" * MAX_BYTES, "道" * (MAX_BYTES // 3))]
-    ends = [end for several in SUFFIXES.values() for end in several]
+    ends = [kind.suffix for several in KINDS.values() for kind in several]
     for name in names:
         for end in ends:
             file = f"{name}_{'v' * 80}{end}"

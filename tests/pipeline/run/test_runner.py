@@ -216,6 +216,13 @@ def test_damaged_artefact_is_computed_again(finished, executor):
     assert finished.folder(tile).path.exists()
 
 
+def test_tiles_of_an_older_version_are_exported_again_from_the_store(finished, executor, monkeypatch):
+    monkeypatch.setattr("flexroad.tasks.export.cog.VERSION", 10**6)
+    assert computed(results_of(finished, executor)) == times(4, {"export": 1})
+    monkeypatch.setattr("flexroad.pipeline.graph.products.ITEM_VERSION", 10**6)
+    assert computed(results_of(Run.open(finished.path), executor)) == times(4, {"export": 1})
+
+
 def test_missing_product_is_written_again(finished, executor):
     folder = finished.folder(finished.catalog.tiles[0].id).path
     (mesh,) = folder.glob("*.glb")
@@ -423,7 +430,11 @@ def test_item_is_valid_stac_with_checksums(run, executor):
     folder = run.folder(tile.id).path
     item = pystac.Item.from_file(str(folder / "item.json"))
     assert item.id == tile.id
-    assert {path.name for path in folder.iterdir()} == {*item.assets, "item.json"}
+    assert set(item.assets) == {"mesh", "ply", "height", "road", "support", "surface"}
+    assert {path.name for path in folder.iterdir()} == {
+        *(asset.href for asset in item.assets.values()),
+        "item.json",
+    }
     for asset in item.assets.values():
         data = (folder / asset.href).read_bytes()
         assert asset.extra_fields["file:checksum"] == "1220" + hashlib.sha256(data).hexdigest()

@@ -1,0 +1,84 @@
+"""The mosaics of a run: one VRT per raster over all done tiles."""
+
+import shutil
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+
+from flexroad.catalog import Catalog, Grid
+from flexroad.pipeline.config.loading import compose
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.run.mosaic import common_grid, write_mosaics
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from tests.whole_run import LIGHT
+
+GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 60, 60)
+
+
+@pytest.fixture(scope="module")
+def done(made_survey, tmp_path_factory) -> Run:
+    """A finished run of four tiles."""
+    folder = tmp_path_factory.mktemp("made") / "run"
+    run = Run.create(folder, compose(LIGHT, "light"), Catalog.read(made_survey / "catalog.parquet"))
+    run_tiles(run, SerialExecutor())
+    return run
+
+
+@pytest.mark.parametrize("name", ["height", "road", "support"])
+def test_mosaic_in_a_moved_run_has_the_cells_of_all_tiles(name, done, tmp_path):
+    moved = shutil.copytree(done.path, tmp_path / "elsewhere")
+    with rasterio.open(moved / f"{name}.vrt") as mosaic:
+        whole = mosaic.read(1)
+        assert mosaic.crs.to_epsg() == 25832
+        assert whole.shape == (120, 120)
+        for tile in done.catalog.tiles:
+            with rasterio.open(moved / "tiles" / tile.id / f"{tile.id}_flexroad_{name}.tif") as raster:
+                window = mosaic.window(*tile.grid.bounds)
+                np.testing.assert_array_equal(mosaic.read(1, window=window), raster.read(1))
+                assert mosaic.dtypes == raster.dtypes
+                assert mosaic.descriptions == raster.descriptions == (name,)
+                assert mosaic.units == raster.units
+                assert str(mosaic.nodata) == str(raster.nodata)
+                assert mosaic.colorinterp == raster.colorinterp
+    assert np.ptp(whole) > 0
+
+
+def test_mosaic_names_the_classes(done):
+    names = [category.text for category in ET.parse(done.path / "support.vrt").iter("Category")]
+    assert names == ["outside", "measured", "dtm", "inferred"]
+
+
+def test_mosaic_of_some_tiles_has_nodata_elsewhere(done, tmp_path):
+    moved = Run.open(shutil.copytree(done.path, tmp_path / "part"))
+    tiles = [done.catalog.tiles[0], done.catalog.tiles[3]]
+    assert [kind.key for kind in write_mosaics(moved, tiles)] == ["height", "road", "support"]
+    with rasterio.open(moved.path / "height.vrt") as mosaic:
+        assert np.isnan(mosaic.read(1)).mean() == 0.5
+
+
+def test_tiles_of_different_lattices_have_no_mosaic(done, tmp_path):
+    moved = Run.open(shutil.copytree(done.path, tmp_path / "mixed"))
+    tiles = done.catalog.tiles
+    shifted = replace(tiles[1], grid=replace(tiles[1].grid, west=tiles[1].grid.west + 0.5))
+    assert write_mosaics(moved, [tiles[0], shifted]) == []
+    assert not list(moved.path.glob("*.vrt"))
+
+
+@pytest.mark.parametrize(
+    ("change", "shape"),
+    [
+        ({"west": 500060.0}, (60, 120)),
+        ({"west": 499000.0, "north": 5600300.0}, (360, 1060)),
+        ({"west": 500060.25}, None),
+        ({"cell": 0.5}, None),
+        ({"crs": "EPSG:25833"}, None),
+        ({"west": 5e9}, None),
+    ],
+)
+def test_common_grid_holds_the_cells_of_all_tiles(change, shape):
+    common = common_grid([GRID, replace(GRID, **change)])
+    assert (common and common.shape) == shape
