@@ -62,7 +62,7 @@ SUPPORT = Band(
     "support",
     "Source of the surface's height",
     "uint8",
-    nodata=float(Support.NONE),
+    nodata=int(Support.NONE),
     classes=(
         RasterClass(Support.NONE, "outside", "Beyond the survey", (255, 255, 255)),
         RasterClass(Support.MEASURED, "measured", "The surface model shows the ground", (90, 160, 90)),
