@@ -48,7 +48,7 @@ def run_tiles(
     watch: Callable[[TileResult], None] = lambda result: None,
     verify: bool = False,
 ) -> Summary:
-    """Bring the run's tiles up to date, write the tables, then summary.json.
+    """Bring the run's tiles up to date, write the tables, mosaics and collection, then summary.json.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def run_tiles(
     ConfigError
         If `check_inputs` raises, or each of several tiles lacks a file.
     OSError
-        If the database or the tables cannot be written, for example on a full disk.
+        If the database, the tables, the mosaics or the collection cannot be written, as on a full disk.
     """
     check_inputs(run.config, run.catalog)
     remove_abandoned()

@@ -293,7 +293,7 @@ def test_run_cached_makes_few_requests(run, storage):
     storage.requests()
     run_tiles(run, SerialExecutor())
     first = storage.requests()
-    # Requests per file and artefact: stat, write or read, stat; the headers of DSM and DTM are read once more.
+    # Requests per file and artefact: stat, write or read, stat. Headers of DSM and DTM are read once more.
     assert len(first) / 4 < 47
     run_tiles(Run.open(run.path), SerialExecutor())
     again = [path for _, path in storage.requests()]
