@@ -240,8 +240,8 @@ def _run_tiles(
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
     if summary.done and summary.without_roads == summary.done:
         warn(
-            "no tile of this run has a road; if there are roads, check the road source of the catalog and "
-            "the options of segment"
+            "no tile of this run has a road that the filter keeps; if there are roads, check the road source "
+            "of the catalog and the options of segment and ecsrc"
         )
     if summary.failed:
         echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")

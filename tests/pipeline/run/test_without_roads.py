@@ -102,7 +102,7 @@ def test_command_counts_tiles_without_roads_apart(half, flexroad, tmp_path):
     where = half.tiles[0].root + "/catalog.parquet"
     words = ["run", "--config", config, "--catalog", where, "--out", out, "--executor", "serial"]
     alone = flexroad(*words, "--tile", half.tiles[BARE[0]].id).expected(0)
-    assert "warning: no tile of this run has a road; if there are roads, check the road source" in alone.err
+    assert "warning: no tile of this run has a road that the filter keeps; if there are roads" in alone.err
     prometheus = tmp_path / "run.prom"
     said = flexroad(*words, "--prometheus", prometheus).expected(0)
     line = "4 tiles: 4 done (1 cached, 2 without roads), 0 failed, 0 pending"
