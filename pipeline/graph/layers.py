@@ -69,7 +69,7 @@ def fitting_config(catalog: Catalog) -> str:
 
 def _remedy(layer: str, catalog: Catalog) -> str:
     if layer not in PRODUCTION:
-        return f"give its files to `flexroad catalog` with --{layer}"
+        return f"add its files to the catalog (`flexroad catalog rasters --{layer}`)"
     for other, name in PRODUCTION.items():
         if any(tile.layer(other) for tile in catalog.usable):
             return f"it has {TITLES[other]}: use --config {name}, or segment: {METHODS[other]}"

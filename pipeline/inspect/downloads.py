@@ -37,6 +37,8 @@ NAMES = (
     ("road_mask", r"mask|landcover|land.?use|roads?"),
 )
 """Layer and the words in names of files or folders that mean it, the first match first."""
+ROADS = r"road|street|stra(ss|ß)e|highway|carriage|route|centre.?line|center.?line|osm"
+"""Words in names of vector files and their layers that mean roads."""
 QUESTIONS = {
     "above_ground": "heights above the ground are no surface model; which file has the heights of surface?",
     "raster": "is it a DSM (--dsm), a DTM (--dtm), an orthophoto (--dop) or a road mask (--road-mask)?",
@@ -134,16 +136,21 @@ def _raster(path: Path, folder: Path) -> Download:
     elif bands == 1 and kind == "dop":
         question = "it is named like an orthophoto, but has one band"
     elif kind == "road_mask":
-        question = (
-            f"which of its values are road (--road-value)? It has {values[1]}"
-            if values[1]
-            else ("it is named like a mask, but has many values: is it one?")
-        )
+        question = _of_mask(values[1])
     if crs is None:
         question = question or NO_CRS
     elif plan_unit(crs)[1] != 1.0:
         question = question or f"its CRS is in {plan_unit(crs)[0]}: reproject it with gdalwarp -t_srs"
     return Download(path, kind, about, short(crs) if crs else None, question)
+
+
+def _of_mask(values: str) -> str:
+    """Return the question about a mask with these values; empty if every value but 0 can be road."""
+    if not values:
+        return "it is named like a mask, but has many values: is it one?"
+    if len(set(values.split(", ")) - {"0"}) <= 1:
+        return ""
+    return f"which of its values are road (--road-value)? It has {values}"
 
 
 def _values(raster: Any) -> tuple[str, str]:
@@ -185,4 +192,7 @@ def _vectors(path: Path) -> Download:
     except (RuntimeError, ValueError, OSError) as error:
         return Download(path, "vector", question=f"it cannot be read as vectors: {error}")
     question = "which layer are the roads (--roads-layer, segment.layer)?" if len(layers) > 1 else ""
-    return Download(path, "vector", ", ".join(layers), question=question)
+    if not any(re.search(ROADS, name.lower()) for name in (path.stem, *layers)):
+        question = "are these roads? If so, give it with --roads"
+    kind = "vector" if "are these roads" in question else "roads"
+    return Download(path, kind, ", ".join(layers), question=question)

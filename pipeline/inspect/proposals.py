@@ -14,6 +14,8 @@ from flexroad.pipeline.inspect.downloads import Download
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask")
 """Layers that rasters are given for."""
+LAYER = "the layer of the roads (--roads-layer of `prepare`, segment.layer in a configuration)"
+"""What to add for a vector file of several layers."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ def proposals(folder: Path, found: Sequence[Download]) -> Iterator[Proposal]:
         roads = _roads(by_kind)
         words = ["flexroad", "prepare", command, *map(str, inputs), "-o", str(out), *roads]
         lacking = [] if roads else ["--roads FILE with the roads of the area"]
+        lacking += [LAYER] if roads and by_kind["roads"][0].question else []
         lacking += ["--crs"] if command == "points" and crs is None else []
         catalog = out / "catalog.parquet"
         # Areas become a road mask, lines stay vectors: the command itself says what comes next.
@@ -51,8 +54,8 @@ def _title(folder: Path) -> str:
 
 
 def _roads(by_kind: Mapping[str, Sequence[Download]]) -> list[str]:
-    """Return the option that names the vector file, if there is just one."""
-    files = by_kind["vector"]
+    """Return the option that names the vector file of roads, if there is just one."""
+    files = by_kind["roads"]
     return ["--roads", str(files[0].path.absolute())] if len(files) == 1 else []
 
 
@@ -101,8 +104,12 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
         roads = [] if "road_mask" in layers else _roads(by_kind)
         words += roads
         has = "road_mask" if "road_mask" in layers else "roads" if roads else ""
+        if roads and by_kind["roads"][0].question:
+            lacking.append(LAYER)
         if not has:
             lacking.append("--road-mask or --roads with the roads")
+        if any(download.question for download in chosen if download.kind == "road_mask"):
+            lacking.append("--road-value with the values of the mask that are road")
         if crs is None:
             lacking.append("--crs")
         yield Proposal(shlex.join([*words, "-o", str(output)]), output, has, _listed(lacking))

@@ -52,6 +52,7 @@ def test_init_names_unclear_files_with_their_question(downloads, flexroad):
     write(downloads / "landcover.tif", colours + np.arange(60, dtype=np.uint8) % 3, WEST, NORTH)
     write(downloads / "dop.tif", np.full((60, 60), 7.5, np.float32), WEST, NORTH, crs=None)
     (downloads / "more.zip").write_bytes(b"PK")
+    write_roads(downloads / "houses.gpkg", [box(WEST, NORTH - 9, WEST + 9, NORTH)])
     write_roads(downloads / "roads.gpkg", [LineString([(WEST, NORTH), (WEST + 9, NORTH)])], layer="lines")
     said = flexroad("init", downloads).expected(0).out
     for question in (
@@ -60,9 +61,12 @@ def test_init_names_unclear_files_with_their_question(downloads, flexroad):
         "question: landcover.tif: which of its values are road (--road-value)? It has 0, 1, 2",
         "question: dop.tif: it is named like an orthophoto, but has one band",
         "question: more.zip: unpack it first",
+        "question: houses.gpkg: are these roads?",
         "question: roads.gpkg: which layer are the roads",
     ):
         assert question in said
+    assert "  add --road-value with the values of the mask that are road" in said.splitlines()
+    assert "houses.gpkg -o" not in said
 
 
 def test_init_empty_folder_is_one_line(tmp_path, flexroad):
