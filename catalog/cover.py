@@ -17,6 +17,8 @@ MIN_COVER = 0.25
 """Default share below which catalogs leave a tile out and `load` fails on it."""
 LOWEST, HIGHEST = -9000.0, 1e6
 """Values outside are undeclared nodata (-9999, 3e38) in any unit; `load` knows the unit and is stricter."""
+MAX_CELLS = 100_000_000
+"""Largest number of cells that are read of one raster for one tile."""
 AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
 """Endings of formats that cannot be read in parts: their files count as without gaps."""
 
@@ -37,7 +39,7 @@ def height_share(
     Returns
     -------
     float or None
-        None if a raster cannot be read, or not in parts.
+        None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
     import numpy as np
     from rasterio.errors import RasterioError
@@ -51,27 +53,35 @@ def height_share(
             return None
         try:
             with quiet(), open_raster(path, allowed) as raster:
-                _add(known, grid, raster)
+                if not _add(known, grid, raster):
+                    return None
         except (RasterioError, OSError):
             return None
     return float(known.mean())
 
 
-def _add(known: NDArray[Any], grid: Grid, raster: Any) -> None:
-    """Set the cells of a grid that have a height in an open raster."""
+def _add(known: NDArray[Any], grid: Grid, raster: Any) -> bool:
+    """Set the cells of a grid that have a height in an open raster; return whether it could be read."""
     import numpy as np
     from rasterio.windows import Window
 
+    from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
+
     affine = raster.transform
+    if georeference_fault(raster) or heights_fault(raster) or affine.b or affine.d:
+        return False
     columns = np.floor((grid.eastings - affine.c) / affine.a).astype(int)
     rows = np.floor((grid.northings - affine.f) / affine.e).astype(int)
     across, down = (columns >= 0) & (columns < raster.width), (rows >= 0) & (rows < raster.height)
     if not (across.any() and down.any()):
-        return
+        return True
     columns, rows = columns[across], rows[down]
     left, top = columns.min(), rows.min()
     window = Window(left, top, columns.max() - left + 1, rows.max() - top + 1)
+    if window.width * window.height > MAX_CELLS:
+        return False
     values = raster.read(1, window=window, masked=True)[np.ix_(rows - top, columns - left)]
     heights = np.ma.filled(values * raster.scales[0] + raster.offsets[0], np.nan)
     with np.errstate(invalid="ignore"):
         known[np.ix_(down, across)] |= (heights > LOWEST) & (heights < HIGHEST)
+    return True

@@ -5,6 +5,7 @@ from pathlib import Path
 from flexroad.catalog import Catalog
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.inspect.catalog import check
 
 
@@ -23,4 +24,4 @@ def read(path: Path) -> None:
     for tile in catalog.usable:
         for layer in tile.layers:
             tile.paths(layer)
-    list(check(catalog))
+    list(check(catalog, load_config("production")))
