@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from flexroad.catalog.cover import MIN_COVER
-from flexroad.pipeline.cli.command import MIN_COVER_HELP, Allow, Command
+from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import MIN_COVER_HELP, Command
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 
@@ -18,39 +19,70 @@ if TYPE_CHECKING:
 
 catalogs = typer.Typer(no_args_is_help=True, help="Make, show and check catalogs of tiles.")
 
-Output = Annotated[Path, typer.Option("-o", "--output", help="Catalog to write: .parquet or .json.")]
+Output = Annotated[
+    Path,
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="Catalog to write: .parquet, .json or .geojson.",
+        rich_help_panel=options.OUTPUTS,
+    ),
+]
+
+
+def _files(meaning: str, metavar: str = "PATTERN") -> Any:
+    """Return an option that names input files."""
+    return typer.Option(metavar=metavar, help=meaning, rich_help_panel=options.INPUTS)
+
+
+RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")]
 RoadValue = Annotated[
-    list[int] | None, typer.Option(help="Values of the mask that mean road; default: all except 0.")
+    list[int] | None, _files("Values of the mask that mean road; default: all except 0.", "N")
 ]
-Roads = Annotated[
-    str | None, typer.Option(help="Vector files of roads: a file, or a pattern relative to ROOT.")
+Roads = Annotated[str | None, _files("Vector files of roads: a file, or a pattern relative to ROOT.")]
+Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
+Date = Annotated[
+    datetime | None,
+    typer.Option(
+        metavar="YYYY-MM-DD",
+        help="Date of the survey.",
+        rich_help_panel=options.INPUTS,
+    ),
 ]
-TileSize = Annotated[float, typer.Option(help="Size of a tile in m.")]
-MinCover = Annotated[float, typer.Option(min=0, max=1, help=MIN_COVER_HELP)]
-Date = Annotated[datetime | None, typer.Option(help="Date of the survey.")]
+TileSize = Annotated[
+    float, typer.Option(metavar="M", help="Size of a tile in m.", rich_help_panel=options.TILES)
+]
+MinCover = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        max=1,
+        metavar="X",
+        help=MIN_COVER_HELP,
+        rich_help_panel=options.TILES,
+    ),
+]
+Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
 
 
 @catalogs.command("rasters", cls=Command)
 def catalog_rasters(
-    root: Annotated[Path, typer.Argument(help="Folder of rasters.")],
-    dsm: Annotated[str, typer.Option(help="Files of the surface model, relative to ROOT ('dsm/*.tif').")],
-    dtm: Annotated[str, typer.Option(help="Files of the terrain model.")],
+    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters.")],
+    dsm: Annotated[str, _files("Surface model: files relative to ROOT, as 'dsm/*.tif'.")],
+    dtm: Annotated[str, _files("Terrain model.")],
     output: Output,
-    dop: Annotated[str | None, typer.Option(help="Files of the orthophoto.")] = None,
-    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    dop: Annotated[str | None, _files("Orthophoto.")] = None,
+    road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
-    reference: Annotated[
-        str | None, typer.Option(help="Files of reference heights, for the evaluation.")
-    ] = None,
-    reference_road: Annotated[
-        str | None, typer.Option(help="Files of the reference road mask, for the evaluation.")
-    ] = None,
+    reference: Annotated[str | None, _files("Reference heights, for the evaluation.")] = None,
+    reference_road: Annotated[str | None, _files("Reference road mask, for the evaluation.")] = None,
+    crs: Crs = None,
+    date: Date = None,
+    allow: options.Allow = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
-    date: Date = None,
-    crs: Annotated[str | None, typer.Option(help="CRS of files without one: EPSG:25832.")] = None,
-    allow: Allow = None,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
     from flexroad.catalog.sources import rasters
@@ -79,17 +111,23 @@ def catalog_rasters(
 
 @catalogs.command("nrw", cls=Command)
 def catalog_nrw(
-    root: Annotated[Path, typer.Argument(help="Folder of Geobasis NRW downloads with their original names.")],
+    root: Annotated[
+        Path,
+        typer.Argument(metavar="ROOT", help="Folder of Geobasis NRW downloads with their original names."),
+    ],
     output: Output,
-    road_mask: Annotated[str | None, typer.Option(help="Files of the road mask or land cover.")] = None,
+    road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
-    """Cut downloads of Geobasis NRW (dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm) into tiles."""
+    """Cut downloads of Geobasis NRW into tiles.
+
+    Files keep their original names, as dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm.
+    """
     from flexroad.catalog.sources import nrw
 
     result = nrw.index(
@@ -106,13 +144,11 @@ def catalog_nrw(
     _write_catalog(result, output)
 
 
-@catalogs.command("gerod")
+@catalogs.command("gerod", cls=Command)
 def catalog_gerod(
-    root: Annotated[Path, typer.Argument(help="Folder of the paper's GeRoD dataset.")],
+    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of the paper's GeRoD dataset.")],
     output: Output,
-    layout: Annotated[
-        str, typer.Option(help="Configuration whose `dataset` gives the file names.")
-    ] = "gerod",
+    layout: Layout = "gerod",
     date: Date = None,
 ) -> None:
     """List the tiles of the GeRoD dataset."""
@@ -122,13 +158,11 @@ def catalog_gerod(
     _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output, layout)
 
 
-@catalogs.command("dsc3d")
+@catalogs.command("dsc3d", cls=Command)
 def catalog_dsc3d(
-    root: Annotated[Path, typer.Argument(help="Folder of rasters of DSC3D's scenes.")],
+    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters of DSC3D's scenes.")],
     output: Output,
-    layout: Annotated[
-        str, typer.Option(help="Configuration whose `dataset` gives the file names.")
-    ] = "dsc3d",
+    layout: Layout = "dsc3d",
     date: Date = None,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
@@ -149,23 +183,26 @@ def _write_catalog(result: TilingResult, output: Path, config: str | None = None
     echo(after_catalog(output, config))
 
 
-@catalogs.command("synthetic")
+@catalogs.command("synthetic", cls=Command)
 def catalog_synthetic(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")],
     preset: Annotated[
-        str | None,
+        Literal["gerod", "dsc3d"] | None,
         typer.Option(
             help="gerod: separate tiles as in the paper; dsc3d: five meshes; default: adjacent tiles."
         ),
     ] = None,
     tiles: Annotated[
-        int | None, typer.Option(min=1, help="Number of tiles; default: 4, or all of the preset.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Number of tiles; default: 4, or all of the preset."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the scenes.")] = 0,
-    tile_size: Annotated[int | None, typer.Option(min=10, help="Size of a tile in m; default: 250.")] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the scenes.")] = 0,
+    tile_size: Annotated[
+        int | None, typer.Option(min=10, metavar="M", help="Size of a tile in m; default: 250.")
+    ] = None,
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:
-    """Make synthetic scenes: survey rasters, reference rasters and a catalog."""
+    """Make synthetic scenes with known truth, and their catalog."""
     from flexroad.catalog import Catalog
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
@@ -174,8 +211,8 @@ def catalog_synthetic(
     echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 
 
-@catalogs.command("show")
-def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> None:
+@catalogs.command("show", cls=Command)
+def catalog_show(path: options.CatalogFile) -> None:
     """List the tiles of a catalog."""
     from flexroad.catalog import Catalog
 
@@ -192,15 +229,23 @@ def catalog_show(path: Annotated[Path, typer.Argument(metavar="CATALOG")]) -> No
     echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
 
 
-@catalogs.command("check")
+@catalogs.command("check", cls=Command)
 def catalog_check(
-    path: Annotated[Path, typer.Argument(metavar="CATALOG")],
+    path: options.CatalogFile,
     config: Annotated[
-        str | None, typer.Option(help="Configuration of the run; default: the one that fits the layers.")
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Configuration of the run; default: the one that fits the layers.",
+            rich_help_panel=options.INPUTS,
+        ),
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
-    """Check a catalog: layers, what would fail in a run, and the shift between photo and heights."""
+    """Check a catalog before a long run.
+
+    Prints layers, what would fail in a run, and the shift between photo and heights.
+    """
     from flexroad.catalog import Catalog
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.layers import fitting_config

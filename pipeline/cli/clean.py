@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 
 def clean(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    path: options.Run,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files, delete nothing.")] = False,
     forget: Annotated[
         list[str] | None,
         typer.Option(metavar="RUN", help="Another run of the same store that no longer exists; repeatable."),
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
-    """Delete what no run needs: unused artefacts, files of removed tiles and products, temporary files."""
+    """Delete files that no run needs.
+
+    These are unused stage results, files of removed tiles and products, and temporary files.
+    """
     from flexroad.catalog.storage.paths import absolute, parse_location
     from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
     from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage

@@ -1,19 +1,19 @@
-"""Typer command class: options with several values, and a notification if the command line is invalid."""
+"""Typer command class: options with several values, help pages with headings, a notification if invalid."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from typer.core import TyperCommand
 
 from flexroad.pipeline.cli.lifecycle import notify_invalid_command
+from flexroad.pipeline.cli.options import HEADINGS
 
-Allow = Annotated[
-    list[str] | None,
-    typer.Option(metavar="DIR|URL", help="Allow source files in this folder, too; repeatable."),
-]
+OTHERS = "Options"
+MAX_NAME = 30
+"""Longest name of an option, with its values, beside which a help page writes the meaning."""
 
 MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
@@ -35,6 +35,30 @@ class Command(TyperCommand):
             if target := params.get("on_failure"):
                 notify_invalid_command(params.get("out") or params.get("path"), target)
             raise
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments and options of the help page, by their `rich_help_panel`.
+
+        Typer does this only with rich, whose error messages have several lines.
+        """
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            if record := param.get_help_record(ctx):
+                name, text = record
+                if param.param_type_name == "argument":
+                    # Its type adds nothing to its name.
+                    groups.setdefault("Arguments", []).append((name.partition(" <")[0], text))
+                else:
+                    heading = getattr(param, "rich_help_panel", None) or OTHERS
+                    groups.setdefault(heading, []).append((name, text))
+        # One width for all groups; names that are longer have a line of their own.
+        lengths = [len(name) for records in groups.values() for name, _ in records]
+        width = max((length for length in lengths if length <= MAX_NAME), default=MAX_NAME)
+        for heading in sorted(groups, key=["Arguments", *HEADINGS, OTHERS].index):
+            with formatter.section(
+                heading if len(groups) > 1 + ("Arguments" in groups) or heading == "Arguments" else "Options"
+            ):
+                formatter.write_dl([(name.ljust(width), text) for name, text in groups[heading]], width)
 
     def _repeated(self, words: Sequence[str]) -> list[str]:
         if (

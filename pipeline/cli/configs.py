@@ -6,15 +6,19 @@ from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.stdio import echo, echo_document
 
 configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
 
 
-@configs.command("show")
+@configs.command("show", cls=Command)
 def config_show(
     name: Annotated[
-        str | None, typer.Argument(help="A YAML file or a shipped name; default: list the shipped ones.")
+        str | None,
+        typer.Argument(
+            metavar="NAME|FILE", help="A YAML file or a shipped name; default: list the shipped ones."
+        ),
     ] = None,
 ) -> None:
     """Show every option of every variant of a configuration."""

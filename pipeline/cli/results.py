@@ -4,27 +4,35 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo, echo_document
-from flexroad.pipeline.errors import ConfigError
+
+Output = Annotated[
+    Path,
+    typer.Option("-o", "--output", metavar="DIR", help="Folder to write.", rich_help_panel=options.OUTPUTS),
+]
 
 
 def report(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
-    form: Annotated[str, typer.Option("--format", help="md, csv or html.")] = "md",
-    allow: Allow = None,
+    path: options.Run,
+    form: Annotated[
+        Literal["md", "csv", "html"],
+        typer.Option("--format", help="html: one page with pictures.", rich_help_panel=options.OUTPUTS),
+    ] = "md",
+    allow: options.Allow = None,
 ) -> None:
-    """Write RUN/report.<format>: the paper's main table for this run, worst tiles, height steps, failures."""
+    """Write a report on a run: metrics, worst tiles, steps, failures.
+
+    The file is RUN/report.md, .csv or .html.
+    """
     from flexroad.catalog.storage.paths import read
-    from flexroad.pipeline.report import FORMATS, write_report
+    from flexroad.pipeline.report import write_report
     from flexroad.pipeline.run.record import Run
 
-    if form not in FORMATS:
-        raise ConfigError(f"--format {form}: there are {', '.join(FORMATS)}")
     written = write_report(Run.open(path, allow or ()), form)
     if form != "html":
         echo_document(read(written).decode())
@@ -32,22 +40,37 @@ def report(
 
 
 def tables(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    path: options.Run,
+    output: Output,
     true: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="The same tiles, run with the true road mask.")
+        Path | None,
+        typer.Option(
+            metavar="RUN", help="The same tiles, run with the true road mask.", rich_help_panel=options.INPUTS
+        ),
     ] = None,
     dsc3d: Annotated[
         Path | None,
-        typer.Option(metavar="RUN", help="A run for the rows of DSC3D: of its scenes or of synthetic ones."),
+        typer.Option(
+            metavar="RUN",
+            help="A run for the rows of DSC3D: of its scenes or of synthetic ones.",
+            rich_help_panel=options.INPUTS,
+        ),
     ] = None,
     dsc3d_true: Annotated[
         Path | None,
-        typer.Option("--dsc3d-true", metavar="RUN", help="The same scenes, run with the true reference."),
+        typer.Option(
+            "--dsc3d-true",
+            metavar="RUN",
+            help="The same scenes, run with the true reference.",
+            rich_help_panel=options.INPUTS,
+        ),
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
-    """Write the paper's tables and claims next to the values of a run: Markdown, LaTeX, CSV, HTML."""
+    """Write the paper's tables and claims beside the values of a run.
+
+    They are Markdown, LaTeX, CSV and HTML.
+    """
     from flexroad.pipeline.reproduce.tables import write_comparison
     from flexroad.pipeline.run.record import Run
 
@@ -58,14 +81,18 @@ def tables(
 
 
 def figures(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")],
+    path: options.Run,
+    output: Output,
     tile: Annotated[
-        str | None, typer.Option(help="Tile of the maps; default: the one with the median road L2.")
+        str | None,
+        typer.Option(metavar="ID", help="Tile of the maps; default: the one with the median road L2."),
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
-    """Draw the paper's figures from a run, as PDF and PNG with a page of captions."""
+    """Draw the paper's figures from a run.
+
+    They are PDF and PNG, with a page of captions.
+    """
     from flexroad.pipeline.reproduce.figures import write_figures
     from flexroad.pipeline.run.record import Run
 
@@ -75,12 +102,13 @@ def figures(
 
 
 def query(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
-    points: Annotated[Path, typer.Option(help="CSV with columns easting and northing (m).")],
+    path: options.Run,
+    points: Annotated[Path, typer.Option(metavar="FILE", help="CSV with columns easting and northing (m).")],
     variant: Annotated[
-        str | None, typer.Option(help="Variant of the surface; default: the exported one.")
+        str | None,
+        typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
     """Print height, unit normal, tile and class at points, as CSV."""
     from flexroad.pipeline.inspect.points import query_csv

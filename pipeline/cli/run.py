@@ -7,12 +7,12 @@ import shlex
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from flexroad.pipeline.cli.command import Allow
-from flexroad.pipeline.cli.lifecycle import ON_FAILURE, Outcome, format_summary, report_outcome, warn
+from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 
@@ -25,58 +25,72 @@ if TYPE_CHECKING:
     from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.worker.tile import TileResult
 
-Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: one per core.")]
-Scheduler = Annotated[str | None, typer.Option(help="Address of a running Dask scheduler.")]
-ExecutorName = Annotated[str, typer.Option("--executor", help="dask, or serial: one process, for debugging.")]
-Dashboard = Annotated[bool, typer.Option("--dashboard", help="Serve Dask's dashboard and print its address.")]
-Verify = Annotated[
-    bool, typer.Option("--verify", help="Compare the checksums of all products, not only their sizes.")
-]
-OnFailure = Annotated[
-    str | None,
-    typer.Option(
-        metavar="CMD|URL",
-        envvar=ON_FAILURE,
-        help="Shell command or web address (POST) that gets a summary if the exit code is not 0.",
-    ),
-]
-Prometheus = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Text file for Prometheus (.prom), updated during the run."),
-]
+StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess"]
 
 
 @ignore_write_errors()
 def run(
-    catalog: Annotated[Path, typer.Option(help="Catalog of tiles.")],
-    out: Annotated[Path, typer.Option(metavar="RUN", help="Folder of the run; an existing run is resumed.")],
+    catalog: Annotated[
+        Path, typer.Option(metavar="FILE", help="Catalog of tiles.", rich_help_panel=options.INPUTS)
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="RUN",
+            help="Folder of the run; an existing run is resumed.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ],
     config: Annotated[
-        str, typer.Option(help="Configuration: a YAML file or a shipped name (`flexroad config show`).")
+        str,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Configuration: a shipped name, as production, or a YAML file.",
+            rich_help_panel=options.INPUTS,
+        ),
     ] = "production",
-    tile: Annotated[list[str] | None, typer.Option(help="Only these tiles.")] = None,
+    allow: options.Allow = None,
+    checksum: Annotated[
+        bool,
+        typer.Option(
+            "--checksum",
+            help="Detect changed sources by content, not by size and time.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = False,
+    store: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of stage results that several runs share.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ] = None,
+    verify: options.Verify = False,
+    tile: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Only these tiles: --tile ID ID ...", rich_help_panel=options.TILES),
+    ] = None,
     bbox: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(metavar="W S E N", help="Only tiles in these bounds (m)."),
+        typer.Option(
+            metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=options.TILES
+        ),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    executor: ExecutorName = "dask",
-    dashboard: Dashboard = False,
-    store: Annotated[
-        Path | None, typer.Option(help="Folder of stage results that several runs share.")
-    ] = None,
-    checksum: Annotated[
-        bool, typer.Option(help="Detect changed sources by content, not by size and time.")
-    ] = False,
-    allow: Allow = None,
-    verify: Verify = False,
-    on_failure: OnFailure = None,
-    prometheus: Prometheus = None,
+    executor: options.Executor = "dask",
+    workers: options.Workers = None,
+    scheduler: options.Scheduler = None,
+    dashboard: options.Dashboard = False,
+    on_failure: options.OnFailure = None,
+    prometheus: options.Prometheus = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the graph and what would fail, compute nothing.")
+        bool, typer.Option("--dry-run", help="Print what would be computed and what would fail.")
     ] = False,
 ) -> None:
-    """Bring every tile up to date; after an interruption the same command resumes the run."""
+    """Bring every tile of a run up to date.
+
+    After an interruption, the same command resumes the run.
+    """
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import parse_location
@@ -125,22 +139,35 @@ def run(
 
 @ignore_write_errors()
 def rerun(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
-    tile: Annotated[list[str] | None, typer.Option(help="These tiles.")] = None,
-    failed: Annotated[bool, typer.Option("--failed", help="The tiles that failed.")] = False,
-    from_stage: Annotated[
-        str | None, typer.Option("--from", metavar="STAGE", help="Recompute this stage and all later ones.")
+    path: options.Run,
+    tile: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="These tiles: --tile ID ID ...", rich_help_panel=options.TILES),
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    executor: ExecutorName = "dask",
-    dashboard: Dashboard = False,
-    allow: Allow = None,
-    verify: Verify = False,
-    on_failure: OnFailure = None,
-    prometheus: Prometheus = None,
+    failed: Annotated[
+        bool, typer.Option("--failed", help="The tiles that failed.", rich_help_panel=options.TILES)
+    ] = False,
+    from_stage: Annotated[
+        StageName | None,
+        typer.Option(
+            "--from",
+            help="Recompute this stage and all later ones.",
+            rich_help_panel=options.TILES,
+        ),
+    ] = None,
+    allow: options.Allow = None,
+    verify: options.Verify = False,
+    executor: options.Executor = "dask",
+    workers: options.Workers = None,
+    scheduler: options.Scheduler = None,
+    dashboard: options.Dashboard = False,
+    on_failure: options.OnFailure = None,
+    prometheus: options.Prometheus = None,
 ) -> None:
-    """Bring tiles of a run up to date after changes of source files or of RUN/config.yaml."""
+    """Bring tiles of a run up to date again.
+
+    For changes of source files or of RUN/config.yaml, and for failed tiles.
+    """
     from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.graph.borders import STAGE as BORDER
@@ -151,8 +178,6 @@ def rerun(
 
     location = parse_location(path)
     with report_outcome(location, on_failure, prometheus) as outcome:
-        if from_stage is not None and from_stage not in STAGE_NAMES:
-            raise ConfigError(f"--from {from_stage}: no such stage; there are {', '.join(STAGE_NAMES)}")
         force = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
         # The control points of a border are part of the fit.
         force |= {BORDER} if "fit" in force else frozenset()
@@ -191,9 +216,7 @@ def _executor(
 
     if name == "serial":
         return SerialExecutor()
-    if name == "dask":
-        return DaskExecutor(workers, scheduler, cluster, dashboard, say)
-    raise ConfigError(f"--executor {name}: there are dask and serial")
+    return DaskExecutor(workers, scheduler, cluster, dashboard, say)
 
 
 def _run_tiles(
@@ -267,12 +290,12 @@ def _exit(outcome: Outcome) -> None:
 
 
 def status(
-    path: Annotated[Path, typer.Argument(metavar="RUN")],
+    path: options.Run,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
     geojson: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a map of the tile states, for QGIS.")
     ] = None,
-    allow: Allow = None,
+    allow: options.Allow = None,
 ) -> None:
     """Show the state of a run and the failures of its tiles."""
     from flexroad.catalog.storage.paths import parse_location

@@ -9,46 +9,95 @@ from typing import Annotated, Any, Literal
 import typer
 
 from flexroad.catalog.text import printable, shown
-from flexroad.pipeline.cli.command import Allow
+from flexroad.pipeline.cli import options as shared
 from flexroad.pipeline.cli.stdio import echo
 
 
 def train(
-    catalog: Annotated[Path, typer.Argument(metavar="CATALOG")],
+    catalog: shared.CatalogFile,
     method: Annotated[
         Literal["pixels", "dinov2"],
         typer.Option(
-            help="pixels: decision trees on heights and, if available, photo; dinov2: on the photo."
+            help="pixels: decision trees on heights and, if available, photo; dinov2: on the photo.",
+            rich_help_panel=shared.METHOD,
         ),
     ],
     labels: Annotated[
         Literal["mask", "vector"],
-        typer.Option(help="mask: the catalog's reference road or road mask; vector: its vector roads."),
+        typer.Option(
+            help="mask: the catalog's reference road or road mask; vector: its vector roads.",
+            rich_help_panel=shared.INPUTS,
+        ),
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="MODEL", help="Model file; the report is written beside it."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="MODEL",
+            help="Model file; the report is written beside it.",
+            rich_help_panel=shared.OUTPUTS,
+        ),
     ],
     config: Annotated[
-        str, typer.Option(help="Configuration with the options of load and segment.")
+        str,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Configuration with the options of load and segment.",
+            rich_help_panel=shared.INPUTS,
+        ),
     ] = "paper",
     validation: Annotated[
-        float, typer.Option(min=0.05, max=0.9, help="Fraction of the tiles for validation.")
+        float,
+        typer.Option(
+            min=0.05,
+            max=0.9,
+            metavar="X",
+            help="Fraction of the tiles for validation.",
+            rich_help_panel=shared.VALIDATION,
+        ),
     ] = 0.3,
     gap_m: Annotated[
-        float, typer.Option("--gap-m", min=0, help="Distance of training cells from validation tiles (m).")
+        float,
+        typer.Option(
+            "--gap-m",
+            min=0,
+            metavar="M",
+            help="Distance of training cells from validation tiles (m).",
+            rich_help_panel=shared.VALIDATION,
+        ),
     ] = 50.0,
     ignore_m: Annotated[
-        float, typer.Option("--ignore-m", min=0, help="Distance of training cells from edges of labels (m).")
+        float,
+        typer.Option(
+            "--ignore-m",
+            min=0,
+            metavar="M",
+            help="Distance of training cells from edges of labels (m).",
+            rich_help_panel=shared.VALIDATION,
+        ),
     ] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the split and of the training.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, metavar="N", help="Seed of the split and of the training.", rich_help_panel=shared.METHOD
+        ),
+    ] = 0,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Option of the method's training; repeatable."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Option of the method's training; repeatable.",
+            rich_help_panel=shared.METHOD,
+        ),
     ] = None,
-    allow: Allow = None,
+    allow: shared.Allow = None,
 ) -> None:
-    """Train a segmenter on labelled tiles and validate it on others; write MODEL, MODEL.html, MODEL.json."""
+    """Train a segmenter on labelled tiles and validate it on others.
+
+    The files are MODEL, its report MODEL.html, and MODEL.json.
+    """
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.outputs import output_file

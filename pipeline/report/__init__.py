@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
 from flexroad.pipeline.run.record import Run
 
-FORMATS = ("md", "csv", "html")
+Format = Literal["md", "csv", "html"]
 
 
-def write_report(run: Run, form: str) -> Location:
+def write_report(run: Run, form: Format) -> Location:
     """Write RUN/report.<form> and return its path.
 
     Parameters
     ----------
-    form : str
-        One of `FORMATS`.
+    form : {"md", "csv", "html"}
 
     Raises
     ------

@@ -231,16 +231,11 @@ def test_run_with_failed_tile_exits_with_1(survey, tmp_path):
         (["run", "--config", "paper", "--catalog", "CAT", "--out", "FILE/x"], "cannot write the run"),
         (["run", "--config", "paper", "--catalog", "CAT", "--out", "OUT", "--tile", "1_2"], "did you mean"),
         (
-            ["run", "--config", "paper", "--catalog", "CAT", "--out", "OUT", "--executor", "x"],
-            "dask and serial",
-        ),
-        (
             [*"run --config paper --catalog CAT --out OUT --scheduler tcp://127.0.0.1:9".split()],
             "does not answer",
         ),
         (["run", "--config", "paper"], "Missing option"),
         (["status", "FILE"], "is no run"),
-        (["rerun", "OUT", "--from", "fitt"], "no such stage"),
         (["catalog", "show", "FILE"], "is not a FlexRoad catalog"),
         (["config", "show", "nope"], "no configuration 'nope'"),
     ],

@@ -1,0 +1,80 @@
+"""Options that several commands share, and the headings under which help pages list options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from flexroad.pipeline.cli.lifecycle import ON_FAILURE
+
+INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
+METHOD, VALIDATION = "Method", "Split into training and validation"
+GROUND, RASTERS, RECONSTRUCTION = "Ground", "Rasters", "Reconstruction"
+WORK, ALARMS = "Parallel work", "Alarms and monitoring"
+HEADINGS = (
+    INPUTS,
+    METHOD,
+    VALIDATION,
+    RECONSTRUCTION,
+    GROUND,
+    RASTERS,
+    TILES,
+    OUTPUTS,
+    WORK,
+    ALARMS,
+)
+"""In the order of a help page."""
+
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
+CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
+Allow = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="DIR|URL",
+        help="Allow source files in this folder, too; repeatable.",
+        rich_help_panel=INPUTS,
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(min=1, metavar="N", help="Worker processes; default: one per core.", rich_help_panel=WORK),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="A running Dask scheduler: tcp://host:8786.", rich_help_panel=WORK),
+]
+Executor = Annotated[
+    Literal["dask", "serial"],
+    typer.Option(help="dask: worker processes; serial: one process, for debugging.", rich_help_panel=WORK),
+]
+Dashboard = Annotated[
+    bool,
+    typer.Option("--dashboard", help="Serve Dask's dashboard and print its address.", rich_help_panel=WORK),
+]
+Verify = Annotated[
+    bool,
+    typer.Option(
+        "--verify",
+        help="Compare the checksums of all products, not only their sizes.",
+        rich_help_panel=OUTPUTS,
+    ),
+]
+OnFailure = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CMD|URL",
+        envvar=ON_FAILURE,
+        help="Shell command or web address (POST) that gets a summary if the exit code is not 0.",
+        rich_help_panel=ALARMS,
+    ),
+]
+Prometheus = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Text file for Prometheus (.prom), updated during the run.",
+        rich_help_panel=ALARMS,
+    ),
+]

@@ -1,0 +1,69 @@
+"""Help pages: what each option takes, and under which heading it is."""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer
+
+from flexroad.pipeline.cli.main import app
+from flexroad.pipeline.graph.stages import STAGE_NAMES
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, command in group.commands.items():
+        inner = hasattr(command, "commands")
+        yield from commands(command, (*words, name)) if inner else [((*words, name), command)]
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_says_what_each_option_takes(words, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    command = COMMANDS[words]
+    page = command.get_help(command.make_context(words[-1], [], resilient_parsing=True))
+    assert max(map(len, page.splitlines())) <= 80
+    assert re.findall(r"<[a-z][\w \[\]]*>", page) == [], "a type of Python instead of a meaning"
+
+
+@pytest.mark.parametrize("words", [(), ("catalog",), ("prepare",), ("config",)], ids=" ".join)
+def test_help_lists_commands_with_whole_sentences(words, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    group = typer.main.get_command(app)
+    for word in words:
+        group = group.commands[word]
+    lines = group.get_help(group.make_context("x", [], resilient_parsing=True)).splitlines()
+    listed = lines[lines.index("Commands:") + 1 :]
+    assert len(listed) == len(group.commands)
+    assert [line for line in listed if line.endswith("...")] == []
+
+
+def test_help_lists_options_under_headings():
+    command = COMMANDS["run",]
+    page = command.get_help(command.make_context("run", [], resilient_parsing=True))
+    headings = re.findall(r"^(\w.*):$", page, re.MULTILINE)
+    assert headings == ["Inputs", "Tiles", "Outputs", "Parallel work", "Alarms and monitoring", "Options"]
+    assert page.index("Parallel work:") < page.index("--executor <dask|serial>")
+
+
+def test_rerun_from_offers_every_stage():
+    (option,) = (param for param in COMMANDS["rerun",].params if "--from" in param.opts)
+    assert option.display_type_rich(None) == f"<{'|'.join(STAGE_NAMES)}>"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("run --config paper --catalog c.json --out x --executor x", "dask"),
+        ("rerun x --from fitt", "ecsrc"),
+        ("report x --format pdf", "html"),
+        ("catalog synthetic -o x --preset gero", "gerod"),
+    ],
+)
+def test_option_with_other_value_names_the_valid_ones(flexroad, words, message):
+    said = flexroad(*words.split()).expected(2)
+    assert f"Invalid value for '{words.split()[-2]}'" in said.err
+    assert message in said.err
