@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.stdio import echo, echo_document
 
@@ -20,6 +21,7 @@ def config_show(
             metavar="NAME|FILE", help="A YAML file or a shipped name; default: list the shipped ones."
         ),
     ] = None,
+    settings: options.Settings = None,
 ) -> None:
     """Show every option of every variant of a configuration."""
     import yaml
@@ -30,9 +32,9 @@ def config_show(
         for shipped_name, path in shipped().items():
             echo(f"{shipped_name:10} {path.read_text().splitlines()[0].lstrip('# ')}")
         return
-    config = load_config(name)
+    config = load_config(name, settings or ())
     chains = {
-        variant: {stage: options.model_dump(mode="json") for stage, options in chain.items()}
+        variant: {stage: chosen.model_dump(mode="json") for stage, chosen in chain.items()}
         for variant, chain in config.chains.items()
     }
     sections = {key: getattr(config, key).model_dump(mode="json") for key in ("export", "cluster")}
@@ -41,7 +43,7 @@ def config_show(
 
 @configs.command("template")
 def config_template() -> None:
-    """Print a configuration with every option, its default and its meaning."""
+    """Print every option with its default and its meaning."""
     from flexroad.pipeline.config.schema import template
 
     echo_document(template())

@@ -78,3 +78,12 @@ Prometheus = Annotated[
         rich_help_panel=ALARMS,
     ),
 ]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Option that replaces the configuration's: fit.spacing_m=5; repeatable.",
+        rich_help_panel=INPUTS,
+    ),
+]

@@ -49,6 +49,7 @@ def run(
             rich_help_panel=options.INPUTS,
         ),
     ] = "production",
+    settings: options.Settings = None,
     allow: options.Allow = None,
     checksum: Annotated[
         bool,
@@ -102,10 +103,10 @@ def run(
     path, catalog_path = parse_location(out), parse_location(catalog)
     root = parse_location(store) if store else None
 
-    def read_catalog(settings: Config) -> tuple[Catalog, Catalog]:
+    def read_catalog(chosen: Config) -> tuple[Catalog, Catalog]:
         """Return the whole catalog and its selected tiles."""
         whole = Catalog.read(catalog_path, allow or ())
-        check_allowed(whole, layers_read(settings))
+        check_allowed(whole, layers_read(chosen))
         selected = whole.select(tile or (), bbox)
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
@@ -119,20 +120,20 @@ def run(
         from flexroad.pipeline.cli.dry_run import plan
         from flexroad.pipeline.graph.graph import tile_graphs
 
-        settings = load_config(config)
-        whole, selected = read_catalog(settings)
-        check_inputs(settings, of_run(whole, selected))
-        graphs = tile_graphs(selected, settings, checksum)
-        for line in plan(graphs, root or path / "store", path, settings):
+        chosen = load_config(config, settings or ())
+        whole, selected = read_catalog(chosen)
+        check_inputs(chosen, of_run(whole, selected))
+        graphs = tile_graphs(selected, chosen, checksum)
+        for line in plan(graphs, root or path / "store", path, chosen):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
-        settings = load_config(config)
-        whole, selected = read_catalog(settings)
+        chosen = load_config(config, settings or ())
+        whole, selected = read_catalog(chosen)
         with _locked(path, create=True):
-            opened = Run.create(path, settings, of_run(whole, selected), root, checksum)
+            opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
-            make_executor = partial(_executor, executor, workers, scheduler, settings.cluster, dashboard)
+            make_executor = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
     _exit(outcome)
 

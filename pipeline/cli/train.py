@@ -88,7 +88,7 @@ def train(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Option of the method's training; repeatable.",
+            help="Option of the training (rounds=100) or the configuration (load.halo_m=0); repeatable.",
             rich_help_panel=shared.METHOD,
         ),
     ] = None,
@@ -108,8 +108,11 @@ def train(
     from flexroad.pipeline.training.train import TrainOptions, train
     from flexroad.tasks.errors import TaskError
 
-    options = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(settings or []))
-    tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config)
+    # The options of a training have no stage before a dot.
+    changes = [text for text in settings or () if "." in text.partition("=")[0]]
+    own = [text for text in settings or () if text not in changes]
+    options = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(own))
+    tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config, changes)
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
     check_writable(output.parent)

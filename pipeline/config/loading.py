@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.merge import merge
 from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
+from flexroad.pipeline.config.settings import Setting, applied
 from flexroad.pipeline.errors import ConfigError
 
 SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"
@@ -51,15 +53,26 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_config(name: str | Path) -> Config:
+def load_config(name: str | Path, settings: Sequence[str] = ()) -> Config:
     """Read a configuration by shipped name or by file name.
+
+    Parameters
+    ----------
+    name : str or Path
+    settings : sequence of str
+        Options that replace those of the file: ``fit.spacing_m=5``. They are a part of the configuration's
+        name, so that no result looks like one of the file alone.
 
     Raises
     ------
     ConfigError
         If no such configuration exists, or a key or value is invalid; one line per error.
     """
-    return compose(_raw(name), str(name))
+    config = compose(_raw(name), str(name))
+    if not settings:
+        return config
+    changed = applied(config.raw, [Setting.parse(text) for text in settings])
+    return compose(changed, " ".join([str(name), *(f"--set {printable(text)}" for text in settings)]))
 
 
 def compose(raw: Mapping[str, Any], name: str) -> Config:
@@ -74,7 +87,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
     _reject_unknown_keys(raw, [*stages, *SECTIONS], name, "")
     variants = _mapping(raw.get("variants") or {"flexroad": {}}, name, "variants")
     base = {
-        stage: _merge(DEFAULTS.get(stage), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
+        stage: merge(DEFAULTS.get(stage), raw.get(stage), TAG.get(stage), f"{name}: {stage}")
         for stage in stages
     }
     chains = {}
@@ -86,7 +99,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
         chains[str(variant)] = {
             stage: _validate(
                 stage_models()[stage],
-                _merge(base[stage], overrides.get(stage), TAG.get(stage), f"{name}: {where}.{stage}"),
+                merge(base[stage], overrides.get(stage), TAG.get(stage), f"{name}: {where}.{stage}"),
                 f"{name}: {where}.{stage}" if stage in overrides else f"{name}: {stage}",
             )
             for stage in stages
@@ -99,7 +112,7 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             raise ConfigError(
                 f"{name}: export.variants: no variant {shown(variant)}, only {', '.join(chains)}"
             )
-    options = _merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
+    options = merge({}, raw.get("cluster"), TAG["cluster"], f"{name}: cluster")
     cluster = _validate(TypeAdapter(Cluster), options, f"{name}: cluster")
     dataset = _mapping(raw.get("dataset") or {}, name, "dataset")
     if wrong := [key for key in dataset if not isinstance(key, str)]:
@@ -207,28 +220,9 @@ def _extend(parent: dict[str, Any], child: dict[str, Any]) -> dict[str, Any]:
             merged[key] = value
         else:
             # A parent without a method has the default one; another method starts from its own defaults.
-            base = _merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
-            merged[key] = _merge(base, value, TAG.get(key), key)
+            base = merge(DEFAULTS.get(key), parent.get(key), TAG.get(key), key)
+            merged[key] = merge(base, value, TAG.get(key), key)
     return merged
-
-
-def _merge(base: Any, override: Any, tag: str | None, where: str) -> dict[str, Any]:
-    """Merge an override into a stage's options; an override with another method replaces them."""
-    options, changes = _tagged(base, tag, where), _tagged(override, tag, where)
-    if tag in changes and tag in options and changes[tag] != options[tag]:
-        return changes
-    return options | changes
-
-
-def _tagged(options: Any, tag: str | None, where: str) -> dict[str, Any]:
-    if options is None:
-        return {}
-    # YAML reads a bare `off` as false.
-    if isinstance(options, str | bool) and tag:
-        return {tag: options if isinstance(options, str) else ("on" if options else "off")}
-    if isinstance(options, dict):
-        return dict(options)
-    raise ConfigError(f"{where}: expected a mapping of options, not {shown(options)}")
 
 
 def _mapping(value: Any, name: str, where: str) -> dict[str, Any]:
@@ -261,7 +255,8 @@ def _short(key: object, limit: int = MAX_KEY) -> str:
 
 def _hint(key: str, allowed: list[str]) -> str:
     near = difflib.get_close_matches(key, allowed, n=1)
-    return f"; did you mean {near[0]}?" if near else f"; valid are {', '.join(allowed)}"
+    meant = f"did you mean {near[0]}? " if near else ""
+    return f"; {meant}valid are {', '.join(allowed)}"
 
 
 def _validate(model: TypeAdapter[Any], options: dict[str, Any], where: str) -> Any:

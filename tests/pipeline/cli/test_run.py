@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.catalog import Catalog, Layer
@@ -193,3 +194,14 @@ def test_status_of_locked_run_shows_owner(flexroad, nightly, survey, tmp_path):
     with run_lock(tmp_path / "run"):
         assert json.loads(flexroad("status", tmp_path / "run", "--json"))["at_work"]["pid"] == os.getpid()
         assert f"pid {os.getpid()} on" in flexroad("status", tmp_path / "run")
+
+
+def test_run_with_setting_records_it_for_rerun(flexroad, nightly, tmp_path):
+    assert "fit.iteration: unknown key; did you mean iterations?" in flexroad(
+        *nightly, "--set", "fit.iteration=4", "--dry-run", expect=2
+    )
+    flexroad(*nightly, "--set", "fit.iterations=4", "--tile", "499980_5599980")
+    assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["fit"]["iterations"] == 4
+    said = flexroad("rerun", tmp_path / "run", "--executor", "serial")
+    assert "1 tiles: 1 done (1 cached)" in said
+    assert "--set fit.iterations=4" in flexroad("report", tmp_path / "run")

@@ -1,0 +1,75 @@
+"""Settings of the command line, ``--set fit.spacing_m=5``: options in a configuration by dotted key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flexroad.catalog.text import printable, shown
+from flexroad.pipeline.config import document
+from flexroad.pipeline.config.merge import merge, tagged
+from flexroad.pipeline.config.models import TAG
+from flexroad.pipeline.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One option and its value."""
+
+    keys: tuple[str, ...]
+    """The parts of the dotted key: ``("fit", "spacing_m")``."""
+    value: Any
+
+    @classmethod
+    def parse(cls, text: str) -> Setting:
+        """Return the setting in ``KEY=VALUE``; the value is YAML within the limits of `document`.
+
+        Raises
+        ------
+        ConfigError
+            If there is no key or value, or the value cannot be read.
+        """
+        key, equals, value = text.partition("=")
+        keys = tuple(key.split("."))
+        if not equals or not all(keys):
+            raise ConfigError(f"--set {shown(text)}: give KEY=VALUE, like --set fit.spacing_m=5")
+        option = f"--set {printable(key)}"
+        return cls(keys, document.parse(value.encode(errors="surrogateescape"), option).value)
+
+    @property
+    def selects_method(self) -> bool:
+        """Whether it selects the method of a stage, of which the stage's other options depend."""
+        stage = self.keys[2:] if self.keys[0] == "variants" else self.keys
+        return len(stage) == 1 or (len(stage) == 2 and stage[1] == TAG.get(stage[0]))
+
+
+def applied(raw: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, Any]:
+    """Return a configuration with changed options; equal keys take the last value.
+
+    Methods are set first: another method starts from its own defaults, in whatever order they are given.
+
+    Raises
+    ------
+    ConfigError
+        If a key leads into an option that has no options of its own.
+    """
+    changed = dict(raw)
+    for setting in sorted(settings, key=lambda setting: not setting.selects_method):
+        changed = _assigned(changed, setting.keys, setting.value)
+    return changed
+
+
+def _assigned(
+    options: Any, keys: tuple[str, ...], value: Any, parents: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return the options below ``parents`` with another value at ``keys``."""
+    tag = TAG.get(parents[-1]) if parents else None
+    where = f"--set {printable('.'.join((*parents, *keys)))}"
+    key, *rest = keys
+    mapping = tagged(options, tag, f"{where}: {printable('.'.join(parents))}")
+    if rest:
+        return mapping | {key: _assigned(mapping.get(key), tuple(rest), value, (*parents, key))}
+    if key == tag:
+        return merge(mapping, {key: value}, tag, where)
+    return mapping | {key: merge(mapping.get(key), value, TAG[key], where) if key in TAG else value}

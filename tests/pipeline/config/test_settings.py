@@ -1,0 +1,64 @@
+import pytest
+
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+
+
+def test_setting_replaces_an_option_and_names_the_configuration():
+    base, config = load_config("nightly"), load_config("nightly", ["fit.spacing_m=5", "ecsrc.verge_m=2"])
+    assert config.chains["flexroad"]["fit"].spacing_m == 5
+    assert config.chains["flexroad"]["fit"].huber_m == base.chains["flexroad"]["fit"].huber_m
+    assert config.raw["fit"]["spacing_m"] == 5
+    assert config.name == "nightly --set fit.spacing_m=5 --set ecsrc.verge_m=2"
+    # A variant with a method of its own keeps it.
+    assert load_config("paper", ["fit.degree=2"]).chains["plane"]["fit"].method == "plane"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["fit=smoothing_spline", "fit.spacing_m=5"],
+        ["fit.spacing_m=5", "fit.method=smoothing_spline"],
+        ["fit={method: smoothing_spline, spacing_m: 5}"],
+        ["variants.flexroad.fit.spacing_m=5", "variants.flexroad.fit=smoothing_spline"],
+    ],
+)
+def test_setting_of_a_method_starts_from_its_defaults(settings):
+    fit = load_config("paper", settings).chains["flexroad"]["fit"]
+    assert (fit.method, fit.spacing_m) == ("smoothing_spline", 5)
+
+
+def test_setting_below_a_single_word_keeps_the_method():
+    chains = load_config(
+        "paper", ["variants.rgt.sample.method=corners", "segment.method=vector", "segment.cleanup.drop_m2=9"]
+    ).chains
+    assert chains["rgt"]["sample"].method == "corners"
+    assert chains["flexroad"]["segment"].method == "vector"
+    assert chains["flexroad"]["segment"].cleanup.drop_m2 == 9
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "fit.degre=2",
+            "paper --set fit.degre=2: fit.degre: unknown key; did you mean degree? valid are c",
+        ),
+        (
+            "ft.degree=2",
+            "paper --set ft.degree=2: ft: unknown key; did you mean fit? valid are load,",
+        ),
+        ("fit.degree=99", "paper --set fit.degree=99: fit.degree: input should be less than or equal to 10"),
+        ("fit.degree.x=1", "--set fit.degree.x: fit.degree: expected a mapping of options, not 3"),
+        ("fit.degree=[", "--set fit.degree: not readable as YAML"),
+        ("fit.degree=" + "9" * 500, "--set fit.degree: not readable as YAML: line 1, column 1: a number of"),
+        ("fit.degree", "--set 'fit.degree': give KEY=VALUE, like --set fit.spacing_m=5"),
+        ("fit..degree=2", "--set 'fit..degree=2': give KEY=VALUE"),
+        ("extends=nightly", "paper --set extends=nightly: extends: unknown key; valid are"),
+    ],
+)
+def test_invalid_setting_raises_one_line_that_names_it(setting, message):
+    with pytest.raises(ConfigError) as caught:
+        load_config("paper", [setting])
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
