@@ -23,6 +23,11 @@ def printable(text: str) -> str:
     return text if text.isprintable() else "".join(map(_escaped, text))
 
 
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 tile``, ``2 tiles``."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def shown(value: object) -> str:
     """Return a value from a file in a short form, for messages."""
     text = printable(_REPR.repr(value))

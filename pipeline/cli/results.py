@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo, echo_document
 
@@ -113,6 +115,13 @@ def query(
     """Print height, unit normal, tile and class at points, as CSV."""
     from flexroad.pipeline.inspect.points import query_csv
 
-    outside = query_csv(path, points, variant, sys.stdout, allow or ())
-    if outside:
-        echo(f"note: {outside} points lie on no finished tile; their columns are empty", err=True)
+    answer = query_csv(path, points, variant, sys.stdout, allow or ())
+    if number := len(answer.earlier):
+        echo(
+            f"note: sources or options of {count(number, 'tile')} have changed since; the values are of "
+            f"the last finished state; next: flexroad rerun {shlex.quote(str(path))}",
+            err=True,
+        )
+    if outside := int((answer.tile == "").sum()):
+        verb = "lies" if outside == 1 else "lie"
+        echo(f"note: {count(outside, 'point')} {verb} on no finished tile; the columns are empty", err=True)

@@ -21,7 +21,7 @@ from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.run.status import TileStatus, peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.types import Floats, RoadMask, Surface
@@ -39,6 +39,8 @@ class Answer:
     """``(n,)``, tile ids."""
     kind: NDArray[np.str_]
     """``(n,)``, ``road`` or ``terrain`` according to the segmented mask."""
+    earlier: tuple[str, ...] = ()
+    """Ids of tiles whose values are of earlier sources or options (`Ground.earlier`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +53,16 @@ class Ground:
 
     run: Run
     variant: str
+    earlier: bool = False
+    """Whether a tile of which sources or options have changed since has its last finished surface."""
 
     @classmethod
     def open(
-        cls, path: Location | str, variant: str | None = None, allow: Sequence[str | Path] = ()
+        cls,
+        path: Location | str,
+        variant: str | None = None,
+        allow: Sequence[str | Path] = (),
+        earlier: bool = False,
     ) -> Ground:
         """Open a run.
 
@@ -67,9 +75,10 @@ class Ground:
         variant = variant or run.config.export.variants[0]
         if variant not in run.config.chains:
             raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-        if not any(status.done for status in peek_statuses(run, run.catalog.tiles)):
+        ground = cls(run, variant, earlier)
+        if not any(map(ground._finished, peek_statuses(run, run.catalog.tiles))):
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
-        return cls(run, variant)
+        return ground
 
     def at(self, easting: Floats, northing: Floats) -> Answer:
         """Return height, normal, tile and class at n points (m, in the run's CRS).
@@ -83,17 +92,23 @@ class Ground:
         tile = np.zeros(easting.shape, dtype=object)
         kind = np.full(easting.shape, "", dtype=object)
         tile[:] = ""
-        for graph, selected in self._owners(easting, northing):
-            surface, road = self._tile(graph)
+        earlier = []
+        for status, selected in self._owners(easting, northing):
+            graph = status.graph
+            found = self._tile(graph) if status.done else self._last(graph.tile.id)
+            if found is None:
+                continue
+            surface, road = found
+            earlier += [] if status.done else [graph.tile.id]
             east, north = easting[selected], northing[selected]
             height[selected] = surface.height(east, north)
             normal[selected] = surface.normal(east, north)
             tile[selected] = graph.tile.id
             kind[selected] = np.where(road.mask[road.grid.cells(east, north)], "road", "terrain")
-        return Answer(height, normal, tile.astype(str), kind.astype(str))
+        return Answer(height, normal, tile.astype(str), kind.astype(str), tuple(earlier))
 
-    def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileGraph, NDArray[np.intp]]]:
-        """Yield the graph of each finished tile that has points, with the indices of the points."""
+    def _owners(self, easting: Floats, northing: Floats) -> Iterator[tuple[TileStatus, NDArray[np.intp]]]:
+        """Yield the state of each finished tile that has points, with the indices of the points."""
         tiles = self.run.catalog.usable
         tree = STRtree([box(*tile.grid.bounds) for tile in tiles])
         point, number = tree.query(points(easting, northing), predicate="intersects")
@@ -105,9 +120,19 @@ class Ground:
         statuses = peek_statuses(self.run, [tiles[i] for i in numbers])
         for status, indices in zip(statuses, np.split(point[order], starts[1:]), strict=True):
             indices = indices[unassigned[indices]]
-            if status.done and indices.size:
+            if indices.size and self._finished(status):
                 unassigned[indices] = False
-                yield status.graph, indices
+                yield status, indices
+
+    def _finished(self, status: TileStatus) -> bool:
+        last = status.last_record
+        return status.done or (self.earlier and last is not None and last.state == "done")
+
+    def _last(self, tile_id: str) -> tuple[Surface, RoadMask] | None:
+        """Return what a tile had when it was last finished, None if the store no longer has it."""
+        store, nodes = ArtefactStore(self.run.store), self.run.folder(tile_id).nodes(self.variant)
+        fit, segment = (store.find(stage, nodes.get(stage, "")) for stage in ("fit", "segment"))
+        return (fit[0], segment[0]) if fit and segment else None
 
     def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
         evaluate = Evaluator(graph, ArtefactStore(self.run.store))
@@ -120,7 +145,7 @@ class Ground:
 
 def query_csv(
     run: Location, csv: Path, variant: str | None, out: TextIO, allow: Sequence[str | Path] = ()
-) -> int:
+) -> Answer:
     """Read a CSV of points and write it with the added columns height_m, nx, ny, nz, tile and class.
 
     Parameters
@@ -130,8 +155,8 @@ def query_csv(
 
     Returns
     -------
-    int
-        Number of points outside the finished tiles.
+    Answer
+        The values at the points, also of tiles of which sources or options have changed since.
 
     Raises
     ------
@@ -146,11 +171,11 @@ def query_csv(
         raise ConfigError(f"{csv}: no column {error}; it needs easting and northing (m)") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{csv}: not readable as a table of points: {error}") from error
-    answer = Ground.open(run, variant, allow).at(easting, northing)
+    answer = Ground.open(run, variant, allow, earlier=True).at(easting, northing)
     table["height_m"] = answer.height
     for i, name in enumerate(("nx", "ny", "nz")):
         table[name] = answer.normal[:, i]
     table["tile"] = answer.tile
     table["class"] = answer.kind
     table.to_csv(out, index=False, float_format="%.9g")
-    return int((answer.tile == "").sum())
+    return answer

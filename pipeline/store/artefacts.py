@@ -34,8 +34,12 @@ class ArtefactStore:
 
     def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
         """Return a result and the seconds of each stage up to it, None if it is missing or damaged."""
+        return self.find(node.stage, node.fingerprint)
+
+    def find(self, stage: str, fingerprint: str) -> tuple[Any, dict[str, float]] | None:
+        """Return what `get` returns, for a node of which only stage and fingerprint are known."""
         try:
-            return codec.decode(paths.read(self._path(node)))
+            return codec.decode(paths.read(self._path(stage, fingerprint)))
         except DAMAGED:
             # A damaged artefact counts as missing: it is computed and written again.
             return None
@@ -43,15 +47,15 @@ class ArtefactStore:
     def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
         """Store a result and the seconds of each stage up to it; return the size in bytes."""
         data = codec.encode(value, seconds)
-        paths.write(self._path(node), data)
+        paths.write(self._path(node.stage, node.fingerprint), data)
         return len(data)
 
     def has(self, node: Node) -> bool:
         """Return whether the artefact exists; its content is not checked."""
-        return paths.exists(self._path(node))
+        return paths.exists(self._path(node.stage, node.fingerprint))
 
-    def _path(self, node: Node) -> Location:
-        return self.root / node.stage / node.fingerprint[:2] / f"{node.fingerprint}.npz"
+    def _path(self, stage: str, fingerprint: str) -> Location:
+        return self.root / stage / fingerprint[:2] / f"{fingerprint}.npz"
 
 
 def check_writable(folder: Location) -> None:

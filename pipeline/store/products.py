@@ -42,6 +42,14 @@ class TileProducts:
             return None
         return item if complete else None
 
+    def nodes(self, variant: str) -> dict[str, str]:
+        """Return the fingerprint of each stage of a variant when the tile was last finished."""
+        item = self._read("item.json") or {}
+        try:
+            return dict(item["properties"]["flexroad:nodes"][variant])
+        except (KeyError, TypeError, ValueError):
+            return {}
+
     def verified(self) -> bool:
         """Return whether every product named by the item has the checksum it was written with."""
         item = self._read("item.json") or {}

@@ -205,3 +205,22 @@ def test_run_with_setting_records_it_for_rerun(flexroad, nightly, tmp_path):
     said = flexroad("rerun", tmp_path / "run", "--executor", "serial")
     assert "1 tiles: 1 done (1 cached)" in said
     assert "--set fit.iterations=4" in flexroad("report", tmp_path / "run")
+
+
+def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(flexroad, nightly, tmp_path):
+    flexroad(*nightly)
+    run, points = tmp_path / "run", tmp_path / "points.csv"
+    points.write_text("easting,northing\n500010,5600010\n500011,5600070\n")
+    before = flexroad("query", run, "--points", points)
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace("iterations: 3", "iterations: 4"))
+    flexroad("rerun", run, "--tile", "499980_5599980", "--executor", "serial", expect=1)
+    *after, note = flexroad("query", run, "--points", points).splitlines()
+    # The first point is on the tile that was computed again, the second one is not.
+    assert after[1] != before.splitlines()[1]
+    assert after[2] == before.splitlines()[2]
+    assert note.startswith(
+        "note: sources or options of 1 tile have changed since; the values are of the last"
+    )
+    shutil.rmtree(run / "store")
+    assert "1 point lies on no finished tile" in flexroad("query", run, "--points", points)
