@@ -22,6 +22,7 @@ from flexroad.catalog.crs import bounds_in, same, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
+from flexroad.catalog.text import count
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
@@ -191,13 +192,13 @@ def _covered(
         elif cover:
             thin.append(tile_id)
     note = (
-        f"left out {_count(thin)} with a DSM height in less than {min_cover:.0%} of the cells "
+        f"left out {count(len(thin), 'tile')} with a DSM height in less than {min_cover:.0%} of the cells "
         f"(--min-cover 0 keeps them): {some(thin)}"
     )
     if not kept:
         raise CatalogError(f"no tile is left: {note}")
     below = (
-        f"{_count(risky)} with a DSM height in less than {MIN_COVER:.0%} of the cells will fail, "
+        f"{count(len(risky), 'tile')} with a DSM height in less than {MIN_COVER:.0%} of the cells will fail, "
         f"unless the configuration sets load: {{min_valid: {min_cover:g}}}: {some(risky)}"
     )
     return kept, [note] * bool(thin) + [below] * bool(risky)
@@ -236,8 +237,6 @@ def assumed(tiles: Sequence[Tile]) -> list[str]:
     undated = [tile.id for tile in tiles if tile.datetime_assumed]
     if not undated:
         return []
-    return [f"no date in the dsm of {_count(undated)}: the files' times are used instead (--date sets it)"]
-
-
-def _count(ids: Sequence[str]) -> str:
-    return f"{len(ids)} tile" + "s" * (len(ids) != 1)
+    return [
+        f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead (--date sets it)"
+    ]

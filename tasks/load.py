@@ -18,6 +18,7 @@ from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import Unit, height_unit
 from flexroad.catalog.storage.paths import stat
+from flexroad.catalog.text import count
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
@@ -287,10 +288,9 @@ def remove_absurd(heights: Floats) -> int:
     return int(np.count_nonzero(absurd))
 
 
-def absurd_note(layer: str, count: int) -> str:
+def absurd_note(layer: str, removed: int) -> str:
     """Return the note on heights that `remove_absurd` removed from a layer."""
-    cells = "1 cell" if count == 1 else f"{count} cells"
-    return f"{layer}: {cells} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
+    return f"{layer}: {count(removed, 'cell')} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
 
 
 def _unit(patch: RasterWindow) -> Unit:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from flexroad.catalog.cover import MIN_COVER
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import MIN_COVER_HELP, Command
 from flexroad.pipeline.cli.next_step import after_catalog
@@ -179,7 +180,7 @@ def _write_catalog(result: TilingResult, output: Path, config: str | None = None
         echo(f"note: {note}", err=True)
     catalog = Catalog(result.tiles)
     catalog.write(output)
-    echo(f"{len(catalog.tiles)} tiles in {output}")
+    echo(f"{count(len(catalog.tiles), 'tile')} in {output}")
     echo(after_catalog(output, config))
 
 
@@ -207,7 +208,7 @@ def catalog_synthetic(
     from flexroad.pipeline.benchmark.scenes import write_scenes
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
-    echo(f"{len(Catalog.read(path).tiles)} tiles in {path}")
+    echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
     echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 
 
@@ -226,7 +227,7 @@ def catalog_show(path: options.CatalogFile) -> None:
         size = f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m"
         echo(f"{tile.id}  {size}  {date}  {tile.stratum or '-'}  {layers}")
     systems = sorted({tile.grid.crs for tile in catalog.usable})
-    echo(f"{len(catalog.tiles)} tiles, {', '.join(crs[:60] for crs in systems)}")
+    echo(f"{count(len(catalog.tiles), 'tile')}, {', '.join(crs[:60] for crs in systems)}")
 
 
 @catalogs.command("check", cls=Command)

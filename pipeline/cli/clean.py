@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
@@ -57,9 +58,9 @@ def clean(
                 unregister(run.store, user)
     for kind, meaning in MEANING.items():
         if files[kind]:
-            echo(f"{meaning}: {files[kind]} files, {sizes[kind] / 1e6:.1f} MB")
+            echo(f"{meaning}: {count(files[kind], 'file')}, {sizes[kind] / 1e6:.1f} MB")
     folders = sum(1 for _ in abandoned()) if dry_run else remove_abandoned()
     if folders:
         echo(f"temporary folders of processes that were killed: {folders}")
     verb = "would free" if dry_run else "freed"
-    echo(f"{verb} {files.total()} files, {sizes.total() / 1e6:.1f} MB")
+    echo(f"{verb} {count(files.total(), 'file')}, {sizes.total() / 1e6:.1f} MB")

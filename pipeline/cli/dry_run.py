@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.text import count
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import TileGraph, layers_read
@@ -43,7 +44,7 @@ def plan(graphs: Iterable[TileGraph], store: Location, run: Location, config: Co
                 f"  {node.stage:9}{node.fingerprint[:8]}  {'done' if done else state:7} "
                 f"<- {inputs}  ({', '.join(users[node.fingerprint])})"
             )
-    yield f"{tiles} tiles"
+    yield count(tiles, "tile")
     for stage in (*STAGE_NAMES, BORDER):
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
         if counts:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
@@ -46,7 +47,7 @@ def format_summary(summary: Summary) -> str:
         parts.append(f"{summary.without_roads} without roads")
     states = f"{summary.done} done ({', '.join(parts)}), {summary.failed} failed, {summary.pending} pending"
     changes = f"{summary.new} new, {summary.changed} changed, {summary.vanished} vanished"
-    return f"{summary.tiles} tiles: {states}; {changes}; {summary.seconds:.0f} s"
+    return f"{count(summary.tiles, 'tile')}: {states}; {changes}; {summary.seconds:.0f} s"
 
 
 def warn(line: str, kind: str = "warning") -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.next_step import after_catalog
@@ -82,7 +83,7 @@ def _run(make: Callable[[], PreparedDataset]) -> None:
         raise typer.Exit(130) from None
     for note in dataset.notes:
         echo(f"note: {note}", err=True)
-    echo(f"{dataset.tiles} tile{'s' * (dataset.tiles != 1)} in {dataset.catalog}")
+    echo(f"{count(dataset.tiles, 'tile')} in {dataset.catalog}")
     echo(after_catalog(dataset.catalog))
 
 

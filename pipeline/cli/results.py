@@ -123,5 +123,7 @@ def query(
             err=True,
         )
     if outside := int((answer.tile == "").sum()):
-        verb = "lies" if outside == 1 else "lie"
-        echo(f"note: {count(outside, 'point')} {verb} on no finished tile; the columns are empty", err=True)
+        verb, whose = ("lies", "its") if outside == 1 else ("lie", "their")
+        echo(
+            f"note: {count(outside, 'point')} {verb} on no finished tile; {whose} columns are empty", err=True
+        )

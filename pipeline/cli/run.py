@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.worker.tile import TileResult
 
-StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess"]
+StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
 
 
 @ignore_write_errors()
@@ -152,7 +152,7 @@ def rerun(
         StageName | None,
         typer.Option(
             "--from",
-            help="Recompute this stage and all later ones.",
+            help="Recompute this stage and all later ones; export: only write the products again.",
             rich_help_panel=options.TILES,
         ),
     ] = None,
@@ -179,7 +179,8 @@ def rerun(
 
     location = parse_location(path)
     with report_outcome(location, on_failure, prometheus) as outcome:
-        force = frozenset(STAGE_NAMES[STAGE_NAMES.index(from_stage) :]) if from_stage else frozenset()
+        steps = (*STAGE_NAMES, "export")
+        force = frozenset(steps[steps.index(from_stage) :]) if from_stage else frozenset()
         # The control points of a border are part of the fit.
         force |= {BORDER} if "fit" in force else frozenset()
         with _locked(location):

@@ -9,6 +9,7 @@ from statistics import median
 from flexroad.catalog import LAYERS, Catalog, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import short
+from flexroad.catalog.text import count
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import check_layers
@@ -34,9 +35,9 @@ def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
     tiles = catalog.usable
     sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
     systems = sorted({short(tile.grid.crs) for tile in tiles})
-    yield Finding(f"{len(tiles)} tiles of {', '.join(sizes)}; {', '.join(systems)}")
+    yield Finding(f"{count(len(tiles), 'tile')} of {', '.join(sizes)}; {', '.join(systems)}")
     counts = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
-    yield Finding("tiles with " + ", ".join(f"{name}: {count}" for name, count in counts.items() if count))
+    yield Finding("tiles with " + ", ".join(f"{name}: {number}" for name, number in counts.items() if number))
     try:
         check_layers(config, catalog)
     except ConfigError as error:
@@ -50,8 +51,8 @@ def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
     tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
     cells = Counter(tile.grid.cell for tile in tiles)
     tiles = [tile for tile in tiles if tile.grid.cell == cells.most_common(1)[0][0]]
-    count = min(MAX_PHOTO_TILES, len(tiles))
-    sample = [tiles[i * len(tiles) // count] for i in range(count)]
+    most = min(MAX_PHOTO_TILES, len(tiles))
+    sample = [tiles[i * len(tiles) // most] for i in range(most)]
     pairs: list[coregistration.Pair] = []
     for tile in sample:
         try:
@@ -76,7 +77,7 @@ def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
         for tile in tile_shifts
     )
     measured = (
-        f"{shift} of the heights (over {len(pairs)} tile{'s' * (len(pairs) != 1)}, half of them within "
+        f"{shift} of the heights (over {count(len(pairs), 'tile')}, half of them within "
         f"{scatter:.1f} m of that; sun at {shift.sun[0]:.0f}°, {shift.sun[1]:.0f}° high; "
         f"confidence {shift.confidence:.2f})"
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.text import count
 
 MAX_FILES = 5000
 """Largest number of files that are looked at."""
@@ -126,7 +127,7 @@ def _raster(path: Path, folder: Path) -> Download:
     except (RasterioError, OSError) as error:
         return Download(path, "raster", question=f"it cannot be read as a raster: {error}")
     kind = _named(path, folder)
-    about = f"{bands} band{'s' * (bands > 1)} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"
+    about = f"{count(bands, 'band')} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"
     question = QUESTIONS.get(kind, "")
     if bands >= 3 and kind in ("dsm", "dtm", "raster"):
         kind, question = (

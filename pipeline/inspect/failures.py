@@ -14,6 +14,7 @@ from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.headers.rasters import quiet, some
 from flexroad.catalog.storage.paths import Location, StatCache
+from flexroad.catalog.text import count
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking
@@ -59,7 +60,7 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
 
 
 def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Finding:
-    return Finding(f"{len(ids)} of {len(tiles)} tiles would fail: {reason}: {some(ids)}", fault=True)
+    return Finding(f"{len(ids)} of {count(len(tiles), 'tile')} would fail: {reason}: {some(ids)}", fault=True)
 
 
 def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding]:
@@ -71,9 +72,9 @@ def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding
             on_tile = layer.reaching(tile.grid.bounds)
             files.update(tile.paths(on_tile) if on_tile else ())
     stat = StatCache()
-    missing = [(path, count) for path, count in files.items() if stat(path) is None]
-    for path, count in missing[:MAX_SHOWN]:
-        yield Finding(f"missing: {path} ({count} tile{'s' * (count != 1)})", fault=True)
+    missing = [(path, number) for path, number in files.items() if stat(path) is None]
+    for path, number in missing[:MAX_SHOWN]:
+        yield Finding(f"missing: {path} ({count(number, 'tile')})", fault=True)
     if len(missing) > MAX_SHOWN:
         yield Finding(f"missing: {len(missing) - MAX_SHOWN} more files", fault=True)
 

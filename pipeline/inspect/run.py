@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds
 from flexroad.catalog.storage.paths import exists, parse_location, read
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.assembled import assembled
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
@@ -50,7 +51,7 @@ class RunView:
         return (
             f"<flexroad.RunView: {self.run.path}>\n"
             f"config {self.run.config.name}, variant {self.variant}\n"
-            f"{len(self.run.catalog.tiles)} tiles: {states}"
+            f"{count(len(self.run.catalog.tiles), 'tile')}: {states}"
         )
 
     @property

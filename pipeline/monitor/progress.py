@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from flexroad.catalog.text import printable
+from flexroad.catalog.text import count, printable
 from flexroad.pipeline.worker.tile import TileResult
 
 PLAIN_EVERY_S = 10.0
@@ -57,6 +57,9 @@ class ProgressDisplay:
     def __enter__(self) -> ProgressDisplay:
         if self.live:
             self.live.start()
+        else:
+            # In a log, or a pipe, the first results may take minutes.
+            self.say(f"starting: {count(self.total, 'tile')}")
         return self
 
     def __exit__(
@@ -91,7 +94,8 @@ class ProgressDisplay:
         tried = sum(self.status.values())
         spent = time.monotonic() - self.start
         left = spent / tried * (self.total - tried) if tried else float("nan")
-        return f"{tried}/{self.total} tiles, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
+        tiles = count(self.total, "tile")
+        return f"{tried}/{tiles}, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
 
     def say(self, text: str) -> None:
         """Print one line; characters that cannot be printed are escaped."""

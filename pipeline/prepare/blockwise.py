@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import track
 
 from flexroad.catalog import Grid
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.point_buckets import (
@@ -75,7 +76,7 @@ def write_blocks(
     """
     jobs = list(_jobs(writer, bucketed, options))
     _check_memory(jobs)
-    log(f"{len(jobs)} block{'s' * (len(jobs) != 1)} of {bucketed.buckets.edge:g} m")
+    log(f"{count(len(jobs), 'block')} of {bucketed.buckets.edge:g} m")
     finished = executor.map(_rasterise_block, jobs, _fail)
     for job in track(finished, "making rasters", len(jobs), console=Console(stderr=True)):
         _write_block(writer, job)

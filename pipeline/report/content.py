@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import pandas as pd
 import yaml
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
@@ -91,7 +92,7 @@ def gather(run: Run) -> Content:
         columns=["tile", "stage", "error", "message", "file"],
     )
     return Content(
-        title=f"FlexRoad: {run.config.name} over {counts.tiles} tile{'s' * (counts.tiles != 1)}",
+        title=f"FlexRoad: {run.config.name} over {count(counts.tiles, 'tile')}",
         state=_state(counts),
         reference=_reference(run, set(done.tile_id)),
         main=_over_tiles(done, variants, FIGURES, "mean"),

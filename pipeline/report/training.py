@@ -15,6 +15,7 @@ import pandas as pd
 import yaml
 
 from flexroad.catalog.storage.paths import write
+from flexroad.catalog.text import count
 from flexroad.pipeline.report.pages import template
 from flexroad.pipeline.report.render import curves, segmentation_map
 from flexroad.pipeline.run.record import versions
@@ -72,7 +73,6 @@ def _figures(quality: Quality) -> dict[str, float]:
 
 
 def _page(outcome: Outcome, name: str) -> str:
-    split = outcome.split
     rows = [
         ("all cells", outcome.quality),
         (f"{outcome.options.ignore_m:g} m off label edges", outcome.inner),
@@ -85,11 +85,10 @@ def _page(outcome: Outcome, name: str) -> str:
             for evaluation in outcome.judged
         ]
     )
-    count = f"{len(split.train)} tile{'s' * (len(split.train) != 1)}"
     return template("training.html.j2").render(
         title=f"Road model {name}",
         state=summary(outcome),
-        lines=_lines(outcome, count),
+        lines=_lines(outcome),
         sections=[
             ("Validation tiles, together", overall.rename(columns=COLUMNS), _meaning(outcome)),
             ("Validation tiles, one by one", per_tile.rename(columns=COLUMNS), ""),
@@ -102,12 +101,13 @@ def _page(outcome: Outcome, name: str) -> str:
     )
 
 
-def _lines(outcome: Outcome, count: str) -> list[str]:
+def _lines(outcome: Outcome) -> list[str]:
     options, split = outcome.options, outcome.split
     return [
-        f"Method {options.method}, labels: {options.labels}. Trained on {count}, validated on "
-        f"{len(split.validate)} in one separate block. Not used for training: cells nearer to the block than "
-        f"{options.gap_m:g} m, and cells nearer to an edge of the labels than {options.ignore_m:g} m.",
+        f"Method {options.method}, labels: {options.labels}. Trained on {count(len(split.train), 'tile')}, "
+        f"validated on {len(split.validate)} in one separate block. Not used for training: cells nearer to "
+        f"the block than {options.gap_m:g} m, and cells nearer to an edge of the labels than "
+        f"{options.ignore_m:g} m.",
         "Expect lower quality on land that looks different. dinov2 chooses its stopping point and its "
         "threshold on the validation tiles, so its figures are slightly optimistic; pixels chooses them on "
         "parts of the training tiles.",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.reproduce.bootstrap import LEVEL, RESAMPLES, Means, bootstrap
@@ -166,4 +167,4 @@ def _per_stratum(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
         for figure, label in FIGURES.items():
             table[label] = [format_figure(means[row.variant][figure], figure) for row in rows]
         tiles = len(selected.index.unique("tile_id"))
-        yield Section(f"Our figures, {stratum}: {tiles} tile{'s' * (tiles != 1)}", table)
+        yield Section(f"Our figures, {stratum}: {count(tiles, 'tile')}", table)

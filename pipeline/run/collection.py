@@ -13,6 +13,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.index import PROJECTION, STAC_VERSION, datetime_text
 from flexroad.catalog.storage.paths import remove, write
+from flexroad.catalog.text import count
 from flexroad.pipeline.run.mosaic import vrt_name, write_mosaics
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.records import DONE
@@ -51,14 +52,13 @@ def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[
     cells = {tile.grid.cell for tile in done}
     export = run.config.export
     codes = sorted({tile.grid.crs for tile in done if tile.grid.has_code})
-    count = "1 tile" if len(done) == 1 else f"{len(done)} tiles"
     return {
         "type": "Collection",
         "stac_version": STAC_VERSION,
         "stac_extensions": [PROJECTION, *EXTENSIONS],
         "id": run.collection,
         "title": run.collection,
-        "description": f"Road surfaces of {count} by FlexRoad, configuration {run.config.name}",
+        "description": f"Road surfaces of {count(len(done), 'tile')} by FlexRoad, configuration {run.config.name}",
         # The licence of the results depends on that of the sources.
         "license": "other",
         "extent": {

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import printable, shown
+from flexroad.catalog.text import count, printable, shown
 from flexroad.pipeline.config.methods import methods
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
@@ -215,7 +215,7 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     tiles = LabelledTiles(options, _chain(config)["load"], _vector_options(config))
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
-    log(f"{len(sides.train)} tiles for training, {len(sides.validate)} for validation")
+    log(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
     samples = [Samples(tiles, sides, part) for part in ("train", "validate")]
 
     def progress(done: int, of: int, last: Round) -> None:

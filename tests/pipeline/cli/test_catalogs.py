@@ -30,11 +30,11 @@ def test_catalog_nrw_can_be_run(tmp_path, quick_config):
     out = tmp_path / "nrw.parquet"
     words = ("--tile-size", 50, "--road-mask", "road.tif", "--road-value", 2, 3, "-o", out)
     out_text, err_text = flexroad("catalog", "nrw", root, *words)
-    assert f"1 tiles in {out}" in out_text
+    assert f"1 tile in {out}" in out_text
     assert "note: left out 3 tiles with a DSM height in less than 25%" in err_text
     assert Catalog.read(out).tiles[0].layer("road_mask").values == (2, 3)
     words = ("--config", quick_config, "--catalog", out, "--out", tmp_path / "run", "--executor", "serial")
-    assert "1 tiles: 1 done" in flexroad("run", *words)[0]
+    assert "1 tile: 1 done" in flexroad("run", *words)[0]
     assert (tmp_path / "run" / "tiles" / "356000_5699950" / "356000_5699950_flexroad.glb").is_file()
 
 

@@ -51,7 +51,7 @@ def test_help_lists_options_under_headings():
 
 def test_rerun_from_offers_every_stage():
     (option,) = (param for param in COMMANDS["rerun",].params if "--from" in param.opts)
-    assert option.display_type_rich(None) == f"<{'|'.join(STAGE_NAMES)}>"
+    assert option.display_type_rich(None) == f"<{'|'.join((*STAGE_NAMES, 'export'))}>"
 
 
 @pytest.mark.parametrize(

@@ -200,7 +200,7 @@ def test_run_with_tile_keeps_other_tiles_of_the_run(survey, tmp_path):
         "serial",
     ]
     one, two = catalog.tiles[3].id, catalog.tiles[1].id
-    assert "1 tiles: 1 done (0 cached)" in flexroad(*words, "--tile", one)
+    assert "1 tile: 1 done (0 cached)" in flexroad(*words, "--tile", one)
     assert "2 tiles: 2 done (0 cached)" in flexroad(*words, "--tile", two)
     table = pd.read_parquet(tmp_path / "run" / "metrics.parquet")
     assert table.tile_id.tolist() == [two, one]

@@ -50,7 +50,7 @@ def test_prepare_points_prints_next_command_that_runs(cloud, roads, tmp_path):
     )
     (next_line,) = (line for line in output.splitlines() if line.startswith("next: "))
     words = next_line.removeprefix("next: flexroad ").replace("RUN", str(tmp_path / "run")).split()
-    assert "1 tiles: 1 done" in flexroad(*words, "--executor", "serial")
+    assert "1 tile: 1 done" in flexroad(*words, "--executor", "serial")
     (tile,) = Catalog.read(out / "catalog.parquet").tiles
     assert (tile.dataset, f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == (
         "street",

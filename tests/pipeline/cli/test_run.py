@@ -115,12 +115,12 @@ def test_run_with_pipe_as_output_is_refused_at_the_start(flexroad, nightly, tmp_
     assert not (tmp_path / "run" / "tiles").exists()
 
 
-def test_run_that_cannot_start_notifies(flexroad, nightly, notification, tmp_path, monkeypatch):
-    said = flexroad(*nightly, *notification.words, "--executor", "x", expect=2)
+def test_run_that_cannot_start_notifies(flexroad, nightly, survey, notification, tmp_path, monkeypatch):
+    said = flexroad(*nightly, *notification.words, "--store", survey, expect=2)
     received = notification.received
     assert received["exit_code"] == 2
-    assert "could not start: --executor x: there are dask and serial" in received["text"]
-    assert "dask and serial" in said
+    assert "could not start: cannot write the run" in received["text"]
+    assert "choose another --out or --store" in said
     # There is no summary of this run.
     assert "tiles" not in received
     with run_lock(tmp_path / "run"):
@@ -203,7 +203,7 @@ def test_run_with_setting_records_it_for_rerun(flexroad, nightly, tmp_path):
     flexroad(*nightly, "--set", "fit.iterations=4", "--tile", "499980_5599980")
     assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["fit"]["iterations"] == 4
     said = flexroad("rerun", tmp_path / "run", "--executor", "serial")
-    assert "1 tiles: 1 done (1 cached)" in said
+    assert "1 tile: 1 done (1 cached)" in said
     assert "--set fit.iterations=4" in flexroad("report", tmp_path / "run")
 
 
@@ -224,3 +224,19 @@ def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(
     )
     shutil.rmtree(run / "store")
     assert "1 point lies on no finished tile" in flexroad("query", run, "--points", points)
+
+
+def test_rerun_from_export_only_writes_the_products_again(flexroad, nightly, tmp_path):
+    one = ["--tile", "499980_5599980"]
+    assert "starting: 1 tile\n" in flexroad(*nightly, *one)
+    run = tmp_path / "run"
+    mesh = run / "tiles" / one[1] / f"{one[1]}_flexroad.ply"
+    before = mesh.read_bytes()
+    # The size is the same, so only --verify would notice it.
+    mesh.write_bytes(b"x" * len(before))
+    flexroad("rerun", run, "--from", "export", "--executor", "serial")
+    assert mesh.read_bytes() == before
+    last = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    stages = [event["stage"] for event in last if event.get("tile") == one[1] and event.get("computed")]
+    assert stages.count("export") == 2
+    assert stages.count("fit") == 1
