@@ -23,7 +23,7 @@ from flexroad.pipeline.reproduce.claims import (
     percent,
 )
 from flexroad.pipeline.reproduce.dsc3d import compare_dsc3d
-from flexroad.pipeline.reproduce.metrics_data import MetricsData
+from flexroad.pipeline.reproduce.metrics_data import PARTLY, MetricsData
 from flexroad.pipeline.reproduce.published import BASE, DSC3D, GEROD, TABLE_I, TABLE_I_DSC3D, TABLE_II, Row
 from flexroad.pipeline.reproduce.sections import (
     Section,
@@ -34,7 +34,11 @@ from flexroad.pipeline.reproduce.sections import (
     verdicts_table,
 )
 
-MASKS = {"segmented": "segmented mask", "reference": "true mask"}
+MASKS = {
+    "segmented": "segmented mask",
+    "reference": "true mask",
+    PARTLY: "true mask where a tile has one, else by the segmented mask",
+}
 
 
 @dataclass(frozen=True, eq=False)

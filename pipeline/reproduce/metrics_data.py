@@ -20,6 +20,8 @@ FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
 FIGURE_DTYPE: Final = "float32"
 """Type of the stored figures. Pages are made from these values: the stored files reproduce them exactly."""
+PARTLY = "partly reference"
+"""Value of the column ``classes`` if only some tiles have a true mask."""
 UNNAMED = "rasters whose catalog does not name them"
 
 
@@ -39,7 +41,7 @@ class MetricsData:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Values of `evaluate.classes`; the main one first."""
+        """The masks that classed the cells: ``segmented``, ``reference`` or `PARTLY`; the main one first."""
         return tuple(dict.fromkeys(self.rows.classes))
 
     @property
@@ -175,9 +177,19 @@ def _rows(run: Run) -> pd.DataFrame:
     if len(classes) > 1:
         raise ConfigError(f"{run.path}: evaluate.classes differs between variants; use one value for all")
     rows = read_metrics(run.path)
-    rows = rows.assign(dataset=datasets[0] or UNNAMED, classes=classes[0])
+    rows = rows.assign(dataset=datasets[0] or UNNAMED, classes=_classes_used(run, classes[0], rows))
     figures = rows[list(FIGURES)].astype("float64").where(rows.status == "done").astype(FIGURE_DTYPE)
     return pd.concat([rows[KEYS].astype("str"), figures], axis="columns")
+
+
+def _classes_used(run: Run, option: str, rows: pd.DataFrame) -> str:
+    """Return the mask that classed the cells: without a true mask it is the segmented one, by any option."""
+    done = set(rows.tile_id[rows.status == "done"])
+    tiles = [tile for tile in run.catalog.tiles if tile.id in done or not done]
+    with_mask = sum(tile.layer("reference_road") is not None for tile in tiles)
+    if option == "segmented" or not with_mask:
+        return "segmented"
+    return "reference" if with_mask == len(tiles) else PARTLY
 
 
 def _checked(rows: pd.DataFrame, run: Location, dsc3d: tuple[MetricsData, ...] = ()) -> MetricsData:

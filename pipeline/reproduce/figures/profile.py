@@ -81,9 +81,10 @@ def draw(view: TileView, row: Floats, col: Floats, heights: dict[str, Floats]) -
         "truth": {"color": TRUTH, "linewidth": 2.4, "alpha": 0.7},
         "FlexRoad": {"color": FLEXROAD, "linestyle": (0, (3.5, 1.2))},
     }
-    for label, style in styles.items():
-        axes["heights"].plot(at, heights[label], label=label, **style)
-        axes["errors"].plot(at, heights[label] - heights["truth"], label=label, **style)
+    for name, style in styles.items():
+        label = view.against.removeprefix("the ") if name == "truth" else name
+        axes["heights"].plot(at, heights[name], label=label, **style)
+        axes["errors"].plot(at, heights[name] - heights["truth"], label=label, **style)
     _frame(axes["heights"], axes["errors"], at, heights)
     return figure
 

@@ -1,6 +1,7 @@
 """The figures show the numbers of the run."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -158,7 +159,9 @@ def test_profile_shows_rasters_along_path(tile):
     np.testing.assert_allclose(lines["Plane"].get_ydata(), expected + plane.origin[2], atol=1e-6)
     for line in errors.lines:
         whole = lines[line.get_label()].get_ydata()
-        np.testing.assert_allclose(line.get_ydata(), whole - lines["truth"].get_ydata())
+        np.testing.assert_allclose(line.get_ydata(), whole - lines["reference surface"].get_ydata())
+    measured = profile.make_figure(replace(tile, against="the DTM"), ROLES).figure
+    assert "DTM" in [line.get_label() for axes in measured.axes for line in axes.lines]
 
 
 def test_trajectory_on_straight_road_is_right_of_centre():

@@ -318,6 +318,19 @@ def test_collect_true_run_without_true_mask_raises(tmp_path):
         collect(ours, true)
 
 
+def test_compare_names_the_mask_that_classed_the_cells(tmp_path):
+    every = made_run(tmp_path / "every", "ablation_true")
+    none = made_run(tmp_path / "none", "ablation_true", layers=("dsm", "dtm"))
+    tiles = (*every.catalog.tiles[:2], *none.catalog.tiles[2:])
+    some = replace(every, catalog=Catalog(tiles))
+    for run, words in (
+        (every, "classed as road or terrain by the true mask."),
+        (none, "classed as road or terrain by the segmented mask."),
+        (some, "by the true mask where a tile has one, else by the segmented mask."),
+    ):
+        assert any(note.endswith(words) for note in compare(collect(run)).notes), words
+
+
 STAND_IN = "synthetic photogrammetry, stand-in for DSC3D; "
 CIRCULAR, TRUTH = STAND_IN + "circular", STAND_IN + "true"
 
