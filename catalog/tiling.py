@@ -238,5 +238,6 @@ def assumed(tiles: Sequence[Tile]) -> list[str]:
     if not undated:
         return []
     return [
-        f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead (--date sets it)"
+        f"no date in the dsm of {count(len(undated), 'tile')}: the files' times are used instead "
+        "(--date sets it)"
     ]

@@ -58,7 +58,8 @@ def collection(run: Run, done: Sequence[Tile], mosaics: Sequence[Kind]) -> dict[
         "stac_extensions": [PROJECTION, *EXTENSIONS],
         "id": run.collection,
         "title": run.collection,
-        "description": f"Road surfaces of {count(len(done), 'tile')} by FlexRoad, configuration {run.config.name}",
+        "description": f"Road surfaces of {count(len(done), 'tile')} by FlexRoad, "
+        f"configuration {run.config.name}",
         # The licence of the results depends on that of the sources.
         "license": "other",
         "extent": {
