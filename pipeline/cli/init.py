@@ -44,7 +44,10 @@ def init(
         typer.Option(metavar="FILE", help="Also write a small configuration; an existing file is kept."),
     ] = None,
 ) -> None:
-    """Say what a folder of downloads has, what is unclear, and which commands make a catalog of it."""
+    """Say what a folder of downloads has, and which commands fit.
+
+    Asks what is unclear. The commands make a catalog of the files and run it.
+    """
     from flexroad.pipeline.inspect.downloads import MAX_FILES, look
     from flexroad.pipeline.inspect.proposals import proposals
 

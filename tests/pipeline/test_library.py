@@ -40,7 +40,7 @@ def city(tmp_path_factory) -> Path:
     """A folder with a survey of two tiles of 60 m and ``runs/city``, in which the first tile is done."""
     folder = tmp_path_factory.mktemp("library")
     catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=0, size_m=60))
-    run = Run.create(folder / "runs" / "city", load_config("nightly"), catalog)
+    run = Run.create(folder / "runs" / "city", load_config("production"), catalog)
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
     return folder
 
@@ -129,7 +129,7 @@ def test_fit_equals_run_over_same_rasters(tmp_path, rasters):
     """The run has one tile: with neighbours it would know more ground than the rasters."""
     fitted = flexroad.fit(**rasters)
     catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
-    run_tiles(Run.create(tmp_path / "run", load_config("nightly"), catalog), SerialExecutor())
+    run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
     run = flexroad.open_run(tmp_path / "run")
     west, south, east, north = fitted.bounds
     x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
@@ -306,7 +306,7 @@ def test_run_to_xarray_without_geotiffs_raises(city, tmp_path):
 def test_run_with_failed_tile_lists_failures(city, tmp_path):
     catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
     (tmp_path / "survey" / "dsm" / "499980_5599980.tif").unlink()
-    run = Run.create(tmp_path / "run", load_config("nightly"), catalog)
+    run = Run.create(tmp_path / "run", load_config("production"), catalog)
     with pytest.raises(flexroad.ConfigError, match=r"failures.csv does not exist"):
         assert flexroad.open_run(run.path).failures
     run_tiles(run, SerialExecutor())

@@ -47,7 +47,7 @@ def test_catalog_rasters_next_line_runs_as_printed(words, layer, place, rasters,
     assert line.startswith(f"next: flexroad run --config {PRODUCTION[layer]} ")
     assert ("--allow" in line) == ("mine" in place)
     arguments = shlex.split(line.removeprefix("next: flexroad "))
-    assert "1 tiles: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
+    assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
     name = "it's" if "mine" in place else "my data"
     assert (tmp_path / "runs" / name / "metrics.parquet").is_file()
 
@@ -70,4 +70,4 @@ def test_catalog_with_own_layout_next_line_names_it(rasters, flexroad, tmp_path,
     said = flexroad("catalog", "dsc3d", rasters, "-o", "c.parquet", "--layout", layout).expected(0)
     arguments = shlex.split(said.out.splitlines()[-1].removeprefix("next: flexroad "))
     assert arguments[:3] == ["run", "--config", str(layout)]
-    assert "1 tiles: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
+    assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out

@@ -312,15 +312,15 @@ def test_collect_mixed_datasets_raises(tmp_path):
 
 
 def test_collect_true_run_without_true_mask_raises(tmp_path):
-    ours = made_run(tmp_path / "ours", layers=("dsm", "dtm"))
-    true = made_run(tmp_path / "true", "ablation_true", layers=("dsm", "dtm"))
+    ours = made_run(tmp_path / "ours", layers=("dsm", "dtm", "road_mask"))
+    true = made_run(tmp_path / "true", "ablation_true", layers=("dsm", "dtm", "road_mask"))
     with pytest.raises(ConfigError, match="has no true road mask in its catalog; leave out --true"):
         collect(ours, true)
 
 
 def test_compare_names_the_mask_that_classed_the_cells(tmp_path):
     every = made_run(tmp_path / "every", "ablation_true")
-    none = made_run(tmp_path / "none", "ablation_true", layers=("dsm", "dtm"))
+    none = made_run(tmp_path / "none", "ablation_true", layers=("dsm", "dtm", "road_mask"))
     tiles = (*every.catalog.tiles[:2], *none.catalog.tiles[2:])
     some = replace(every, catalog=Catalog(tiles))
     for run, words in (
