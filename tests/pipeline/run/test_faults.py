@@ -155,8 +155,8 @@ def test_run_workers_cannot_start_exits_with_one_line(config, made_survey, night
     few = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh"]
     done = subprocess.run([*few, *call], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr.startswith("error: cannot start 2 worker processes here: ")
-    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("starting: 4 tiles\nerror: cannot start 2 worker processes here: ")
+    assert done.stderr.count("\n") == 2
     assert night().code == 0
     assert_whole(out, undisturbed)
 
