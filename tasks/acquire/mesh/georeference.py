@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import unescape
 
 import numpy as np
 
@@ -22,6 +23,8 @@ LOCAL_BELOW = 10_000.0
 """If all plan coordinates are smaller than this, they are taken as local, not as coordinates of a CRS."""
 MOST_CHARACTERS = 2**20
 """Longest sidecar file that is read."""
+SRS = re.compile(r"<SRS>\s*([^<]+?)\s*</SRS>")
+SRS_ORIGIN = re.compile(r"<SRSOrigin>\s*([^<]+?)\s*</SRSOrigin>")
 SEARCHED_FOLDERS = 3
 """Number of folders searched for a sidecar file: the mesh's own and those above it."""
 
@@ -57,8 +60,8 @@ class Georeference:
         if self.crs is None or local:
             missing = "georeference" if local else "CRS"
             raise TaskError(
-                f"{path} has no {missing}, and no data_meta.json, coords.txt or .prj in its folder or up to "
-                "two folders above has one; give --crs EPSG:... and --offset EASTING NORTHING HEIGHT",
+                f"{path} has no {missing}, and no data_meta.json, coords.txt, metadata.xml or .prj in its "
+                "folder or up to two above has one; give --crs EPSG:... and --offset EASTING NORTHING HEIGHT",
                 file=str(path),
             )
         try:
@@ -71,8 +74,8 @@ def read_sidecar(path: Path) -> Georeference:
     """Read the nearest sidecar file of a mesh, in its folder or up to two above; empty if there is none.
 
     Supported are ``data_meta.json`` (DeepScenario: UTM zone and offset), ``coords.txt``, also in
-    ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan, none in height), and ``.prj``
-    (only the CRS).
+    ``odm_georeferencing`` (OpenDroneMap: UTM zone, then an offset in plan, none in height), ``metadata.xml``
+    (ContextCapture, DJI Terra and others: ``SRS`` and ``SRSOrigin``), and ``.prj`` (only the CRS).
 
     Raises
     ------
@@ -85,6 +88,7 @@ def read_sidecar(path: Path) -> Georeference:
             ("data_meta.json", _deepscenario),
             ("coords.txt", _odm),
             ("odm_georeferencing/coords.txt", _odm),
+            ("metadata.xml", _model_metadata),
         ):
             if (folder / name).is_file():
                 return result.with_fallback(read(folder / name))
@@ -116,6 +120,24 @@ def _odm(path: Path) -> Georeference:
             file=str(path),
         ) from error
     return Georeference(_utm(int(zone[1]), zone[2]) if zone else head.strip(), (east, north, 0.0))
+
+
+def _model_metadata(path: Path) -> Georeference:
+    text = _text(path)
+    crs, origin = SRS.search(text), SRS_ORIGIN.search(text)
+    try:
+        if crs is None:
+            raise ValueError("there is no SRS")
+        system = unescape(crs[1])
+        in_plan(system)
+        east, north, up = map(float, (origin[1] if origin else "0,0,0").split(","))
+    except (ValueError, CatalogError) as error:
+        raise TaskError(
+            f"{path} has no SRS like EPSG:32632 with an SRSOrigin of three numbers: {error}; give --crs and "
+            "--offset",
+            file=str(path),
+        ) from error
+    return Georeference(system, (east, north, up))
 
 
 def _text(path: Path) -> str:

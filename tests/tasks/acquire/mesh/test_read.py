@@ -150,6 +150,12 @@ def test_read_mesh_inside_out_gives_a_note(tmp_path, texture):
     assert read_mesh(path, **PLACED).notes == (note,)
 
 
+MODEL_METADATA = """<?xml version="1.0" encoding="utf-8"?>
+<ModelMetadata version="1">
+\t<SRS>{}</SRS>
+\t<SRSOrigin>{}</SRSOrigin>
+</ModelMetadata>
+"""
 SIDECARS = {
     "data_meta.json": (
         json.dumps({"reference_utm": {"zone": [17, "N"], "offset": [552208, 4114742, -5]}}),
@@ -157,6 +163,7 @@ SIDECARS = {
     ),
     "coords.txt": ("WGS84 UTM 17N\n552208 4114742\n1 2 3\n", 0),
     "odm_georeferencing/coords.txt": ("EPSG:32617\n552208 4114742\n", 0),
+    "metadata.xml": (MODEL_METADATA.format("EPSG:32617", "552208,4114742,7"), 7),
 }
 
 
@@ -202,6 +209,16 @@ def sidecar_without_zone(folder, texture):
 
 def sidecar_without_offset(folder, texture):
     (folder / "coords.txt").write_text("WGS84 UTM 17N\n")
+    return write_obj(folder, texture), {}
+
+
+def sidecar_of_a_tangent_plane(folder, texture):
+    (folder / "metadata.xml").write_text(MODEL_METADATA.format("ENU:37.2,-80.4", "0,0,0"))
+    return write_obj(folder, texture), {}
+
+
+def sidecar_with_half_an_origin(folder, texture):
+    (folder / "metadata.xml").write_text(MODEL_METADATA.format("EPSG:32617", "552208,4114742"))
     return write_obj(folder, texture), {}
 
 
@@ -281,6 +298,8 @@ BAD = {
     wrong_crs: "m.obj: unknown CRS 'EPSG:nothing'",
     sidecar_without_zone: "data_meta.json has no reference_utm",
     sidecar_without_offset: "coords.txt has no CRS in its first line and an offset",
+    sidecar_of_a_tangent_plane: "metadata.xml has no SRS like .*ENU:37.2,-80.4.*--crs and --offset",
+    sidecar_with_half_an_origin: "metadata.xml has no SRS like .* with an SRSOrigin of three numbers",
     no_texture: "m.obj needs the texture .*m.png, which does not exist.*--no-dop",
     no_texture_of_ply: "m.ply needs the texture .*m.png, which does not exist.*--no-dop",
     broken_texture: "the texture .*m.png of .*m.obj cannot be read",
