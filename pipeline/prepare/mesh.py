@@ -26,7 +26,7 @@ from flexroad.pipeline.prepare.point_buckets import (
     disk_errors,
 )
 from flexroad.pipeline.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
-from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.mesh import reference
 from flexroad.tasks.acquire.mesh.georeference import Offset
 from flexroad.tasks.acquire.mesh.read import read_mesh
@@ -92,6 +92,7 @@ def prepare_mesh(
     TaskError, CatalogError, ConfigError
         If the mesh or the roads cannot be used, or the folder cannot be written; no files are left behind.
     """
+    check_roads(common)
     log(f"reading {path}")
     mesh = read_mesh(path, mesh_options.up, common.crs, mesh_options.offset, colours=mesh_options.dop)
     return publish_mesh(mesh, path.name, out, common, mesh_options, options, executor, log)

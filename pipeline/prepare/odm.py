@@ -28,7 +28,7 @@ from flexroad.pipeline.prepare.mesh import MeshOptions, prepare_mesh
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
-from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.points import fill_voids, ground_filter, to_rasters
 from flexroad.tasks.types import Floats, Orthophoto
@@ -96,6 +96,7 @@ def prepare_odm(
 def _from_rasters(
     folder: Path, out: Path, common: PrepareOptions, options: to_rasters.Options, log: Callable[[str], None]
 ) -> PreparedDataset:
+    check_roads(common)
     has_dtm, photo = (folder / DTM).is_file(), folder / PHOTO
     frame, bounds = _frame(folder / DSM, common)
     grid = prepared_grid(bounds, frame.target, common, str(folder / DSM), out, photo=photo.is_file())

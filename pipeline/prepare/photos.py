@@ -21,6 +21,7 @@ from flexroad.pipeline.prepare.mesh import MeshOptions, publish_mesh
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.point_buckets import disk_errors, scratch_folder
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset
+from flexroad.pipeline.prepare.roads import check_roads
 from flexroad.tasks import TaskError
 from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
 from flexroad.tasks.acquire.photos.exif import PlacedPhotos, place_photos, read_control, read_shot
@@ -105,6 +106,7 @@ def prepare_photos(
     TaskError, CatalogError, ConfigError
         If pycolmap is missing, a photograph has no position, or they do not match; no files are left behind.
     """
+    check_roads(common)
     sfm.colmap()
     placed = place_photos([read_shot(path) for path in _files(images)], common.to_crs)
     control = photos_options.control and read_control(

@@ -25,7 +25,7 @@ from flexroad.pipeline.prepare.point_buckets import (
     scratch_folder,
 )
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
-from flexroad.pipeline.prepare.roads import add_roads
+from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.points.to_rasters import Options, reach_m, tags
 
 Ground = Literal["auto", "classes", "filter"]
@@ -81,6 +81,7 @@ def prepare_points(
         If the folder cannot be written, the disk is full or too small, or cell and pixel sizes do not fit
         each other.
     """
+    check_roads(common)
     step = common.step_m
     clouds = tuple(inspect(path) for path in find(files))
     frame = _frame(clouds, common)

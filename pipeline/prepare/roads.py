@@ -35,6 +35,24 @@ CUT = "cut it to the area, e.g. gdal_translate -projwin"
 LINES = ("LineString", "MultiLineString")
 
 
+def check_roads(common: PrepareOptions) -> None:
+    """Check the roads before the work that precedes their use; a mesh is only checked to exist.
+
+    Raises
+    ------
+    ConfigError
+        If the roads do not exist, are no raster, mesh or vector file, or lack the layer or a feature of it.
+    """
+    path = common.roads
+    if path is None:
+        return
+    if not path.exists():
+        raise ConfigError(f"--roads {path} does not exist")
+    if path.suffix.lower() in MESHES or _is_raster(path) or _osm(path, common.roads_layer):
+        return
+    _read(path, common.roads_layer, common.roads_where, rows=1)
+
+
 def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
     """Write the road mask, if roads were given; a vector file of roads is entered in the catalog, too.
 
@@ -95,8 +113,6 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools 
     ConfigError
         If the file cannot be read, holds points, or has no road on the grid.
     """
-    if not path.exists():
-        raise ConfigError(f"--roads {path} does not exist")
     mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)
     if mask is None:
         features = _features(path, layer, where, grid)
@@ -121,6 +137,14 @@ def _mesh(path: Path, grid: Grid) -> Bools:
 
     mesh = read_mesh(path, colours=False)
     return covered_cells(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
+
+
+def _is_raster(path: Path) -> bool:
+    try:
+        with open_raster(path) as source:
+            return bool(source.count and source.crs)
+    except ERRORS:
+        return False
 
 
 def _raster(path: Path, grid: Grid) -> Bools | None:
@@ -151,13 +175,9 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
 
 def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> Any:
     """Return the polygons of a vector file in the grid's CRS, or None if it holds lines."""
-    vectors = _vectors(path)
-    if vectors is not None and vectors.extents is None and layer is None:
-        # OSM's own format has roads as lines, mostly; reading the whole file to check that would be slow.
+    if _osm(path, layer):
         return None
     features = _read(path, layer, where)
-    if features.crs is None:
-        raise ConfigError(f"{path} has no CRS; assign one, e.g. ogr2ogr -a_srs {short(grid.crs)}")
     features = features[~(features.geometry.isna() | features.geometry.is_empty)].to_crs(grid.crs)
     features = features[has_place(features.geometry.to_numpy())]
     kinds = sorted(set(features.geom_type) - {*AREAS, *LINES})
@@ -173,7 +193,14 @@ def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> A
     return None
 
 
-def _read(path: Path, layer: str | None, where: str | None) -> Any:
+def _osm(path: Path, layer: str | None) -> bool:
+    """Return whether a file is OSM's own format: mostly lines, and slow to read as a whole."""
+    vectors = _vectors(path)
+    return vectors is not None and vectors.extents is None and layer is None
+
+
+def _read(path: Path, layer: str | None, where: str | None, rows: int | None = None) -> Any:
+    """Return the features of a layer; ``rows`` limits their number."""
     import geopandas
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError
@@ -185,11 +212,13 @@ def _read(path: Path, layer: str | None, where: str | None) -> Any:
             raise ConfigError(f"{path} has several layers: {', '.join(names)}; select one with --roads-layer")
         if layer is not None and layer not in names:
             raise ConfigError(f"{path} has no layer {layer!r}; its layers: {', '.join(names)}")
-        features = geopandas.read_file(file, layer=layer or names[0], where=where)
+        features = geopandas.read_file(file, layer=layer or names[0], where=where, rows=rows)
     except (DataSourceError, DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
             f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"
         ) from error
+    if features.crs is None:
+        raise ConfigError(f"{path} has no CRS; assign one, e.g. ogr2ogr -a_srs EPSG:25832 NEW.gpkg {path}")
     if features.empty:
         condition = f" where {where}" if where else ""
         raise ConfigError(f"{path} has no feature{condition} in layer {layer or names[0]!r}")

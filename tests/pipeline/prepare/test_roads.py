@@ -10,8 +10,10 @@ from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.raster_writer import RasterWriter
-from flexroad.pipeline.prepare.roads import add_roads, burn
+from flexroad.pipeline.prepare.roads import add_roads, burn, check_roads
 from flexroad.tasks import TaskError, memory
+from tests.command_line import call
+from tests.make_roads import write_osm
 
 GRID = Grid("EPSG:25832", 400_000, 5_700_100, 1.0, 80, 100)
 
@@ -112,20 +114,50 @@ def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
     [
         (lambda path: None, None, None, "does not exist"),
         (lambda path: path.write_text("roads"), None, None, "cannot be read"),
-        (lambda path: write(path, [Point(400_010, 5_700_020)]), None, None, "Points, but roads must be"),
-        (lambda path: write(path, [LineString([(0, 0), (1, 1)])]), None, None, "no road of .* is in the"),
-        (lambda path: write(path, [box(0, 0, 9, 9)]), None, None, "no road of .* is in the area"),
         (lambda path: write(path, [box(0, 0, 9, 9)], crs=None), None, None, "no CRS"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), "streets", None, "no layer 'streets'"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "id = 7", "no feature where id = 7"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "kind = 'road'", "--roads-where"),
-        (lambda path: write(path, [Polygon()]), None, None, "no road"),
     ],
 )  # fmt: skip
-def test_burn_invalid_roads_is_one_line(tmp_path, make, layer, where, message):
+def test_check_roads_without_usable_features_raises_one_line(tmp_path, make, layer, where, message):
     path = tmp_path / "roads.gpkg"
     make(path)
     with pytest.raises(ConfigError, match=message) as caught:
-        burn(path, layer, where, GRID)
+        check_roads(PrepareOptions(roads=path, roads_layer=layer, roads_where=where))
     assert "\n" not in str(caught.value)
     assert "roads" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ([Point(400_010, 5_700_020)], "Points, but roads must be"),
+        ([LineString([(0, 0), (1, 1)])], "no road of .* is in the area"),
+        ([box(0, 0, 9, 9)], "no road of .* is in the area"),
+        ([Polygon()], "no road"),
+    ],
+)
+def test_burn_roads_elsewhere_or_of_no_area_raises_one_line(tmp_path, shapes, message):
+    path = write(tmp_path / "roads.gpkg", shapes)
+    with pytest.raises(ConfigError, match=message) as caught:
+        burn(path, None, None, GRID)
+    assert "\n" not in str(caught.value)
+
+
+def test_valid_roads_pass_the_check(tmp_path):
+    check_roads(PrepareOptions())
+    ways = write_osm(tmp_path / "ways.osm", {"highway=residential": [(9.0, 50.0), (9.1, 50.0)]})
+    check_roads(PrepareOptions(roads=ways))
+    polygons = write(tmp_path / "roads.gpkg", [box(400_000, 5_700_000, 400_010, 5_700_100)])
+    check_roads(PrepareOptions(roads=polygons))
+    published(tmp_path / "out", polygons)
+    check_roads(PrepareOptions(roads=tmp_path / "out" / "road_mask.tif"))
+
+
+@pytest.mark.parametrize("command", ["points", "mesh", "photos"])
+def test_prepare_checks_roads_before_it_reads_its_input(command, tmp_path):
+    broken = tmp_path / "input"
+    broken.write_text("nothing")
+    words = ("prepare", command, broken, "-o", tmp_path / "out", "--roads", tmp_path / "none.gpkg")
+    assert call(*words).expected(2).errors == [f"error: --roads {tmp_path / 'none.gpkg'} does not exist"]
