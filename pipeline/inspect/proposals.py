@@ -126,8 +126,14 @@ def _pattern(folder: Path, paths: Sequence[Path]) -> str | None:
         return glob.escape(names[0])
     start = os.path.commonprefix(names)  # noqa: RUF071 (of characters)
     end = os.path.commonprefix([name[::-1] for name in names])[::-1]  # noqa: RUF071
-    for middle in ("*", "**/*"):
-        pattern = glob.escape(start) + middle + glob.escape(end)
+    above = start[: start.rfind("/") + 1]
+    # Whole names are replaced first: what next year's files have in common with these is not known.
+    for first, middle, last in (
+        (above, "*", Path(names[0]).suffix),
+        (start, "*", end),
+        (start, "**/*", end),
+    ):
+        pattern = glob.escape(first) + middle + glob.escape(last)
         try:
             matched = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
         except ValueError:
