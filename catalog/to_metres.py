@@ -20,6 +20,7 @@ from flexroad.catalog.crs import (
     short,
     transformer,
     utm_of,
+    vertical,
 )
 from flexroad.catalog.errors import CatalogError
 
@@ -81,6 +82,11 @@ class MetricTransform:
         target = _metric(to_crs) if to_crs else twin
         exact = is_projected(source) and same(target, twin)
         return cls(source, target, plan_unit(source)[1] if exact else None, height_m, notes)
+
+    @property
+    def vertical(self) -> str | None:
+        """Vertical CRS of the heights in metres, None if the source does not declare one."""
+        return vertical(self.source)
 
     def metres(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
         """Return eastings, northings and heights in metres, ``(n,)`` each.

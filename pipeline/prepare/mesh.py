@@ -125,7 +125,7 @@ def publish_mesh(
     check_disk(out, RECORD.itemsize * points, f"the {points:,.0f} points sampled on {name}", remedy)
     dop_cell = common.dop_cell_m if mesh_options.dop else None
     log(f"{len(mesh.faces):,} faces over {grid.width} x {grid.height} cells in {short(grid.crs)}")
-    with RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options)) as writer:
+    with RasterWriter(out, grid, dop_cell, _tags(name, mesh_options, options), frame.vertical) as writer:
         has_mask = add_roads(writer, common)
         if has_mask:
             writer.tags["REFERENCE"] = (

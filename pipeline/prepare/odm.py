@@ -106,7 +106,7 @@ def _from_rasters(
     )
     name = folder.resolve().name
     tags = {"SOURCE": f"OpenDroneMap, {name}", "DSM": f"{DSM}, maximum per cell", "DTM": dtm_source}
-    with RasterWriter(out, grid, dop_cell, tags) as writer:
+    with RasterWriter(out, grid, dop_cell, tags, frame.vertical) as writer:
         log(f"resampling {folder / DSM} to {grid.width} x {grid.height} cells")
         _resample_heights(writer, "dsm", folder / DSM, frame, Resampling.max)
         if has_dtm:

@@ -103,7 +103,8 @@ def prepare_points(
         grid = prepared_grid(bucketed.bounds, frame.target, common, names, out, photo=not colourless)
         notes = (*frame.notes, *notes, *dense, *_left_out(bucketed, colourless))
         file_tags = _tags(clouds, frame, bucketed, options)
-        with RasterWriter(out, grid, None if colourless else common.dop_cell_m, file_tags) as writer:
+        dop_cell = None if colourless else common.dop_cell_m
+        with RasterWriter(out, grid, dop_cell, file_tags, frame.vertical) as writer:
             write_blocks(writer, bucketed, options, executor, log)
             add_roads(writer, common)
             dataset = common.dataset or _name(files)

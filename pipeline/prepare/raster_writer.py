@@ -26,6 +26,7 @@ from rasterio.windows import Window
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER, height_share
+from flexroad.catalog.crs import compound
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.storage.outputs import output_file
@@ -74,6 +75,8 @@ class RasterWriter:
         Pixel of the orthophoto (m), None if there is no orthophoto.
     tags : Mapping[str, str]
         TIFF tags of every file: its source and its processing.
+    vertical : str, optional
+        Vertical CRS of the heights, in metres, if it is known.
 
     Raises
     ------
@@ -81,11 +84,19 @@ class RasterWriter:
         If the folder cannot be written.
     """
 
-    def __init__(self, out: Path, grid: Grid, dop_cell: float | None, tags: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        out: Path,
+        grid: Grid,
+        dop_cell: float | None,
+        tags: Mapping[str, str],
+        vertical: str | None = None,
+    ) -> None:
         self.out = out
         self.grid = grid
         self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
         self.tags = dict(tags)
+        self._crs_of_heights = compound(grid.crs, vertical) if vertical else grid.crs
         self._new = not out.exists()
         self._open: dict[str, Any] = {}
         self._roads: list[VectorFile] = []
@@ -249,7 +260,7 @@ class RasterWriter:
                 self.scratch / f"{layer}.tmp.tif",
                 "w+",
                 driver="GTiff",
-                crs=grid.crs,
+                crs=self._crs_of_heights if layer in HEIGHTS else grid.crs,
                 transform=grid.transform,
                 width=grid.width,
                 height=grid.height,

@@ -8,12 +8,14 @@ import pytest
 import rasterio
 
 from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog.crs import vertical
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare import point_buckets, points
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.tasks.acquire.points.to_rasters import Options
+from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.load import load
 from tests.make_clouds import write_cloud
@@ -307,3 +309,22 @@ def test_prepare_points_failing_block_leaves_no_folder(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="no more"):
         prepare(two_files(tmp_path), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("crs", "datum"),
+    [("EPSG:25832+7837", 7837), ("EPSG:2994+8228", 5703), ("EPSG:25832", None)],
+    ids=["metres", "feet", "unknown"],
+)
+def test_prepare_points_writes_the_vertical_crs_of_its_points(tmp_path, crs, datum):
+    places = np.add(np.argwhere(np.ones((60, 60))), (640_000, 860_000))
+    files = [write_cloud(tmp_path / "a.laz", np.column_stack([places, np.full(3600, 30.0)]), 2, crs)]
+    catalog = prepare(files, tmp_path / "out")[0].catalog
+    for layer in ("dsm", "dtm"):
+        with rasterio.open(tmp_path / "out" / f"{layer}.tif") as raster:
+            assert vertical(raster.crs.to_wkt()) == (datum and f"EPSG:{datum}")
+    (tile,) = Catalog.read(catalog).tiles
+    assert tile.grid.crs in ("EPSG:25832", "EPSG:2993")
+    assert vertical_crs(tile) == (datum and f"EPSG:{datum}")
+    height = 30 * (0.3048 if crs.startswith("EPSG:2994") else 1)
+    np.testing.assert_allclose(np.nanmedian(load(tile, LoadOptions()).dsm), height, atol=WITHIN)
