@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
 
+from flexroad.catalog.headers import vrt
+from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.index import Catalog
 from flexroad.catalog.storage.paths import Location, normalise
-from flexroad.catalog.tile import LAYERS
+from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import ADDRESS, AllowedFolders, full_name
 
 MAX_FOLDERS = 4
 """Largest number of folders suggested with --allow; if there are more, parent folders are suggested."""
 TOPS = ("/", "s3:/", "s3:")
+MAX_DEPTH = 4
+"""Largest depth of VRTs that name VRTs."""
 
 
 def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
-    """Raise an error if a tile names a file that it may not read.
+    """Raise an error if a tile, or a VRT (``.vrt``) on disk that it names, names a file that may not be read.
 
-    `Tile.paths` raises the same error, but only when the file is needed.
+    `Tile.paths` and `open_raster` raise the same error, but only when the file is needed.
 
     Parameters
     ----------
@@ -30,11 +35,19 @@ def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
     CatalogError
         Names the first such tile, its layer and file, and the options that allow all such files.
     """
-    for tile in catalog.tiles:
-        for layer in tile.all_layers:
-            if tile.allowed and layer.name in layers and (outside := tile.outside(layer)):
-                folders = _needed(catalog, tile.allowed, layers)
-                raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", outside, folders)
+    checked = set[str]()
+    for tile, layer in _chosen(catalog, layers):
+        if tile.allowed is None:
+            continue
+        if outside := tile.outside(layer):
+            folders = _needed(catalog, tile.allowed, layers)
+            raise tile.allowed.refusal(f"tile {tile.id}: {layer.name}", outside, folders)
+        for vrt_name in {full_name(tile.root, file) for file in layer.files} - checked:
+            checked.add(vrt_name)
+            for name in _sources(vrt_name):
+                if not tile.allowed.permits(name):
+                    folders = _needed(catalog, tile.allowed, layers)
+                    raise tile.allowed.refusal(f"tile {tile.id}: {layer.name} {vrt_name}", name, folders)
 
 
 def needed(catalog: Catalog, folder: Location | str, layers: Collection[str] = LAYERS) -> tuple[str, ...]:
@@ -54,12 +67,28 @@ def _needed(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) 
 
 def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str]) -> Iterator[str]:
     """Yield the name of every file outside the allowed folders that could be allowed."""
+    names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
+    for name in (name for file in names for name in (file, *_sources(file))):
+        if not ADDRESS.match(name) and not allowed.permits(name):
+            yield normalise(name)
+
+
+def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:
     for tile in catalog.tiles:
-        for layer in (layer for layer in tile.all_layers if layer.name in layers):
-            for file in layer.files:
-                name = full_name(tile.root, file)
-                if not ADDRESS.match(name) and not allowed.permits(name):
-                    yield normalise(name)
+        yield from ((tile, layer) for layer in tile.all_layers if layer.name in layers)
+
+
+def _sources(name: str, depth: int = MAX_DEPTH) -> tuple[str, ...]:
+    """Return the files that a VRT on disk names; empty for other files and for one that cannot be read."""
+    on_disk = not ADDRESS.match(name) and not name.lower().startswith("s3:")
+    if not depth or not on_disk or not name.lower().endswith(".vrt"):
+        return ()
+    try:
+        named = vrt.sources(Path(name))
+    except (Refused, OSError):
+        # The reader reports it.
+        return ()
+    return (*named, *(file for source in named for file in _sources(source, depth - 1)))
 
 
 def _outermost(folders: Iterable[str]) -> set[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -78,7 +80,7 @@ def scan(
     layer : str
         Name of the layer, for messages.
     pattern : str
-        Glob pattern relative to ``root``.
+        Glob pattern: see `matching`.
     crs : str, optional
         CRS of files without one.
     allow : sequence of str
@@ -98,7 +100,8 @@ def scan(
     """
     files, notes = opened(root, layer, matching(root, layer, pattern), crs, allow)
     if not files:
-        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {root}; {notes[0]}")
+        folder, _ = _start(root, pattern)
+        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {folder}; {notes[0]}")
     return files, notes
 
 
@@ -135,23 +138,52 @@ def _option(layer: str) -> str:
 
 
 def matching(root: Path, layer: str, pattern: str) -> list[Path]:
-    """Return the files that match a glob pattern relative to ``root``, by name.
+    """Return the files that match a glob pattern, by name.
+
+    Parameters
+    ----------
+    root : Path
+        The folder that relative patterns start from, resolved.
+    layer : str
+        Name of the layer, for messages.
+    pattern : str
+        Relative to ``root``; absolute, or with ``..``, it names files outside.
 
     Raises
     ------
     CatalogError
         If no file matches; the message shows which files exist.
     """
+    folder, relative = _start(root, pattern)
     try:
-        paths = sorted(path for path in root.glob(pattern) if path.is_file())
+        paths = sorted(path for path in folder.glob(relative) if path.is_file())
     except (ValueError, NotImplementedError) as error:
-        raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {root}: {error}") from error
+        raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {folder}: {error}") from error
     if not paths:
-        files = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
-        names = some(sorted(islice(files, 100)))
-        hint = f"there are {names}" if names else "the folder is empty"
-        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {root}; {hint}")
+        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {_there(folder)}")
     return paths
+
+
+def _start(root: Path, pattern: str) -> tuple[Path, str]:
+    """Return the folder that a pattern starts from, and the rest of the pattern, relative to it."""
+    if not (os.path.isabs(pattern) or ".." in Path(pattern).parts):  # noqa: PTH117
+        return root, pattern
+    # As in catalogs, .. is resolved by name: links are not followed.
+    whole = Path(os.path.normpath(root / pattern))
+    if whole.is_relative_to(root) and whole != root:
+        return root, whole.relative_to(root).as_posix()
+    parts = whole.parts
+    fixed = next((n for n, part in enumerate(parts) if glob.has_magic(part)), len(parts) - 1)
+    return Path(*parts[:fixed]), str(Path(*parts[fixed:]))
+
+
+def _there(folder: Path) -> str:
+    """Return which files are in a folder, for a message."""
+    if not folder.is_dir():
+        return "the folder does not exist"
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    names = some(sorted(islice(files, 100)))
+    return f"there are {names}" if names else "the folder is empty"
 
 
 def _name(root: Path, path: Path) -> str:

@@ -33,8 +33,9 @@ def index(
     root : Path
         The folder.
     patterns : Mapping[str, str]
-        Layer name (see `catalog.LAYERS`) to glob pattern relative to ``root``; ``dsm`` is required. For
-        ``roads`` (vector files) the path of a file outside ``root`` is allowed as well.
+        Layer name (see `catalog.LAYERS`) to glob pattern; ``dsm`` is required. A pattern is relative to
+        ``root``; absolute, or with ``..``, it names files outside. ``roads`` (vector files) may also be the
+        path of a file.
     road_values : tuple of int
         Cell values that mean road in the masks; empty: every value but 0 and nodata.
     tile_size_m : float

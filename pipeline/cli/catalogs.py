@@ -70,7 +70,7 @@ Layout = Annotated[str, _files("Configuration whose `dataset` gives the file nam
 @catalogs.command("rasters", cls=Command)
 def catalog_rasters(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters.")],
-    dsm: Annotated[str, _files("Surface model: files relative to ROOT, as 'dsm/*.tif'.")],
+    dsm: Annotated[str, _files("Surface model: 'dsm/*.tif' in ROOT, or '/data/dsm/*.tif'.")],
     dtm: Annotated[str, _files("Terrain model.")],
     output: Output,
     dop: Annotated[str | None, _files("Orthophoto.")] = None,

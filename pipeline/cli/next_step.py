@@ -21,7 +21,6 @@ def after_catalog(path: Path, config: str | None = None) -> str:
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import needed
     from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.graph.graph import layers_read
     from flexroad.pipeline.graph.layers import fitting_config
     from flexroad.pipeline.run.record import check_inputs
 
@@ -35,6 +34,7 @@ def after_catalog(path: Path, config: str | None = None) -> str:
     # Many catalogs are called catalog.parquet: their folder tells them apart.
     title = path.stem if path.stem != "catalog" else path.absolute().parent.name or "run"
     words = ["flexroad", "run", "--config", name, "--catalog", str(path), "--out", f"runs/{title}"]
-    for folder in needed(catalog, path.parent, layers_read(settings)):
+    # Of all layers, so that the same options suit `catalog check` and `train`.
+    for folder in needed(catalog, path.parent):
         words += ["--allow", folder]
     return f"next: {shlex.join(words)}"

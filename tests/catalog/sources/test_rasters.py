@@ -52,6 +52,37 @@ def test_tile_lists_every_file_in_reach(tmp_path):
     }
 
 
+@pytest.mark.parametrize("pattern", ["{}/heights/dt*.tif", "../heights/dtm.tif", "../data/../heights/*.tif"])
+def test_index_pattern_outside_root_gives_full_names(tmp_path, pattern):
+    write(tmp_path / "data" / "dsm.tif", FLAT)
+    path = write(tmp_path / "heights" / "dtm.tif", FLAT)
+    result = index(tmp_path / "data", {"dsm": "dsm.tif", "dtm": pattern.format(tmp_path)})
+    assert files(result, "dtm") == [(str(path),)]
+    assert files(result) == [("dsm.tif",)]
+
+
+@pytest.mark.parametrize("pattern", ["{}/dsm/*.tif", "../data/dsm/a.tif", "dsm/../dsm/a.tif"])
+def test_index_pattern_that_leads_into_root_gives_relative_names(tmp_path, pattern):
+    write(tmp_path / "data" / "dsm" / "a.tif", FLAT)
+    result = index(tmp_path / "data", {"dsm": pattern.format(tmp_path / "data")})
+    assert files(result) == [("dsm/a.tif",)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("{}/no/*.tif", "below {}/no; the folder does not exist$"),
+        ("../data/no*.tif", "below {}/data; there are dsm.tif$"),
+        ("{}/heights/no.tif", "below {}/heights; there are dtm.tif$"),
+    ],
+)
+def test_index_pattern_outside_root_without_file_names_the_folder(tmp_path, pattern, message):
+    write(tmp_path / "data" / "dsm.tif", FLAT)
+    write(tmp_path / "heights" / "dtm.tif", FLAT)
+    with pytest.raises(CatalogError, match=message.format(tmp_path)):
+        index(tmp_path / "data", {"dsm": "dsm.tif", "dtm": pattern.format(tmp_path)})
+
+
 def test_file_only_in_halo_is_a_layer_nearby(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     write(tmp_path / "dtm.tif", FLAT, west=295750)
@@ -305,7 +336,7 @@ def test_index_wrong_pattern_or_layer_raises_error(tmp_path):
     with pytest.raises(CatalogError, match=r"no file matches --road-mask '\*.png' .*; there are dom/a.tif"):
         index(tmp_path, {"dsm": "dom/*.tif", "road_mask": "*.png"})
     with pytest.raises(CatalogError, match="is no pattern below"):
-        index(tmp_path, {"dsm": "/dom/*.tif"})
+        index(tmp_path, {"dsm": "dom/**.tif"})
     with pytest.raises(CatalogError, match="unknown layer 'dom'"):
         index(tmp_path, {"dsm": "dom/*.tif", "dom": "*"})
     with pytest.raises(CatalogError, match="--dsm"):
