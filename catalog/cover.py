@@ -24,7 +24,10 @@ AS_TEXT = (".xyz", ".gz", ".asc", ".txt")
 
 
 def height_share(
-    grid: Grid, paths: Iterable[Location], allowed: AllowedFolders | None = None
+    grid: Grid,
+    paths: Iterable[Location],
+    allowed: AllowedFolders | None = None,
+    crs: str | None = None,
 ) -> float | None:
     """Return the share (0 to 1) of a grid's cells whose centre has a height in one of the rasters.
 
@@ -32,9 +35,11 @@ def height_share(
     ----------
     grid : Grid
     paths : iterable of Location
-        Rasters of heights, north up and in the grid's CRS.
+        Rasters of heights, north up.
     allowed : AllowedFolders, optional
         Where the files that a VRT names may lie; None: anywhere on disk.
+    crs : str, optional
+        CRS of rasters without one; None: the grid's.
 
     Returns
     -------
@@ -53,35 +58,38 @@ def height_share(
             return None
         try:
             with quiet(), open_raster(path, allowed) as raster:
-                if not _add(known, grid, raster):
+                if not _add(known, grid, raster, raster.crs.to_wkt() if raster.crs else crs):
                     return None
         except (RasterioError, OSError):
             return None
     return float(known.mean())
 
 
-def _add(known: NDArray[Any], grid: Grid, raster: Any) -> bool:
+def _add(known: NDArray[Any], grid: Grid, raster: Any, crs: str | None) -> bool:
     """Set the cells of a grid that have a height in an open raster; return whether it could be read."""
     import numpy as np
     from rasterio.windows import Window
 
+    from flexroad.catalog.crs import same, transformer
     from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 
     affine = raster.transform
     if georeference_fault(raster) or heights_fault(raster) or affine.b or affine.d:
         return False
-    columns = np.floor((grid.eastings - affine.c) / affine.a).astype(int)
-    rows = np.floor((grid.northings - affine.f) / affine.e).astype(int)
-    across, down = (columns >= 0) & (columns < raster.width), (rows >= 0) & (rows < raster.height)
-    if not (across.any() and down.any()):
+    x, y = np.meshgrid(grid.eastings, grid.northings)
+    if crs and not same(crs, grid.crs):
+        x, y = transformer(grid.crs, crs).transform(x, y)
+    columns, rows = np.floor((x - affine.c) / affine.a), np.floor((y - affine.f) / affine.e)
+    inside = (columns >= 0) & (columns < raster.width) & (rows >= 0) & (rows < raster.height)
+    if not inside.any():
         return True
-    columns, rows = columns[across], rows[down]
+    columns, rows = columns[inside].astype(int), rows[inside].astype(int)
     left, top = columns.min(), rows.min()
     window = Window(left, top, columns.max() - left + 1, rows.max() - top + 1)
     if window.width * window.height > MAX_CELLS:
         return False
-    values = raster.read(1, window=window, masked=True)[np.ix_(rows - top, columns - left)]
+    values = raster.read(1, window=window, masked=True)[rows - top, columns - left]
     heights = np.ma.filled(values * raster.scales[0] + raster.offsets[0], np.nan)
     with np.errstate(invalid="ignore"):
-        known[np.ix_(down, across)] |= (heights > LOWEST) & (heights < HIGHEST)
+        known[inside] |= (heights > LOWEST) & (heights < HIGHEST)
     return True

@@ -178,6 +178,23 @@ def degrees(text: str, easting: float, northing: float) -> tuple[float, float]:
     return float(longitude), float(latitude)
 
 
+def scales(source: str, target: str, x: float, y: float) -> tuple[float, float]:
+    """Return how far one unit of a CRS reaches along the two axes of another one, in units of the latter.
+
+    Parameters
+    ----------
+    source, target : str
+        The two CRSs.
+    x, y : float
+        A point, in ``source``.
+    """
+    step = 1e-5 if is_geographic(source) else 1.0
+    xs, ys = transformer(source, target).transform([x - step, x + step, x, x], [y, y, y - step, y + step])
+    across = math.hypot(xs[1] - xs[0], xs[3] - xs[2]) / (2 * step)
+    along = math.hypot(ys[1] - ys[0], ys[3] - ys[2]) / (2 * step)
+    return across, along
+
+
 def bounds_in(target: str, source: str, bounds: Bounds) -> Bounds:
     """Return the bounds, in another CRS, of what lies within bounds; NaN if they cannot be transformed."""
     try:

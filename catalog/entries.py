@@ -22,6 +22,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.text import printable, shown
 from flexroad.catalog.tile import LAYERS, Layer, Tile, by_cover, faulty
+from flexroad.catalog.to_metres import HEIGHT_UNITS
 from flexroad.catalog.trust import AllowedFolders
 
 MAX_CELLS = 10**8
@@ -63,6 +64,8 @@ class _Asset(_Schema):
     values: list[Value] = Field(alias="flexroad:values")
     crs: Text | None = Field(None, alias="flexroad:crs")
     extents: Any = Field(None, alias="flexroad:extents")
+    reproject: bool | None = Field(None, alias="flexroad:reproject")
+    height_unit: Text | None = Field(None, alias="flexroad:height_unit")
 
 
 class _Assets(_Schema):
@@ -202,7 +205,8 @@ class TileReader:
             if system is not None:
                 _check_crs(system, "flexroad:crs")
             files = self._files(names)
-            return Layer(name, files, tuple(values), system, _extents(asset, len(names)))
+            extents = _extents(asset, len(names))
+            return Layer(name, files, tuple(values), system, extents, *_conversion(asset))
         except CatalogError as error:
             raise CatalogError(f"assets.{name}.{error}") from error
 
@@ -337,6 +341,19 @@ def _unpacked(edges: bytes) -> tuple[Bounds, ...]:
     if np.isnan(np.frombuffer(edges)).any():
         raise CatalogError("flexroad:extents: a number is NaN")
     return tuple(struct.iter_unpack("=4d", edges))
+
+
+def _conversion(asset: dict[str, Any]) -> tuple[bool, str | None]:
+    """Return whether files are reprojected, and the unit of their heights if they declare none."""
+    # Older catalogs do not have these fields.
+    reproject, unit = asset.get("flexroad:reproject"), asset.get("flexroad:height_unit")
+    if reproject is not None and type(reproject) is not bool:
+        raise TypeError
+    if unit is not None and type(unit) is not str:
+        raise TypeError
+    if unit is not None and unit not in HEIGHT_UNITS:
+        raise CatalogError(f"flexroad:height_unit: {shown(unit)} is not one of {', '.join(HEIGHT_UNITS)}")
+    return bool(reproject), unit
 
 
 def _is_text(value: Any) -> bool:

@@ -28,6 +28,16 @@ class Unreadable:
         return f"<{self.reason}>"
 
 
+FIELDS = (
+    ".flexroad:files",
+    ".flexroad:values",
+    ".flexroad:crs",
+    ".flexroad:reproject",
+    ".flexroad:height_unit",
+)
+"""Fields of an asset that make a layer, without its extents."""
+
+
 def entries(data: bytes) -> Iterator[Item]:
     """Yield the fields of each item that make a tile; reading whole items is many times slower.
 
@@ -44,9 +54,7 @@ def entries(data: bytes) -> Iterator[Item]:
     paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
     columns = dict.fromkeys(".".join(path[:3] if path[0] == "assets" else path[:1]) for path in paths)
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
-    plain += [
-        name for name in columns if name.endswith((".flexroad:files", ".flexroad:values", ".flexroad:crs"))
-    ]
+    plain += [name for name in columns if name.startswith("assets.") and name.endswith(FIELDS)]
     # Reader threads may still be alive when a short process ends, and would abort it.
     rows = _values(file.read(plain, use_threads=False))
     extents = [name for name in columns if name.endswith(".flexroad:extents")]

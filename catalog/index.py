@@ -253,6 +253,8 @@ def _asset(layer: Layer, root: str) -> Item:
         "flexroad:crs": layer.crs,
         # One flat list, because nested lists take twice as long to read.
         "flexroad:extents": [edge for extent in layer.extents for edge in extent] or None,
+        "flexroad:reproject": layer.reproject,
+        "flexroad:height_unit": layer.height_unit,
     }
 
 
@@ -291,7 +293,8 @@ def _to_parquet(items: list[Item]) -> bytes:
 
 def _full_item() -> Item:
     """Return an item with all layers and fields."""
-    layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832", ((0.0, 0.0, 1.0, 1.0),)) for name in LAYERS)
+    extents = ((0.0, 0.0, 1.0, 1.0),)
+    layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832", extents, True, "foot") for name in LAYERS)
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
     whole["properties"] |= {"proj:wkt2": "", "flexroad:fault": ""}

@@ -45,6 +45,11 @@ class Layer:
     extents: tuple[Bounds, ...] = ()
     """West, south, east and north of each file (m, in the tile's CRS), in the order of ``files``; empty where
     they are unknown (published datasets, older catalogs): each file may then lie anywhere."""
+    reproject: bool = False
+    """Whether rasters in another CRS than the tile's are warped when they are read, or are an error."""
+    height_unit: str | None = None
+    """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare none; None: metres or, of a
+    file that is reprojected, the unit of its eastings."""
 
     def __post_init__(self) -> None:
         if self.extents and len(self.extents) != len(self.files):

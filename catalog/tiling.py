@@ -5,9 +5,10 @@ The files of a survey rarely match the tiles, so each tile lists every file with
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import compress
 from pathlib import Path
@@ -18,14 +19,40 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.cover import MIN_COVER, height_share
-from flexroad.catalog.crs import bounds_in, same, short
+from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, same, scales, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
 from flexroad.catalog.text import count
-from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
+from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
+CELLS = (1.0, 2.0, 2.5, 5.0)
+"""Sizes of the cells of tiles whose DSM is reprojected (m), and these times powers of ten."""
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """How files in other CRSs and units are used."""
+
+    reproject: bool = False
+    """Warp files in another CRS when they are read; else tiles on them fail."""
+    to_crs: str | None = None
+    """CRS of the tiles; None: that of most DSM files, which must be in metres."""
+    height_unit: str | None = None
+    """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare none."""
+
+    def __post_init__(self) -> None:
+        if self.to_crs and not self.reproject:
+            raise CatalogError(f"--to-crs {self.to_crs} needs --reproject")
+        if self.to_crs and not (is_projected(self.to_crs) and plan_unit(self.to_crs)[1] == 1):
+            raise CatalogError(
+                f"--to-crs {self.to_crs} is in {plan_unit(self.to_crs)[0]}; "
+                "give a projected CRS in metres, such as EPSG:25832"
+            )
+
+
+NO_CONVERSION = Conversion()
 
 
 @dataclass(frozen=True)
@@ -65,6 +92,7 @@ def cut(
     crs: str | None = None,
     min_cover: float = MIN_COVER,
     dataset: str = "",
+    conversion: Conversion = NO_CONVERSION,
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
 
@@ -88,6 +116,8 @@ def cut(
         `load.min_valid` would fail on them. 0 keeps all that files touch, and reads no heights.
     dataset : str
         Name of the data in reports.
+    conversion : Conversion
+        Whether and where to files in other CRSs are reprojected.
 
     Raises
     ------
@@ -96,21 +126,31 @@ def cut(
     """
     dsm = layer_files["dsm"]
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]
-    require_metric(next(file for file in dsm if file.crs == grid_crs))
+    if conversion.to_crs:
+        grid_crs = in_plan(conversion.to_crs)
+    else:
+        require_metric(next(file for file in dsm if file.crs == grid_crs), "--reproject")
     placed = {name: _place(layer_files[name], grid_crs) for name in LAYERS if name in layer_files}
-    notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs)]
+    notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs, conversion)]
 
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
-    grids, left_out = _covered(root, grids, _near(grids, placed["dsm"]), min_cover)
+    grids, left_out = _covered(root, grids, _near(grids, placed["dsm"]), min_cover, conversion.reproject)
+    if not any(file.crs == grid_crs for file in dsm):
+        notes.append(f"the tiles have cells of {next(iter(grids.values())).cell:g} m")
     near = {name: _near(grids, files) for name, files in placed.items()}
     # Of the whole layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
+    others = {name: any(not same(p.file.crs, grid_crs) for p in files) for name, files in placed.items()}
     values = dict.fromkeys(MASKS, road_values)
     tiles = []
     for tile_id, grid in grids.items():
         layers, nearby = by_cover(
             [
-                _layer(name, by_tile[tile_id].files, values.get(name, ()), bare[name])
+                _converted(
+                    _layer(name, by_tile[tile_id].files, values.get(name, ()), bare[name]),
+                    conversion,
+                    others[name],
+                )
                 for name, by_tile in near.items()
                 if by_tile[tile_id].files
             ],
@@ -135,18 +175,37 @@ def _place(files: Sequence[RasterFile], crs: str) -> list[_PlacedFile]:
     return placed
 
 
-def _other_crs(layer: str, files: Sequence[_PlacedFile], crs: str) -> list[str]:
-    """Return a note if files are in another CRS: only the tiles they overlap will fail."""
+def _other_crs(layer: str, files: Sequence[_PlacedFile], crs: str, conversion: Conversion) -> Iterator[str]:
+    """Yield notes on files in another CRS: they are reprojected, or the tiles that they overlap will fail."""
     others = [placed.file for placed in files if not same(placed.file.crs, crs)]
     if not others:
-        return []
+        return
     names = some([file.name for file in others])
-    return [f"{layer} is in {short(others[0].crs)}, not {short(crs)}, in {names}: tiles there will fail"]
+    differs = f"{layer} is in {short(others[0].crs)}, not {short(crs)}, in {names}"
+    if not conversion.reproject:
+        yield f"{differs}: tiles there will fail; --reproject warps such files when they are read"
+        return
+    how = "to the nearest cell" if layer in MASKS else "bilinearly"
+    yield f"{differs}: reprojected when it is read, {how}"
+    unknown = [file for file in others if not file.height_unit and plan_unit(file.crs)[1] != 1]
+    feet = [file for file in unknown if is_projected(file.crs)]
+    if layer in HEIGHTS and feet and not conversion.height_unit:
+        yield (
+            f"{layer}: heights of {some([file.name for file in feet])} are assumed to be in "
+            f"{plan_unit(feet[0].crs)[0]}, like x and y; if not, use --height-unit metre"
+        )
+
+
+def _converted(layer: Layer, conversion: Conversion, has_others: bool) -> Layer:
+    """Return the layer with what `load` needs for files in another CRS, or of an undeclared unit."""
+    unit = conversion.height_unit if layer.name in HEIGHTS else None
+    return replace(layer, reproject=conversion.reproject and has_others, height_unit=unit)
 
 
 def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]:
     """Return the grids of the tiles that the DSM files touch, by id, with the most frequent cell size."""
-    cell = Counter(p.file.cell for p in dsm if p.file.crs == crs).most_common(1)[0][0]
+    cells = Counter(p.file.cell for p in dsm if p.file.crs == crs)
+    cell = cells.most_common(1)[0][0] if cells else _cell_m(dsm[0], crs)
     grids: dict[str, Grid] = {}
     for file, bounds in dsm:
         if file.crs == crs and file.cell == cell:
@@ -155,6 +214,21 @@ def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]
             extent = Grid.covering(crs, bounds, cell)
         grids.update(extent.tiles(size_m))
     return dict(sorted(grids.items()))
+
+
+def _cell_m(placed: _PlacedFile, crs: str) -> float:
+    """Return the cell of tiles whose DSM is reprojected (m).
+
+    That of the file if it is in metres and has nearly this size on the ground, else the nearest of `CELLS`.
+    """
+    file, (west, south, east, north) = placed
+    across, along = scales(crs, file.crs, (west + east) / 2, (south + north) / 2)
+    true_m = file.cell / max(across, along)
+    is_metric = is_projected(file.crs) and plan_unit(file.crs)[1] == 1
+    if is_metric and math.isclose(true_m, file.cell, rel_tol=0.01):
+        return file.cell
+    power = 10.0 ** math.floor(math.log10(true_m))
+    return min((size * power for size in (*CELLS, 10.0)), key=lambda size: abs(math.log(size / true_m)))
 
 
 def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, _NearFiles]:
@@ -180,12 +254,12 @@ def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, 
 
 
 def _covered(
-    root: Path, grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float
+    root: Path, grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float, reproject: bool
 ) -> tuple[dict[str, Grid], list[str]]:
     """Return the tiles of which the DSM covers at least ``min_cover``, and notes on the others."""
     kept, thin, risky = dict[str, Grid](), list[str](), list[str]()
     for tile_id, grid in grids.items():
-        cover = _cover(root, grid, near[tile_id], min_cover)
+        cover = _cover(root, grid, near[tile_id], min_cover, reproject)
         if cover >= max(min_cover, 1e-9):
             kept[tile_id] = grid
             risky += [tile_id] if min_cover and cover < MIN_COVER else []
@@ -204,13 +278,15 @@ def _covered(
     return kept, [note] * bool(thin) + [below] * bool(risky)
 
 
-def _cover(root: Path, grid: Grid, near: _NearFiles, min_cover: float) -> float:
+def _cover(root: Path, grid: Grid, near: _NearFiles, min_cover: float, reproject: bool) -> float:
     """Return the share of a tile that the DSM covers: by heights, or by the extents of the files."""
     by_extents = _area(near.shared) / (grid.width * grid.cell) ** 2
-    if not min_cover or by_extents < min_cover or any(not same(file.crs, grid.crs) for file in near.in_core):
+    others = [file for file in near.in_core if not same(file.crs, grid.crs)]
+    if not min_cover or by_extents < min_cover or (others and not reproject):
         return by_extents
     # What a VRT names was checked when the files were found.
-    by_heights = height_share(grid, [root / file.name for file in near.in_core])
+    bare = next((file.crs for file in near.in_core if not file.has_crs), None)
+    by_heights = height_share(grid, [root / file.name for file in near.in_core], crs=bare)
     return by_extents if by_heights is None else by_heights
 
 

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER
-from flexroad.catalog.crs import Unit, height_unit
-from flexroad.catalog.storage.paths import stat
+from flexroad.catalog.crs import Unit, height_unit, is_projected, plan_unit
+from flexroad.catalog.storage.paths import Location, stat
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
@@ -46,7 +46,7 @@ METRE: Unit = ("metre", 1.0)
 UNITS = {
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
-    **dict.fromkeys(("us-ft", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
+    **dict.fromkeys(("us-ft", "us-foot", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
 }
 """Size (m) of the units of height that bands declare; names in lower case."""
@@ -89,7 +89,8 @@ def load(tile: Tile, options: Options) -> TileData:
     """Read a tile's DSM, DTM, masks and reference onto its lattice, grown by the halo.
 
     Cells that coincide are copied; others are resampled (heights bilinearly, classes to the nearest),
-    with a note. Where files overlap, the first one with a value is used.
+    with a note. Files in another CRS are warped if the layer says so (`Layer.reproject`). Where files
+    overlap, the first one with a value is used, those in the tile's CRS before others.
 
     Raises
     ------
@@ -186,7 +187,7 @@ def _source(tile: Tile, name: str) -> Source | None:
     needed = (layer.reaching(tile.grid.bounds) or layer).files
     paths = zip(layer.files, tile.paths(layer), strict=True)
     files = tuple(path for file, path in paths if file in needed or stat(path))
-    return Source(name, files, layer.crs, allowed=tile.allowed)
+    return Source(name, files, layer.crs, allowed=tile.allowed, reproject=layer.reproject)
 
 
 def _optional(source: Source | None) -> Source | None:
@@ -210,42 +211,39 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
     """
     from rasterio.enums import Resampling
 
-    from flexroad.tasks.io.raster import OtherCrs, Unreadable, misalignment, read_window, resample_to
+    from flexroad.tasks.io.raster import Unreadable, joined, resample_to
 
     values = np.full(grid.shape, np.nan)
     reached = np.zeros(grid.shape, bool)
+    warped: list[RasterWindow] = []
     broken: list[Unreadable] = []
     heights = layer.name in HEIGHTS
     resampling = Resampling.bilinear if heights else Resampling.nearest
-    together = Resampling.average if heights else Resampling.mode
     patches: list[RasterWindow] = []
     absurd_cells = 0
     for name, path in zip(layer.files, tile.paths(layer), strict=True):
         try:
-            title = f"{layer.name} {name}"
-            patch = read_window(path, title, grid, core, layer.crs, together, tile.allowed, heights)
+            patch = _window(tile, layer, name, path, grid, core, around)
         except Unreadable as error:
             broken.append(error)
             continue
-        except OtherCrs as error:
-            if not around:
-                raise TaskError(str(error), error.file) from error
-            continue
         if patch is None:
             continue
-        reached |= _reached(patch, grid)
+        reached |= patch.lattice.reached(grid)
         if heights:
-            patch, absurd = _metres(patch)
+            patch, absurd = _metres(_with_unit(patch, layer))
             absurd_cells += absurd
         patches.append(patch)
+        if patch.lattice.crs:
+            warped.append(patch)
+            continue
         np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
         if not np.isnan(values).any():
             break
-    notes = [
-        f"{layer.name} resampled: {reason}"
-        for reason in dict.fromkeys(misalignment(p.file_lattice, grid) for p in patches)
-        if reason
-    ]
+    # After the files in the tile's CRS, which lose nothing.
+    for patch in joined(warped):
+        np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
+    notes = _notes(layer, patches, grid)
     notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
     if absurd_cells:
         notes.append(absurd_note(layer.name, absurd_cells))
@@ -266,13 +264,49 @@ def _check_read(tile: Tile, layer: Layer, mosaic: _Mosaic, core: tuple[slice, sl
         )
 
 
-def _reached(patch: RasterWindow, grid: Grid) -> Bools:
-    """Return the cells of the grid whose centres lie within the patch's bounds, ``(H, W)``."""
-    west, south, east, north = patch.lattice.bounds
-    inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
-        (west < grid.eastings) & (grid.eastings < east)
-    )
-    return inside
+def _window(
+    tile: Tile, layer: Layer, name: str, path: Location, grid: Grid, core: Grid, around: bool
+) -> RasterWindow | None:
+    """Return the part of a file that covers a grid, None if there is none; see `_mosaic`."""
+    from rasterio.enums import Resampling
+
+    from flexroad.tasks.io.raster import OtherCrs, read_window
+
+    heights = layer.name in HEIGHTS
+    together = Resampling.average if heights else Resampling.mode
+    title = f"{layer.name} {name}"
+    try:
+        return read_window(
+            path, title, grid, core, layer.crs, together, tile.allowed, heights, layer.reproject
+        )
+    except OtherCrs as error:
+        if around:
+            return None
+        raise TaskError(str(error), error.file) from error
+
+
+def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[str]:
+    """Return notes on patches that were resampled or reprojected, and on units that were assumed."""
+    from flexroad.tasks.io.raster import misalignment
+
+    notes = []
+    for patch in patches:
+        if reason := misalignment(patch.file_lattice, grid):
+            how = "reprojected" if patch.lattice.crs else "resampled"
+            notes.append(f"{layer.name} {how}: {reason}")
+        if patch.unit_assumed:
+            notes.append(f"{layer.name}: heights taken to be in {patch.unit}, as the file declares no unit")
+    return list(dict.fromkeys(notes))
+
+
+def _with_unit(patch: RasterWindow, layer: Layer) -> RasterWindow:
+    """Return a patch of heights with the unit that the catalog or the CRS gives if none is declared."""
+    if patch.unit or patch.crs is None or height_unit(patch.crs):
+        return patch
+    unit, metres = plan_unit(patch.crs)
+    implied = unit if patch.lattice.crs and is_projected(patch.crs) and metres != 1 else ""
+    unit = layer.height_unit or implied
+    return replace(patch, unit=unit, unit_assumed=bool(unit))
 
 
 def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
@@ -308,16 +342,26 @@ def _unit(patch: RasterWindow) -> Unit:
 
 
 def _check_units(patches: Sequence[RasterWindow]) -> None:
-    """Raise an error if layers differ in their unit of height: probably a missing tag, not a mixed survey."""
+    """Raise an error if layers differ in their unit of height: probably a missing tag, not a mixed survey.
+
+    Files in different CRSs may differ if both declare their unit.
+    """
     first = patches[0]
     for patch in patches[1:]:
         (a, a_metres), (b, b_metres) = _unit(first), _unit(patch)
+        if (first.lattice.crs or patch.lattice.crs) and _declares_unit(first) and _declares_unit(patch):
+            continue
         if not math.isclose(a_metres, b_metres, rel_tol=1e-4):
             raise TaskError(
                 f"{first.name} has heights in {a}, {patch.name} in {b}; "
                 "convert one, or correct its unit with gdal_edit.py -units",
                 patch.file,
             )
+
+
+def _declares_unit(patch: RasterWindow) -> bool:
+    declared = patch.unit and not patch.unit_assumed
+    return bool(declared or (patch.crs and height_unit(patch.crs)))
 
 
 def _check_valid(mosaic: _Mosaic, core: tuple[slice, slice], min_valid: float) -> None:

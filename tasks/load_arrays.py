@@ -11,7 +11,8 @@ from rasterio.enums import Resampling
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.raster import RasterGrid, RasterWindow, misalignment, resample_to
+from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
+from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.load import UNITS, Options, absurd_note, remove_absurd
 from flexroad.tasks.types import Floats, TileData
 

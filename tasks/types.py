@@ -30,6 +30,8 @@ class Source:
     """Whether rasters that are missing or broken are left out, as around a border, and not an error."""
     allowed: AllowedFolders | None = None
     """Where the files that a VRT names may lie; None: anywhere on disk."""
+    reproject: bool = False
+    """Whether rasters in another CRS than the tile's are warped; else they are an error."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from pathlib import Path
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from flexroad.catalog.crs import bounds_in, in_plan, plan_unit, short, utm_of
+from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
@@ -54,6 +54,8 @@ class RasterFile:
     taken: datetime | None
     """Date in the file's tags, with a time zone, or None."""
     modified: datetime
+    height_unit: str | None = None
+    """Unit of heights that the band or the CRS declares, or None."""
 
 
 @contextmanager
@@ -198,6 +200,7 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
             fault = georeference_fault(src) or (heights_fault(src) if heights else None)
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
+            unit = src.units[0] or (height_unit(wkt) or ("",))[0] if wkt else src.units[0]
     except Refused as error:
         raise _Skip(f"it {error}") from error
     except ERRORS as error:
@@ -223,6 +226,7 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
         height=height,
         taken=_taken(tags),
         modified=datetime.fromtimestamp(path.stat().st_mtime, UTC),
+        height_unit=unit or None,
     )
 
 
@@ -242,8 +246,14 @@ def zoned(date: datetime) -> datetime:
     return date if date.tzinfo else date.replace(tzinfo=UTC)
 
 
-def require_metric(file: RasterFile) -> None:
+def require_metric(file: RasterFile, option: str = "") -> None:
     """Check that a file's horizontal CRS is in metres.
+
+    Parameters
+    ----------
+    file : RasterFile
+    option : str
+        Option of the command that reprojects files, for the message; empty if it has none.
 
     Raises
     ------
@@ -255,7 +265,8 @@ def require_metric(file: RasterFile) -> None:
         return
     units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
     zone = utm_of(bounds_in("EPSG:4326", file.crs, file.bounds))
+    instead = f", or use {option} --to-crs {zone}" if option else ""
     raise CatalogError(
         f"{file.name} is in {short(file.crs)}, whose unit is {units}; "
-        f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}"
+        f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}{instead}"
     )

@@ -22,7 +22,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import Tile
-from flexroad.catalog.tiling import TilingResult, cut
+from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
 CRS = "EPSG:25832"
 """CRS of all downloads; XYZ files do not declare it."""
@@ -71,6 +71,7 @@ def index(
     derived: Path | None = None,
     roads: str | None = None,
     allow: Sequence[str] = (),
+    reproject: bool = False,
 ) -> TilingResult:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one is used.
 
@@ -95,6 +96,8 @@ def index(
         Vector files of roads: a file, or a glob pattern relative to ``root``.
     allow : sequence of str
         Folders besides ``root`` that the files named by a VRT of the mask may lie below.
+    reproject : bool
+        Warp a mask in another CRS when it is read.
 
     Raises
     ------
@@ -131,6 +134,7 @@ def index(
         crs=CRS,
         min_cover=min_cover,
         dataset=DATASET,
+        conversion=Conversion(reproject),
     )
     vectors = find(root, roads, CRS) if roads is not None else []
     return replace(

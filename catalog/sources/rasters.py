@@ -12,7 +12,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import LAYERS
-from flexroad.catalog.tiling import TilingResult, cut
+from flexroad.catalog.tiling import NO_CONVERSION, Conversion, TilingResult, cut
 
 
 def index(
@@ -25,6 +25,7 @@ def index(
     crs: str | None = None,
     min_cover: float = MIN_COVER,
     allow: Sequence[str] = (),
+    conversion: Conversion = NO_CONVERSION,
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
 
@@ -48,6 +49,8 @@ def index(
         Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
     allow : sequence of str
         Folders besides ``root`` that the files named by a VRT may lie below.
+    conversion : Conversion
+        Whether and where to files in other CRSs are reprojected.
 
     Raises
     ------
@@ -71,6 +74,7 @@ def index(
         date=date,
         crs=crs,
         min_cover=min_cover,
+        conversion=conversion,
     )
     roads = find(root, patterns["roads"], crs) if "roads" in patterns else []
     return replace(indexed, tiles=with_roads(indexed.tiles, roads, crs), notes=(*notes, *indexed.notes))

@@ -43,6 +43,14 @@ RoadValue = Annotated[
 ]
 Roads = Annotated[str | None, _files("Vector files of roads: a file, or a pattern relative to ROOT.")]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
+Reproject = Annotated[
+    bool,
+    typer.Option(
+        "--reproject",
+        help="Warp rasters in another CRS or in feet when they are read.",
+        rich_help_panel=options.INPUTS,
+    ),
+]
 Date = Annotated[
     datetime | None,
     typer.Option(
@@ -80,6 +88,22 @@ def catalog_rasters(
     reference: Annotated[str | None, _files("Reference heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, _files("Reference road mask, for the evaluation.")] = None,
     crs: Crs = None,
+    reproject: Reproject = False,
+    to_crs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CRS",
+            help="CRS of the tiles, with --reproject; default: the DSM's.",
+            rich_help_panel=options.TILES,
+        ),
+    ] = None,
+    height_unit: Annotated[
+        Literal["metre", "foot", "us-foot"] | None,
+        typer.Option(
+            help="Unit of heights if a file has none; default: metre, or that of the plan.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
     date: Date = None,
     allow: options.Allow = None,
     tile_size: TileSize = 250,
@@ -87,6 +111,7 @@ def catalog_rasters(
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
     from flexroad.catalog.sources import rasters
+    from flexroad.catalog.tiling import Conversion
 
     patterns = {
         "dsm": dsm,
@@ -106,6 +131,7 @@ def catalog_rasters(
         crs=crs,
         min_cover=min_cover,
         allow=allow or (),
+        conversion=Conversion(reproject, to_crs, height_unit),
     )
     _write_catalog(result, output)
 
@@ -124,6 +150,7 @@ def catalog_nrw(
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
     allow: options.Allow = None,
+    reproject: Reproject = False,
 ) -> None:
     """Cut downloads of Geobasis NRW into tiles.
 
@@ -141,6 +168,7 @@ def catalog_nrw(
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
         allow=allow or (),
+        reproject=reproject,
     )
     _write_catalog(result, output)
 

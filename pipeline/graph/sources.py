@@ -22,7 +22,7 @@ Recorded = Sequence[Any]
 File = list[Any]
 """Name, size and version of a file, or name and checksum; None if it does not exist."""
 Entry = list[Any]
-"""Name of a layer, its files (`File`), values and CRS."""
+"""Name of a layer, its files (`File`), values, CRS and, if it has one, its conversion."""
 
 to_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 
@@ -86,7 +86,9 @@ class SourceFiles:
 
 
 def _entry(layer: Layer, files: list[File]) -> Entry:
-    return [layer.name, files, list(layer.values), layer.crs]
+    # Only where they are set, so that older fingerprints stay valid.
+    how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject or layer.height_unit else []
+    return [layer.name, files, list(layer.values), layer.crs, *how]
 
 
 def _checksum(path: Location, file: FileStat | None) -> str | None:

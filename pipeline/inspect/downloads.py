@@ -141,7 +141,9 @@ def _raster(path: Path, folder: Path) -> Download:
     if crs is None:
         question = question or NO_CRS
     elif plan_unit(crs)[1] != 1.0:
-        question = question or f"its CRS is in {plan_unit(crs)[0]}: reproject it with gdalwarp -t_srs"
+        question = (
+            question or f"its CRS is in {plan_unit(crs)[0]}: use --reproject --to-crs with one in metres"
+        )
     return Download(path, kind, about, short(crs) if crs else None, question)
 
 

@@ -101,7 +101,7 @@ def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[
 def _other_crs(tile: Tile, known: dict[Location, str | None]) -> str:
     """Return why a tile would fail if a raster on it is in another CRS; ``known`` has those read before."""
     for layer, paths in _on_tile(tile, READS):
-        for path in paths:
+        for path in () if layer.reproject else paths:
             if path not in known:
                 known[path] = _crs(path, tile.allowed)
             crs = known[path] or layer.crs
@@ -121,8 +121,8 @@ def _crs(path: Location, allowed: AllowedFolders | None) -> str | None:
 
 def _few_heights(tile: Tile, min_valid: float) -> str:
     """Return why a tile would fail if its DSM covers too little of it."""
-    paths = [path for _, paths in _on_tile(tile, ("dsm",)) for path in paths]
-    share = height_share(tile.grid, paths, tile.allowed) if paths else None
+    dsm = next(_on_tile(tile, ("dsm",)), None)
+    share = height_share(tile.grid, dsm[1], tile.allowed, dsm[0].crs) if dsm else None
     if share is None or share >= max(min_valid, 1e-9):
         return ""
     return f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"

@@ -19,7 +19,8 @@ from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import LayerMissing, TaskError
-from flexroad.tasks.io.raster import RasterGrid, Unreadable, opened, place
+from flexroad.tasks.io.raster import Unreadable, opened, place
+from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}
@@ -68,7 +69,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
                 continue
             piece, lattice = part
             photo, gsd_m = _under(photo, piece), piece.grid.cell
-            reached = reached | _reached(lattice, piece.grid)
+            reached = reached | lattice.reached(piece.grid)
             if photo.known.all():
                 break
     # A tile also lists files around it: a broken file fails only the tiles that need it.
@@ -93,31 +94,29 @@ def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
     return replace(first, colour=colour, known=first.known | second.known)
 
 
-def _reached(lattice: RasterGrid, grid: Grid) -> Bools:
-    """Return the cells whose centres lie within the file's bounds, ``(H, W)``."""
-    west, south, east, north = lattice.bounds
-    inside: Bools = ((south < grid.northings) & (grid.northings < north))[:, None] & (
-        (west < grid.eastings) & (grid.eastings < east)
-    )
-    return inside
-
-
 def _read(
     path: Location, source: Source, grid: Grid, gsd_m: float | None
 ) -> tuple[Orthophoto, RasterGrid] | None:
     """Return a file's pixels over the grid, and the file's lattice; None if it does not overlap the grid."""
     name = f"{source.name} {path.name}"
     with opened(path, name, source.allowed) as src:
-        lattice = place(src, path, name, grid, grid, source.crs)
+        lattice = place(src, path, name, grid, grid, source.crs, source.reproject)
         if lattice is None or lattice.window_for(grid) is None:
             return None
         depth = _depth(src, path, name)
-        pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or lattice.dx)
+        pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or _gsd_m(lattice, grid))
         colour, known = _warped(src, lattice, pixels)
     if src.count < 3:
         colour = np.repeat(colour, 3, axis=0)
     scaled = np.rint(colour * (255 / (2**depth - 1)))
     return Orthophoto(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
+
+
+def _gsd_m(lattice: RasterGrid, grid: Grid) -> float:
+    """Return the width of a file's pixel on a grid (m), to the millimetre if it is reprojected."""
+    if not lattice.crs:
+        return lattice.dx
+    return max(0.001, round(lattice.dx * grid.cell / lattice.cell_of(grid)[0], 3))
 
 
 def _depth(src: Any, path: Location, name: str) -> int:
@@ -137,13 +136,14 @@ def _depth(src: Any, path: Location, name: str) -> int:
 
 def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.float32], Bools]:
     """Return the file's colours on the pixels, ``(1 or 3, h, w)``, not scaled, and which pixels are known."""
-    coarser = pixels.cell > max(lattice.dx, lattice.dy) * (1 + LATTICE_TOLERANCE)
+    cell_x, cell_y = lattice.cell_of(pixels)
+    coarser = min(cell_x / lattice.dx, cell_y / lattice.dy) > 1 + LATTICE_TOLERANCE
     bands = (1, 2, 3) if src.count >= 3 else (1,)
     has_alpha = ColorInterp.alpha in src.colorinterp
     with WarpedVRT(
         src,
-        # The file's CRS is the same one by another name: prevent a reprojection.
-        src_crs=pixels.crs,
+        # If the file's CRS is the same one by another name: prevent a reprojection.
+        src_crs=lattice.crs or pixels.crs,
         crs=pixels.crs,
         src_transform=_transform(lattice),
         transform=pixels.transform,
@@ -164,4 +164,4 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
 def _transform(lattice: RasterGrid) -> Affine:
     if lattice.northward:
         return Affine(lattice.dx, 0, lattice.west, 0, lattice.dy, lattice.bounds[1])
-    return Affine(lattice.dx, 0, lattice.west, 0, -lattice.dy, lattice.north)
+    return lattice.transform

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from affine import Affine
 from rasterio.enums import MaskFlags, Resampling
+from rasterio.io import MemoryFile
+from rasterio.vrt import WarpedVRT
 from rasterio.warp import reproject
 from rasterio.windows import Window
 
-from flexroad.catalog.crs import bounds_in, same, short
-from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.crs import bounds_in, in_plan, same, short
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
@@ -23,7 +24,12 @@ from flexroad.catalog.storage.paths import Location, is_remote, stat
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.types import Floats
+
+EXACT = 1e-9
+"""Largest error of transformed positions, in cells; GDAL interpolates them with 0.125 by default, and takes 0
+for no value."""
 
 
 class OtherCrs(TaskError):
@@ -32,90 +38,6 @@ class OtherCrs(TaskError):
 
 class Unreadable(TaskError):
     """A file that is missing or broken, so that its position is unknown."""
-
-
-@dataclass(frozen=True)
-class RasterGrid:
-    """The lattice of a file's cells; unlike in a `Grid`, cells need not be square (m)."""
-
-    west: float
-    north: float
-    dx: float
-    dy: float
-    width: int
-    height: int
-    northward: bool = False
-    """True if the file's rows run northward, as in XYZ files sorted by northing."""
-
-    @classmethod
-    def of(cls, transform: Affine, width: int, height: int) -> RasterGrid:
-        """Return the lattice of an unrotated file."""
-        north = max(transform.f, transform.f + height * transform.e)
-        dx, dy = abs(transform.a), abs(transform.e)
-        return cls(transform.c, north, dx, dy, width, height, northward=transform.e > 0)
-
-    @property
-    def bounds(self) -> Bounds:
-        """West, south, east and north of the outer edges."""
-        return self.west, self.north - self.height * self.dy, self.west + self.width * self.dx, self.north
-
-    def offset(self, grid: Grid) -> tuple[float, float]:
-        """Return the offset (m, east and north) of this lattice from the grid's, modulo its cell size."""
-        east = math.remainder(self.west - grid.west, self.dx)
-        north = math.remainder(self.north - grid.north, self.dy)
-        return east, north
-
-    def fits(self, grid: Grid) -> bool:
-        """Return whether cells coincide to within `LATTICE_TOLERANCE` over the whole grid."""
-        west, north, east, south = self._in_cells(grid)
-        off = max(abs(edge - round(edge)) for edge in (west, north, east, south))
-        same_count = (round(east) - round(west), round(south) - round(north)) == (grid.width, grid.height)
-        return off < LATTICE_TOLERANCE and same_count
-
-    def window_for(self, grid: Grid) -> tuple[slice, slice] | None:
-        """Return the (row, col) slices of this lattice under the grid, rows from the north, or None."""
-        west, north, east, south = self._in_cells(grid)
-        if self.fits(grid):
-            west, north, east, south = round(west), round(north), round(east), round(south)
-        else:
-            # The margin that interpolation at the grid's border cells needs.
-            pad_x, pad_y = 1 + grid.cell / self.dx, 1 + grid.cell / self.dy
-            west, east, north, south = west - pad_x, east + pad_x, north - pad_y, south + pad_y
-        rows = slice(max(0, math.floor(north)), min(self.height, math.ceil(south)))
-        cols = slice(max(0, math.floor(west)), min(self.width, math.ceil(east)))
-        return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
-
-    def step_for(self, grid: Grid) -> int:
-        """Return the number of cells along an axis to be read as one, so that 2 to 4 lie in a grid's cell."""
-        return max(1, math.floor(grid.cell / max(self.dx, self.dy) / 2 + 1e-9))
-
-    def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
-        """Return the slices grown to steps that are counted from the file's corner.
-
-        Cells are then read together in the same way in every window.
-        """
-        grown = (slice(part.start // step * step, -(-part.stop // step) * step) for part in (rows, cols))
-        tall, wide = grown
-        return slice(tall.start, min(tall.stop, self.height)), slice(wide.start, min(wide.stop, self.width))
-
-    def coarser(self, step: int) -> RasterGrid:
-        """Return the lattice of cells read together; a last step with fewer cells counts as a whole one."""
-        width, height = -(-self.width // step), -(-self.height // step)
-        return RasterGrid(self.west, self.north, self.dx * step, self.dy * step, width, height)
-
-    def cut(self, rows: slice, cols: slice) -> RasterGrid:
-        """Return the lattice of a part; rows from the north."""
-        west, north = self.west + cols.start * self.dx, self.north - rows.start * self.dy
-        return RasterGrid(west, north, self.dx, self.dy, cols.stop - cols.start, rows.stop - rows.start)
-
-    def _in_cells(self, grid: Grid) -> tuple[float, float, float, float]:
-        west, south, east, north = grid.bounds
-        return (
-            (west - self.west) / self.dx,
-            (self.north - north) / self.dy,
-            (east - self.west) / self.dx,
-            (self.north - south) / self.dy,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +51,13 @@ class RasterWindow:
     values: Floats
     """``(rows, cols)``, row 0 in the north; NaN where the file has nodata."""
     lattice: RasterGrid
+    """In the tile's CRS, or in that of the file (`RasterGrid.crs`)."""
     unit: str
-    """Unit of the values declared by the band, or empty."""
+    """Unit of the values declared by the band or, of heights, given by the caller; else empty."""
     crs: str | None
     """CRS of the file, else the one given by the caller."""
+    unit_assumed: bool = False
+    """Whether the file does not declare the unit."""
     step: int = 1
     """Number of cells of the file along an axis that were read as one."""
 
@@ -140,7 +65,7 @@ class RasterWindow:
     def file_lattice(self) -> RasterGrid:
         """The lattice of the file's own cells in the window."""
         grid, n = self.lattice, self.step
-        return RasterGrid(grid.west, grid.north, grid.dx / n, grid.dy / n, grid.width * n, grid.height * n)
+        return replace(grid, dx=grid.dx / n, dy=grid.dy / n, width=grid.width * n, height=grid.height * n)
 
 
 def read_window(
@@ -152,6 +77,7 @@ def read_window(
     resampling: Resampling = Resampling.average,
     allowed: AllowedFolders | None = None,
     heights: bool = False,
+    reproject: bool = False,
 ) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
 
@@ -176,6 +102,8 @@ def read_window(
         Where the files that a VRT names may lie; None: anywhere on disk.
     heights : bool
         Whether the file must have heights: one band of real numbers.
+    reproject : bool
+        Whether the file may be in another CRS than the grid; the window is then on its own lattice.
 
     Returns
     -------
@@ -193,7 +121,7 @@ def read_window(
         fault = heights_fault(src) if heights else None
         if fault:
             raise TaskError(f"{name} {fault}", str(path))
-        lattice = place(src, path, name, grid, core, crs)
+        lattice = place(src, path, name, grid, core, crs, reproject)
         slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:
             return None
@@ -201,7 +129,7 @@ def read_window(
         slices = lattice.whole_steps(step, *slices)
         values, unit = _values(src, lattice, step, slices, resampling), src.units[0] or ""
         crs = src.crs.to_wkt() if src.crs else crs
-    return RasterWindow(name, str(path), values, lattice.cut(*slices).coarser(step), unit, crs, step)
+    return RasterWindow(name, str(path), values, lattice.cut(*slices).coarser(step), unit, crs, step=step)
 
 
 @contextmanager
@@ -239,6 +167,8 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
     """
     values = np.full(grid.shape, np.nan)
     lattice = patch.lattice
+    if lattice.crs:
+        return _warped(patch, grid, resampling)
     if lattice.fits(grid):
         row = round((grid.north - lattice.north) / grid.cell)
         col = round((lattice.west - grid.west) / grid.cell)
@@ -247,7 +177,7 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
     reproject(
         patch.values,
         values,
-        src_transform=Affine(lattice.dx, 0, lattice.west, 0, -lattice.dy, lattice.north),
+        src_transform=lattice.transform,
         dst_transform=grid.transform,
         src_crs=grid.crs,
         dst_crs=grid.crs,
@@ -262,8 +192,77 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
     return values
 
 
+def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
+    """Return a patch in another CRS on the grid's cells, ``(H, W)``.
+
+    Every cell is transformed by itself (`EXACT`), so that overlapping windows have equal values.
+    """
+    lattice = patch.lattice
+    rows, cols = patch.values.shape
+    cell_x, cell_y = lattice.cell_of(grid)
+    place = {"crs": lattice.crs, "transform": lattice.transform, "width": cols, "height": rows}
+    with MemoryFile() as memory:
+        with memory.open(driver="GTiff", count=1, dtype="float64", nodata=np.nan, **place) as target:
+            target.write(patch.values, 1)
+        with (
+            memory.open() as source,
+            WarpedVRT(
+                source,
+                crs=grid.crs,
+                transform=grid.transform,
+                width=grid.width,
+                height=grid.height,
+                resampling=resampling,
+                nodata=np.nan,
+                tolerance=EXACT,
+                XSCALE=_scale(lattice.dx / cell_x),
+                YSCALE=_scale(lattice.dy / cell_y),
+            ) as warped,
+        ):
+            values: Floats = warped.read(1)
+    return values
+
+
+def _scale(ratio: float) -> float:
+    """Return the ratio of cells for GDAL, which averages below 0.95: only where two cells lie in one.
+
+    It is rounded, because it differs a little from window to window.
+    """
+    return 1.0 if ratio > 0.5 else round(ratio, 3)
+
+
+def joined(patches: Sequence[RasterWindow]) -> list[RasterWindow]:
+    """Return the windows with those of one lattice in another CRS joined, so that no seam is interpolated.
+
+    Where windows overlap, the first one with a value is used.
+    """
+    groups: list[list[RasterWindow]] = []
+    for patch in patches:
+        group = next((g for g in groups if g[0].lattice.continues(patch.lattice)), None)
+        if group is None:
+            groups.append([patch])
+        else:
+            group.append(patch)
+    return [_union(group) if len(group) > 1 else group[0] for group in groups]
+
+
+def _union(group: Sequence[RasterWindow]) -> RasterWindow:
+    lattice = group[0].lattice
+    cells = [patch.lattice.cells_in(lattice) for patch in group]
+    top, left = min(rows.start for rows, _ in cells), min(cols.start for _, cols in cells)
+    bottom, right = max(rows.stop for rows, _ in cells), max(cols.stop for _, cols in cells)
+    values = np.full((bottom - top, right - left), np.nan)
+    for patch, (rows, cols) in zip(group, cells, strict=True):
+        part = values[rows.start - top : rows.stop - top, cols.start - left : cols.stop - left]
+        np.copyto(part, patch.values, where=np.isnan(part))
+    whole = lattice.cut(slice(top, bottom), slice(left, right))
+    return replace(group[0], values=values, lattice=whole)
+
+
 def misalignment(lattice: RasterGrid, grid: Grid) -> str:
     """Return the reason why cells do not coincide, for a note; empty if they do."""
+    if lattice.crs:
+        return f"from {short(lattice.crs)} to {short(grid.crs)}"
     if lattice.fits(grid):
         return ""
     if not math.isclose(lattice.dx, grid.cell, rel_tol=1e-5) or not math.isclose(lattice.dy, lattice.dx):
@@ -275,7 +274,15 @@ def misalignment(lattice: RasterGrid, grid: Grid) -> str:
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
 
 
-def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str | None) -> RasterGrid | None:
+def place(
+    src: Any,
+    path: Location,
+    name: str,
+    grid: Grid,
+    core: Grid,
+    crs: str | None,
+    reproject: bool = False,
+) -> RasterGrid | None:
     """Return the lattice of a file, or None if it is in another CRS and outside the grid; see `read_window`.
 
     Raises
@@ -304,9 +311,11 @@ def place(src: Any, path: Location, name: str, grid: Grid, core: Grid, crs: str 
         return lattice
     if not _overlap(bounds_in(grid.crs, file_crs, lattice.bounds), grid.bounds):
         return None
+    if reproject:
+        return replace(lattice, crs=in_plan(file_crs))
     raise OtherCrs(
         f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
-        f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}",
+        f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}, or make the catalog with --reproject",
         str(path),
     )
 

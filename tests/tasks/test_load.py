@@ -347,7 +347,8 @@ def test_load_layer_in_other_crs_fails(tmp_path, dtm):
     write(tmp_path / "dtm.tif", relief(40, 40), east, north, crs="EPSG:25833")
     message, file = fails(tile(tmp_path))
     assert message == (
-        "dtm dtm.tif is in EPSG:25833, the tile in EPSG:25832; reproject it, e.g. gdalwarp -t_srs EPSG:25832"
+        "dtm dtm.tif is in EPSG:25833, the tile in EPSG:25832; reproject it, "
+        "e.g. gdalwarp -t_srs EPSG:25832, or make the catalog with --reproject"
     )
     assert file == str(tmp_path / "dtm.tif")
 

@@ -5,6 +5,7 @@ import shlex
 import numpy as np
 import pytest
 import yaml
+from rasterio.warp import transform
 from shapely import box
 
 from flexroad.pipeline.graph.layers import PRODUCTION
@@ -88,6 +89,33 @@ def test_catalog_of_files_outside_next_line_allows_them_for_all_commands(rasters
     training = ("train", rasters / "c.parquet", "--method", "pixels", "--labels", "mask", "-o", "model")
     assert "--allow" in flexroad(*training, *without).expected(2).err
     assert "--allow" not in flexroad(*training, *allow).err
+
+
+def test_catalog_of_feet_and_another_zone_runs_with_reproject(rasters, flexroad, tmp_path):
+    """A folder of one country: heights in feet of the survey, a mask in degrees, heights of ground in UTM."""
+    feet = np.full((100, 100), 300, np.float32)
+    write(rasters / "us" / "dsm.tif", feet, 985_000, 200_000, cell=3, crs="EPSG:2263", unit="foot_us")
+    west, north = transform("EPSG:2263", "EPSG:32618", [985_000], [200_000])
+    write(
+        rasters / "us" / "dtm.tif",
+        np.full((160, 160), 91.44, np.float32),
+        west[0] - 30,
+        north[0] + 30,
+        crs="EPSG:32618",
+        unit="m",
+    )
+    west, north = transform("EPSG:2263", "EPSG:4269", [985_000], [200_000])
+    road = (abs(np.arange(100) - 50) < 10).astype(np.uint8)[:, None].repeat(100, 1)
+    write(rasters / "us" / "mask.tif", road, west[0], north[0], cell=1e-5, crs="EPSG:4269")
+    command = ["catalog", "rasters", rasters / "us", "--dsm", "dsm.tif", "--dtm", "dtm.tif"]
+    command += ["--road-mask", "mask.tif", "--tile-size", 40, "-o", rasters / "us.json", "--reproject"]
+    assert "--reproject --to-crs EPSG:32618" in flexroad(*command).expected(2).err
+    said = flexroad(*command, "--to-crs", "EPSG:32118").expected(0)
+    assert "note: dsm is in EPSG:2263, not EPSG:32118" in said.err
+    arguments = shlex.split(said.out.splitlines()[-1].removeprefix("next: flexroad "))
+    flexroad("catalog", "check", rasters / "us.json").expected(0)
+    said = flexroad(*arguments, "--executor", "serial").expected(0)
+    assert " 0 failed" in said.out
 
 
 def test_catalog_without_roads_says_what_a_run_lacks(rasters, flexroad, tmp_path):

@@ -1,0 +1,144 @@
+"""The lattice of a raster file's cells, and the part of it that covers a grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from affine import Affine
+
+from flexroad.catalog.crs import bounds_in, scales, transformer
+from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.tasks.types import Bools
+
+
+@dataclass(frozen=True)
+class RasterGrid:
+    """The lattice of a file's cells; unlike in a `Grid`, cells need not be square (m, or units of `crs`)."""
+
+    west: float
+    north: float
+    dx: float
+    dy: float
+    width: int
+    height: int
+    northward: bool = False
+    """True if the file's rows run northward, as in XYZ files sorted by northing."""
+    crs: str = ""
+    """CRS of the coordinates if it is another one than that of the grids to read; else empty."""
+
+    @classmethod
+    def of(cls, transform: Affine, width: int, height: int, crs: str = "") -> RasterGrid:
+        """Return the lattice of an unrotated file."""
+        north = max(transform.f, transform.f + height * transform.e)
+        dx, dy = abs(transform.a), abs(transform.e)
+        return cls(transform.c, north, dx, dy, width, height, northward=transform.e > 0, crs=crs)
+
+    @property
+    def bounds(self) -> Bounds:
+        """West, south, east and north of the outer edges."""
+        return self.west, self.north - self.height * self.dy, self.west + self.width * self.dx, self.north
+
+    @property
+    def transform(self) -> Affine:
+        """Affine map from (col, row), rows from the north, to coordinates."""
+        return Affine(self.dx, 0, self.west, 0, -self.dy, self.north)
+
+    def offset(self, grid: Grid) -> tuple[float, float]:
+        """Return the offset (m, east and north) of this lattice from the grid's, modulo its cell size."""
+        east = math.remainder(self.west - grid.west, self.dx)
+        north = math.remainder(self.north - grid.north, self.dy)
+        return east, north
+
+    def fits(self, grid: Grid) -> bool:
+        """Return whether cells coincide to within `LATTICE_TOLERANCE` over the whole grid."""
+        if self.crs:
+            return False
+        west, north, east, south = self._in_cells(grid)
+        off = max(abs(edge - round(edge)) for edge in (west, north, east, south))
+        same_count = (round(east) - round(west), round(south) - round(north)) == (grid.width, grid.height)
+        return off < LATTICE_TOLERANCE and same_count
+
+    def window_for(self, grid: Grid) -> tuple[slice, slice] | None:
+        """Return the (row, col) slices of this lattice under the grid, rows from the north, or None."""
+        west, north, east, south = self._in_cells(grid)
+        cell_x, cell_y = self.cell_of(grid)
+        if self.fits(grid):
+            west, north, east, south = round(west), round(north), round(east), round(south)
+        else:
+            # The margin that interpolation at the grid's border cells needs.
+            pad_x, pad_y = 1 + cell_x / self.dx, 1 + cell_y / self.dy
+            west, east, north, south = west - pad_x, east + pad_x, north - pad_y, south + pad_y
+        rows = slice(max(0, math.floor(north)), min(self.height, math.ceil(south)))
+        cols = slice(max(0, math.floor(west)), min(self.width, math.ceil(east)))
+        return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
+
+    def step_for(self, grid: Grid) -> int:
+        """Return the number of cells along an axis to be read as one, so that 2 to 4 lie in a grid's cell."""
+        cell_x, cell_y = self.cell_of(grid)
+        return max(1, math.floor(min(cell_x / self.dx, cell_y / self.dy) / 2 + 1e-9))
+
+    def cell_of(self, grid: Grid) -> tuple[float, float]:
+        """Return the size of a grid's cell along the axes of this lattice, in its units."""
+        if not self.crs:
+            return grid.cell, grid.cell
+        west, south, east, north = grid.bounds
+        across, along = scales(grid.crs, self.crs, (west + east) / 2, (south + north) / 2)
+        return across * grid.cell, along * grid.cell
+
+    def reached(self, grid: Grid) -> Bools:
+        """Return the cells of a grid whose centres lie within the bounds, ``(H, W)``."""
+        west, south, east, north = self.bounds
+        x, y = np.meshgrid(grid.eastings, grid.northings)
+        if self.crs:
+            x, y = transformer(grid.crs, self.crs).transform(x, y)
+        inside: Bools = (south < y) & (y < north) & (west < x) & (x < east)
+        return inside
+
+    def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
+        """Return the slices grown to steps that are counted from the file's corner.
+
+        Cells are then read together in the same way in every window.
+        """
+        grown = (slice(part.start // step * step, -(-part.stop // step) * step) for part in (rows, cols))
+        tall, wide = grown
+        return slice(tall.start, min(tall.stop, self.height)), slice(wide.start, min(wide.stop, self.width))
+
+    def coarser(self, step: int) -> RasterGrid:
+        """Return the lattice of cells read together; a last step with fewer cells counts as a whole one."""
+        width, height = -(-self.width // step), -(-self.height // step)
+        return replace(
+            self, dx=self.dx * step, dy=self.dy * step, width=width, height=height, northward=False
+        )
+
+    def continues(self, other: RasterGrid) -> bool:
+        """Return whether two lattices in the same other CRS are parts of one lattice."""
+        if not self.crs or (self.crs, self.northward) != (other.crs, other.northward):
+            return False
+        if not (
+            math.isclose(self.dx, other.dx, rel_tol=1e-9) and math.isclose(self.dy, other.dy, rel_tol=1e-9)
+        ):
+            return False
+        col, row = (other.west - self.west) / self.dx, (self.north - other.north) / self.dy
+        return max(abs(col - round(col)), abs(row - round(row))) < LATTICE_TOLERANCE
+
+    def cells_in(self, other: RasterGrid) -> tuple[slice, slice]:
+        """Return the (row, col) slices of this lattice in another one that it continues; may be negative."""
+        col, row = round((self.west - other.west) / self.dx), round((other.north - self.north) / self.dy)
+        return slice(row, row + self.height), slice(col, col + self.width)
+
+    def cut(self, rows: slice, cols: slice) -> RasterGrid:
+        """Return the lattice of a part; rows from the north."""
+        west, north = self.west + cols.start * self.dx, self.north - rows.start * self.dy
+        width, height = cols.stop - cols.start, rows.stop - rows.start
+        return replace(self, west=west, north=north, width=width, height=height, northward=False)
+
+    def _in_cells(self, grid: Grid) -> tuple[float, float, float, float]:
+        west, south, east, north = bounds_in(self.crs, grid.crs, grid.bounds) if self.crs else grid.bounds
+        return (
+            (west - self.west) / self.dx,
+            (self.north - north) / self.dy,
+            (east - self.west) / self.dx,
+            (self.north - south) / self.dy,
+        )
