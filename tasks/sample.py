@@ -6,25 +6,37 @@ uniform: a regular grid of triangles (RGT); corners: the two triangles of a plan
 The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
 the tile has neither frame nor halo, else the core's bounds, so that neighbouring tiles meet. With a frame,
 the points on the border and their heights are those of the neighbours too: the meshes join without a gap.
+
+A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-import startinpy
 from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.meshing.lines import apart_from, divided, ends_at_border, points_and_segments
+from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
+from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
-from flexroad.tasks.spline.mesh_border import NUDGE, border_heights, border_points, joined, on_border
+from flexroad.tasks.spline.mesh_border import (
+    NUDGE,
+    SAME_M,
+    border_heights,
+    border_points,
+    joined,
+    on_border,
+)
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
 
-VERSION = 1
+VERSION = 2
 
 DECIMALS = 6
 """Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
@@ -89,13 +101,12 @@ def sample(
         west, south, east, north = (round(edge, DECIMALS) for edge in local)
         local = west, south, east, north
     if options.method == "dynamic":
-        points = _dynamic(surface, road, mask, local, options, frame)
-        faces = _delaunay(points)
-    else:
-        step = options.road_m if options.method == "uniform" else np.inf
-        points, faces = _regular(surface, origin, local, step, frame)
+        points, faces = _dynamic(surface, road, mask, local, options, frame)
+        return _mesh(points, faces, road, mask)
+    step = options.road_m if options.method == "uniform" else np.inf
+    points, faces = _regular(surface, origin, local, step, frame)
     inside = np.ones(len(faces), np.bool_)
-    if options.method != "corners":
+    if options.method == "uniform":
         x, y, _ = points[faces].mean(axis=1).T
         inside = ~road.outside[road.grid.cells(x + origin[0], y + origin[1])]
         if frame:
@@ -148,22 +159,62 @@ def _regular(
 
 def _dynamic(
     surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
-) -> Floats:
-    """Return road, terrain and border points without duplicates, by northing, then easting, ``(V, 3)``."""
-    parts = [
-        _lattice(surface, road, mask, local, options.road_m),
-        _lattice(surface, road, ~mask, local, options.terrain_m),
-    ]
+) -> tuple[Floats, Faces]:
+    """Return road, terrain and border points, by northing, then easting, and the faces within the survey."""
+    free = np.concatenate(
+        [
+            _lattice(surface, road, mask, local, options.road_m),
+            _lattice(surface, road, ~mask, local, options.terrain_m),
+        ]
+    )
+    limit = _limit(road, local, frame)
+    lines = [] if limit is None else [_divided(limit, road, mask, options)]
     if frame:
-        parts = [part[~on_border(part, local)] for part in parts]
-        parts.append(_shared_border(surface, road.core, local, options, frame))
+        free = free[~on_border(free, local)]
+        border = _shared_border(surface, road.core, local, options, frame)
     else:
-        parts.append(_border(surface, road.core.origin, local, options.terrain_m))
-    points = np.concatenate(parts)
-    points = points[np.lexsort((points[:, 0], points[:, 1]))]
+        border = _border(surface, road.core.origin, local, options, lines)
+    if limit is None:
+        points, _ = _without_duplicates(np.concatenate([free, border]))
+        return points, delaunay(points)
+    plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
+    z = surface.height(*(plan + road.core.origin).T)
+    free = free[limit.covers(free) & apart_from(free, lines, options.road_m / 2)]
+    every = np.concatenate([free, border, np.column_stack([plan, z])])
+    points, number = _without_duplicates(every)
+    faces = constrained(points, number[len(free) + len(border) + segments])
+    return points, faces[limit.covers(points[faces].mean(axis=1))]
+
+
+def _without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Return points by northing, then easting, each place once, and the new numbers of the given ones."""
+    order = np.lexsort((points[:, 0], points[:, 1]))
+    ordered = points[order]
     first = np.ones(len(points), bool)
-    first[1:] = (points[1:, :2] != points[:-1, :2]).any(axis=1)
-    return points[first]
+    first[1:] = (ordered[1:, :2] != ordered[:-1, :2]).any(axis=1)
+    number = np.empty(len(points), np.intp)
+    number[order] = np.cumsum(first) - 1
+    return ordered[first], number
+
+
+def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | None:
+    """Return the limit of the survey on the tile, None if the survey covers all of it."""
+    core = road.core
+    outside = road.outside[road.grid.window(core)]
+    if frame:
+        outside = frame.outside(outside)
+    if not outside.any():
+        return None
+    return survey_limit(outside, (core.west - core.origin[0], core.north - core.origin[1]), core.cell, local)
+
+
+def _divided(limit: SurveyLimit, road: RoadMask, mask: Bools, options: Options) -> NDArray[np.object_]:
+    """Return the limit of the survey with points as dense as those of the ground beside it."""
+
+    def on_road(places: Floats) -> Bools:
+        return np.asarray(mask[road.grid.cells(*(places + road.core.origin).T)])
+
+    return divided(limit.lines, options.road_m, options.terrain_m, on_road)
 
 
 def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step: float) -> Floats:
@@ -179,13 +230,21 @@ def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step
     return np.stack([x[j], y[i], z[i, j]], axis=1)
 
 
-def _border(surface: Surface, origin: tuple[float, float], local: Bounds, step: float) -> Floats:
-    """Return points along the four edges of the domain, corners included, ``(n, 3)``."""
+def _border(
+    surface: Surface, origin: tuple[float, float], local: Bounds, options: Options,
+    lines: Sequence[NDArray[np.object_]],
+) -> Floats:  # fmt: skip
+    """Return points along the four edges of the domain, with corners and ends of lines, ``(n, 3)``."""
     west, south, east, north = local
-    x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
+    x, y = (_axis(*ends, options.terrain_m, to_end=True) for ends in ((west, east), (south, north)))
     sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (south, north)]
     sides += [np.stack(np.broadcast_arrays(edge, y), axis=1) for edge in (west, east)]
     plan = np.concatenate(sides)
+    if lines:
+        ends = ends_at_border(lines, local)
+        corners = np.isin(plan[:, 0], [west, east]) & np.isin(plan[:, 1], [south, north])
+        away = np.linalg.norm(plan[:, None] - ends, axis=2).min(axis=1, initial=np.inf)
+        plan = np.concatenate([plan[corners | (away >= options.road_m / 4)], ends])
     z = surface.height(plan[:, 0] + origin[0], plan[:, 1] + origin[1])
     return np.column_stack([plan, z])
 
@@ -197,28 +256,9 @@ def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options
         [_axis(0.0, length, step, to_end=True) for length in lengths]
         for step in (options.road_m, options.terrain_m)
     )
-    plan = border_points(frame, local, core.cell, fine, coarse, raw=options.mask == "raw")
+    plan = border_points(frame, local, core.cell, fine, coarse, options.mask == "raw", options.road_m / 4)
     z = border_heights(surface, *(plan + core.origin).T)
     return np.column_stack([plan, z])
-
-
-def _delaunay(points: Floats) -> NDArray[np.int32]:
-    """Return the faces of the Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
-
-    Points of a lattice are cocircular; the order of insertion (corners of the bounding box, then by northing
-    and easting) makes the triangulation unique.
-    """
-    plan = points.copy()
-    plan[:, 2] = 0.0
-    triangulation = startinpy.DT()
-    triangulation.snap_tolerance = 10.0 ** -(DECIMALS + 3)
-    triangulation.insert(plan, insertionstrategy="BBox")
-    # Vertex 0 of startinpy is at infinity; the points follow in the order of insertion.
-    faces: NDArray[np.int32] = triangulation.triangles.astype(np.int32) - 1
-    # The object must be deleted in the thread that created it. A sampling profiler such as Dask's may keep
-    # this frame and its locals alive in another thread.
-    del triangulation
-    return faces
 
 
 def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools) -> Mesh:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 2
+VERSION = 3
 
 REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
@@ -103,13 +103,16 @@ def corner(data: TileData, clusters: RoadClusters, border: Border, options: Opti
     clusters : RoadClusters
         The filtered road there.
     """
+    from flexroad.tasks.roads.extent import beyond_extent
     from flexroad.tasks.spline.frame import Corner, rounded
 
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
     held = np.full((2 * j + p, 2 * k + p), np.nan)
     z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, _precise(options))
-    return Corner(rounded(z[j : j + p, k : k + p]))
+    row, col = border.cell
+    around = beyond_extent(data)[row - 1 : row + 1, col - 1 : col + 1]
+    return Corner(rounded(z[j : j + p, k : k + p]), around)
 
 
 def edge(
@@ -144,14 +147,16 @@ def edge(
         )[acting]
     )
     control = z[:, p:-p] if eastward else z[p:-p]
-    first, second = border.sides
-    outside = road.outside[first].ravel() | road.outside[second].ravel()
+    second = border.sides[1]
     order = slice(None) if eastward else slice(None, None, -1)
+    outside = np.stack([road.outside[side].ravel()[order] for side in border.sides])
+    first, last = (end.outside for end in ends)
+    outside[:, 0], outside[:, -1] = (first[:, 1], last[:, 0]) if eastward else (first[0], last[1])
     return Edge(
         control,
         road=road.mask[second].ravel()[order],
         kept=clusters.mask[second].ravel()[order],
-        inside=~outside[order],
+        outside=outside,
     )
 
 

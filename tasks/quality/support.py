@@ -54,6 +54,10 @@ def support(
 
 
 def of_faces(classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh) -> NDArray[np.uint8]:
-    """Return the `Support` of the core cell under the centroid of each face, ``(F,)``."""
+    """Return the `Support` of the core cell under the centroid of each face, ``(F,)``.
+
+    Faces at the limit of the survey are inferred where the cell lies beyond it.
+    """
     x, y = (mesh.vertices[:, axis][mesh.faces].mean(axis=1) + mesh.origin[axis] for axis in (0, 1))
-    return np.asarray(classes[road.core.cells(x, y)])
+    kinds = classes[road.core.cells(x, y)]
+    return np.where(kinds == Support.NONE, np.uint8(Support.INFERRED), kinds)

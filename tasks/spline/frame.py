@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.tasks.types import Bools, Floats
 
@@ -22,6 +23,8 @@ class Corner:
 
     control: Floats
     """Control heights, ``(q, p)``, m; row 0 in the south. NaN if there is no ground to fit."""
+    outside: Bools
+    """Whether the four cells around it lie beyond the survey, ``(2, 2)``; row 0 in the north."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +39,20 @@ class Edge:
     cells to the south or east of it."""
     kept: Bools
     """The same by the filtered mask."""
-    inside: Bools
-    """Whether the cells on both sides lie within the survey."""
+    outside: Bools
+    """Whether the cells along the edge lie beyond the survey, ``(2, cells)``: those in the north or west of
+    it, and those in the south or east. The cells at its ends are as its corners say, for both edges there."""
+
+    @property
+    def inside(self) -> Bools:
+        """Whether the cells on both sides lie within the survey."""
+        return np.asarray(~self.outside.any(axis=0))
+
+    @property
+    def limits(self) -> NDArray[np.intp]:
+        """Numbers of cells from the start of the edge at which the mesh of one of its tiles ends."""
+        changes = (self.outside[:, 1:] != self.outside[:, :-1]).any(axis=0)
+        return np.flatnonzero(changes) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +77,16 @@ class Frame:
         heights[:q, p:-p], heights[-q:, p:-p] = self.south.control, self.north.control
         heights[q:-q, :p], heights[q:-q, -p:] = self.west.control, self.east.control
         return heights
+
+    def outside(self, cells: Bools) -> Bools:
+        """Return the cells of the tile beyond the survey, ``(H, W)``; those along the edges are as these say.
+
+        A void can be closed in the ground around the tile, and open in that around an edge.
+        """
+        result = cells.copy()
+        result[0], result[-1] = self.north.outside[1], self.south.outside[0]
+        result[:, 0], result[:, -1] = self.west.outside[1, ::-1], self.east.outside[0, ::-1]
+        return result
 
 
 def rounded(heights: np.ndarray) -> Floats:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.borders import DECIMALS
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.spline.frame import Edge, Frame
 from flexroad.tasks.types import Bools, Floats, Surface
@@ -19,6 +20,8 @@ from flexroad.tasks.types import Bools, Floats, Surface
 GRAIN_M = 2.0**-12
 """Heights on the border are multiples of this (m): relative to a whole-metre datum they are exact in the
 float32 of GLB files."""
+SAME_M = 0.02
+"""Ends of lines within this distance of a vertex on the border end in it (m)."""
 NUDGE = 1e-6
 """Share of a cell, larger than the rounding error of its edge's coordinates."""
 
@@ -32,9 +35,17 @@ def border_heights(surface: Surface, easting: Floats, northing: Floats) -> Float
 
 
 def border_points(
-    frame: Frame, local: Bounds, cell: float, fine: Sequence[Floats], coarse: Sequence[Floats], raw: bool
+    frame: Frame,
+    local: Bounds,
+    cell: float,
+    fine: Sequence[Floats],
+    coarse: Sequence[Floats],
+    raw: bool,
+    apart_m: float,
 ) -> Floats:
     """Return the vertices on the border of a tile, ``(n, 2)``; corners are in it twice.
+
+    Among them are the places where the meshes of the tile or its neighbour end with the survey.
 
     Parameters
     ----------
@@ -49,6 +60,8 @@ def border_points(
         road and elsewhere. Both have the edge's two ends.
     raw : bool
         Whether the raw road mask counts, instead of the filtered one.
+    apart_m : float
+        Other vertices are left out within this distance of such a place (m).
     """
     sides = []
     for edge, axis, at in _edges(frame, local):
@@ -58,11 +71,21 @@ def border_points(
         on_road, elsewhere = (_at(road, (t[axis] + nudge) / cell) for t in (fine, coarse))
         chosen = [fine[axis][on_road], coarse[axis][~elsewhere]]
         start, stop = local[axis], local[axis + 2]
-        along = np.unique(np.concatenate([*chosen, coarse[axis][[0, -1]]]))
+        ends = coarse[axis][[0, -1]]
+        marks = np.round(edge.limits * cell, DECIMALS)
+        marks = marks[apart(marks, ends, SAME_M)]
+        regular = np.concatenate(chosen)
+        along = np.unique(np.concatenate([regular[apart(regular, marks, apart_m)], marks, ends]))
         along = np.where(along == coarse[axis][-1], stop, start + along)
         across = np.full_like(along, at)
         sides.append(np.stack([along, across] if axis == 0 else [across, along], axis=1))
     return np.concatenate(sides)
+
+
+def apart(positions: Floats, others: Floats, distance_m: float) -> Bools:
+    """Return which positions on a line, ``(n,)``, have a distance (m) from all others, ``(m,)``."""
+    away = np.abs(positions[:, None] - others).min(axis=1, initial=np.inf)
+    return np.asarray(away >= distance_m)
 
 
 def on_border(points: Floats, local: Bounds) -> Bools:

@@ -2,12 +2,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import scipy
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
 
@@ -215,18 +218,105 @@ def test_sample_faces_without_height_are_dropped(method):
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
 
 
-@pytest.mark.parametrize("method", ["dynamic", "uniform"])
-def test_sample_mesh_ends_with_survey(method):
+def test_uniform_mesh_ends_with_survey():
     core = ground(60, 60)
     outside = np.zeros(core.shape, bool)
     outside[:, :25] = True
-    whole = sampled(core, diagonal_street(core), Options(method=method))
-    mesh = sampled(core, diagonal_street(core), Options(method=method), outside=outside)
+    whole = sampled(core, diagonal_street(core), Options(method="uniform"))
+    mesh = sampled(core, diagonal_street(core), Options(method="uniform"), outside=outside)
     centroids = plan(mesh)[mesh.faces].mean(axis=1)
     assert not outside[core.cells(*centroids.T)].any()
     inside = ~outside[core.cells(*plan(whole)[whole.faces].mean(axis=1).T)]
     assert len(mesh.faces) == inside.sum() < len(whole.faces)
     np.testing.assert_array_equal(plan(mesh)[mesh.faces], plan(whole)[whole.faces[inside]])
+
+
+LIMITS = {
+    "straight": lambda x, y: x > 25,
+    "slanted": lambda x, y: y > 20 + 0.37 * x,
+    "shallow": lambda x, y: y > 31.2 + 0.03 * x,
+    "curved": lambda x, y: np.hypot(x - 20, y - 30) < 60,
+    "bay": lambda x, y: np.hypot(x - 90, y - 50) > 30,
+}
+"""Where a survey has data, by metres from the south-west corner of a tile of 100 m."""
+
+
+@pytest.mark.parametrize("halo", [0, 10])
+@pytest.mark.parametrize("cell", [1.0, 0.5])
+@pytest.mark.parametrize("limit", LIMITS)
+def test_dynamic_mesh_is_cut_to_survey(limit, cell, halo):
+    core = ground(round(100 / cell), round(100 / cell), cell)
+    grid = core.buffered(halo)
+    x, y = np.meshgrid(grid.eastings - core.west, grid.northings - core.south)
+    outside = ~LIMITS[limit](x, y)
+    mesh = sampled(core, diagonal_street(grid, 5), halo=halo, outside=outside)
+    assert not faults(mesh)
+    a, b, c = np.moveaxis(plan(mesh)[mesh.faces], 1, 0)
+    drawn = shapely.union_all(shapely.polygons(np.stack([a, b, c], axis=1)))
+    # The true limit, by points 0.1 m apart.
+    fine = np.arange(0.05, 100, 0.1)
+    domain = shapely.box(*(core.bounds if halo else core.hull))
+    truth = shapely.transform(domain, lambda points: points - [core.west, core.south])
+    px, py = np.meshgrid(fine, fine)
+    known = LIMITS[limit](px, py)
+    west, south, east, north = truth.bounds
+    known &= (px > west) & (px < east) & (py > south) & (py < north)
+    local = shapely.transform(drawn, lambda points: points - [core.west, core.south])
+    shapely.prepare(local)
+    covered = shapely.contains_xy(local, px, py)
+    # Distances of the places where mesh and survey differ from the true limit.
+    away = np.maximum(
+        scipy.ndimage.distance_transform_edt(known), scipy.ndimage.distance_transform_edt(~known)
+    )
+    assert away[covered != known].max(initial=0.0) * 0.1 <= 0.85 * cell
+    # Mean width of the difference along the limit.
+    rim = np.count_nonzero(known[1:] != known[:-1]) + np.count_nonzero(known[:, 1:] != known[:, :-1])
+    assert abs(covered.sum() - known.sum()) / rim * 0.1 < 0.2 * cell
+    # No centre of a cell with data is lost, and none beyond the survey is covered.
+    rows = grid.window(core)
+    centres = np.meshgrid(core.eastings - core.west, core.northings - core.south)
+    inner = shapely.contains_xy(truth, *centres)
+    np.testing.assert_array_equal(shapely.contains_xy(local, *centres)[inner], ~outside[rows][inner])
+
+
+def test_dynamic_mesh_of_covered_tile_ignores_gap_in_halo():
+    core = ground(60, 60)
+    grid = core.buffered(10)
+    outside = np.zeros(grid.shape, bool)
+    outside[:5] = True
+    whole = sampled(core, diagonal_street(grid), halo=10)
+    mesh = sampled(core, diagonal_street(grid), halo=10, outside=outside)
+    np.testing.assert_array_equal(mesh.vertices, whole.vertices)
+    np.testing.assert_array_equal(mesh.faces, whole.faces)
+
+
+def test_dynamic_mesh_keeps_islands_and_joins_cells_at_corners():
+    core = ground(60, 60)
+    outside = np.ones(core.shape, bool)
+    outside[30, 30] = outside[31, 31] = outside[10, 50] = False
+    mesh = sampled(core, np.zeros_like(outside), outside=outside)
+    assert not faults(mesh)
+    row, col = core.cells(*plan(mesh)[mesh.faces].mean(axis=1).T)
+    assert outside[row, col].sum() < len(row)
+    assert (outside[row, col] <= ((row // 2 == 15) & (col // 2 == 15))).all()
+    assert 1.0 < areas(mesh).sum() < 3.0
+
+
+@given(seed=st.integers(0, 2**31), halo=st.sampled_from([0, 2]), share=st.floats(0.05, 0.95))
+@settings(max_examples=60, deadline=None)
+def test_dynamic_mesh_of_any_survey_has_every_centre_with_data(seed, halo, share):
+    core = ground(30, 24)
+    grid = core.buffered(halo)
+    rng = np.random.default_rng(seed)
+    outside = rng.random(grid.shape) < share
+    mesh_of = sampled(core, rng.random(grid.shape) < 0.5, halo=halo, outside=outside)
+    assert not faults(mesh_of)
+    a, b, c = np.moveaxis(plan(mesh_of)[mesh_of.faces], 1, 0)
+    drawn = shapely.union_all(shapely.polygons(np.stack([a, b, c], axis=1)))
+    inner = slice(None) if halo else slice(1, -1)
+    covered = shapely.contains_xy(drawn, *np.meshgrid(core.eastings, core.northings))
+    known = ~outside[grid.window(core)]
+    np.testing.assert_array_equal(covered[inner, inner], known[inner, inner])
 
 
 def test_sample_equal_inputs_give_equal_meshes():

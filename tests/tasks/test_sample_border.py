@@ -1,11 +1,14 @@
 """Meshes of neighbouring tiles join without a gap."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.types import RoadClusters, RoadMask
@@ -17,12 +20,12 @@ WEST, SOUTH = 295500.0, 5629250.0
 
 def edge(rng, cells, share, inside=True):
     road = np.repeat(rng.random(cells // 5 + 1) < share, 5)[:cells]
-    return Edge(np.zeros((3, 0)), road, road & (rng.random(cells) < 0.8), np.full(cells, inside))
+    return Edge(np.zeros((3, 0)), road, road & (rng.random(cells) < 0.8), np.full((2, cells), not inside))
 
 
 def block(rng, cell, size, share, inside=True):
     """Two by two tiles with their frames: grid, frame by (column, row)."""
-    corner = Corner(np.zeros((3, 3)))
+    corner = Corner(np.zeros((3, 3)), np.full((2, 2), not inside))
     width, height = size
     lines = {("h", c, r): edge(rng, width, share, inside) for c in range(2) for r in range(3)}
     lines |= {("v", c, r): edge(rng, height, share, inside) for c in range(3) for r in range(2)}
@@ -34,6 +37,37 @@ def block(rng, cell, size, share, inside=True):
             edges = lines["h", c, r], lines["h", c, r + 1], lines["v", c, r], lines["v", c + 1, r]
             tiles[c, r] = grid, Frame(corner, corner, corner, corner, *edges)
     return tiles
+
+
+def surveyed(tiles, has_data):
+    """The tiles with frames that know where a survey ends; ``has_data`` takes easting and northing."""
+
+    def beyond(eastings, northings):
+        return ~has_data(*np.broadcast_arrays(eastings, northings))
+
+    for key, (grid, frame) in tiles.items():
+        (west, south, east, north), half = grid.bounds, grid.cell / 2
+        x, y = grid.eastings, grid.northings[::-1]
+        parts = {}
+        for name, at in (("south", south), ("north", north)):
+            rows = np.stack([beyond(x, at + half), beyond(x, at - half)])
+            parts[name] = replace(getattr(frame, name), outside=rows)
+        for name, at in (("west", west), ("east", east)):
+            columns = np.stack([beyond(at - half, y), beyond(at + half, y)])
+            parts[name] = replace(getattr(frame, name), outside=columns)
+        yield key, (grid, replace(frame, **parts))
+
+
+def overlap_of_open_edges(whole, axis, at):
+    """Largest overlap (m) of two edges of one face each on a line: easting for axis 0."""
+    faces = whole.faces
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, uses = np.unique(pairs, axis=0, return_counts=True)
+    ends = whole.vertices[edges[uses == 1]]
+    on_line = (np.abs(ends[:, :, axis] - at) < 1e-6).all(axis=1)
+    spans = np.sort(ends[on_line][:, :, 1 - axis], axis=1)
+    spans = spans[np.argsort(spans[:, 0])]
+    return (spans[:-1, 1] - spans[1:, 0]).max(initial=0.0)
 
 
 def meshes(tiles, rng, options, outside=lambda east, north: False):
@@ -118,3 +152,62 @@ def test_border_beyond_survey_ends_mesh():
     first = {(0, 0): tiles[0, 0]}
     (mesh,) = meshes(first, rng, Options(), lambda easting, northing: easting > WEST + 60)
     assert mesh.vertices[:, 0].max() < 80
+
+
+SURVEYS = {
+    "slanted": lambda x, y: y - SOUTH > 20.3 + 0.45 * (x - WEST),
+    "shallow": lambda x, y: y - SOUTH > 98.4 + 0.02 * (x - WEST),
+    "curved": lambda x, y: np.hypot(x - WEST - 90, y - SOUTH - 80) < 75,
+    "along the border": lambda x, y: x < WEST + 100,
+}
+
+
+@pytest.mark.parametrize("survey", SURVEYS)
+def test_meshes_cut_to_survey_join_without_open_edges(survey):
+    rng = np.random.default_rng(0)
+    has_data = SURVEYS[survey]
+    tiles = dict(surveyed(block(rng, 1.0, (100, 100), 0.3), has_data))
+    tiles = {key: (grid, frame) for key, (grid, frame) in tiles.items()
+             if has_data(*np.meshgrid(grid.eastings, grid.northings)).any()}  # fmt: skip
+    parts = list(meshes(tiles, rng, Options(), lambda x, y: ~has_data(x, y)))
+    assert not any(map(faults, parts))
+    whole = union(parts)
+    assert whole.uses.max() == 2
+    for axis, at in enumerate((WEST + 100, SOUTH + 100)):
+        assert overlap_of_open_edges(whole, axis, at) == 0
+    x, y = np.meshgrid(np.arange(0.5, 200), np.arange(0.5, 200))
+    assert whole.area == pytest.approx(has_data(WEST + x, SOUTH + y).sum(), abs=30)
+    # All open edges lie within a cell of the limit, or on the rim of the block.
+    open_edges = whole.middles[whole.uses == 1]
+    around = [has_data(*(open_edges + shift).T) for shift in ([1, 0], [-1, 0], [0, 1], [0, -1])]
+    at_rim = (np.abs(open_edges - [WEST + 100, SOUTH + 100]) > 99.9).any(axis=1)
+    assert (at_rim | (np.ptp(np.stack(around).astype(int), axis=0) == 1)).all()
+
+
+def test_mesh_of_covered_tile_is_the_same_beside_end_of_survey():
+    rng = np.random.default_rng(0)
+    tiles = block(rng, 1.0, (100, 100), 0.3)
+    ended = dict(surveyed(tiles, SURVEYS["along the border"]))
+    one, other = (
+        next(meshes({(0, 0): block_[0, 0]}, np.random.default_rng(1), Options())) for block_ in (tiles, ended)
+    )
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**31), share=st.floats(0.02, 0.98), cell=st.sampled_from([0.2, 0.5, 1.0]))
+def test_meshes_of_any_survey_meet(seed, share, cell):
+    rng = np.random.default_rng(seed)
+    n = round(12 / cell)
+    known = rng.random((2 * n + 2, 2 * n + 2)) < share
+
+    def has_data(x, y):
+        return known[np.floor((y - SOUTH) / cell).astype(int), np.floor((x - WEST) / cell).astype(int)]
+
+    known[n - 1 : n + 1] = True
+    tiles = dict(surveyed(block(rng, cell, (n, n), 0.3), has_data))
+    whole = union(meshes(tiles, rng, Options(road_m=0.7, terrain_m=5), lambda x, y: ~has_data(x, y)))
+    assert whole.uses.max() <= 2
+    for axis, at in enumerate((WEST + 12, SOUTH + 12)):
+        assert overlap_of_open_edges(whole, axis, at) < 1e-6

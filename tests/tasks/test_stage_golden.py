@@ -65,9 +65,9 @@ def test_ecsrc_output_is_pinned_to_version(clusters):
 @pytest.mark.parametrize(
     ("method", "golden"),
     [
-        ("dynamic", (1, 3378, (295500, 5629420, 149.0), "76897d34c3ba24f2")),
-        ("uniform", (1, 14062, (295500, 5629420, 149.0), "42a4d38a9f74eb42")),
-        ("corners", (1, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
+        ("dynamic", (2, 3378, (295500, 5629420, 149.0), "76897d34c3ba24f2")),
+        ("uniform", (2, 14062, (295500, 5629420, 149.0), "42a4d38a9f74eb42")),
+        ("corners", (2, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
     ],
 )
 def test_sample_output_is_pinned_to_version(tile, clusters, method, golden):

@@ -1,0 +1,1 @@
+"""Triangulation of a tile in plan, with edges along given lines."""

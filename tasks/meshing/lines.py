@@ -1,0 +1,120 @@
+"""Lines that a mesh has as edges, as points and segments between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Bools, Floats
+
+if TYPE_CHECKING:
+    import shapely
+
+GRID_M = 2.0**-8
+"""Where lines cross, their points are moved to multiples of this (m): no two of them are too close."""
+AT_BORDER_M = 0.005
+"""Points of lines within this distance of the border lie on it (m); more than crossings are moved."""
+
+
+def divided(
+    lines: shapely.MultiLineString, fine_m: float, coarse_m: float, is_fine: Callable[[Floats], Bools]
+) -> NDArray[np.object_]:
+    """Return lines with additional points, as an array of lines.
+
+    Parameters
+    ----------
+    lines : shapely.MultiLineString
+    fine_m, coarse_m : float
+        Largest distance of points where ``is_fine``, and elsewhere (m).
+    is_fine : callable
+        Tells for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
+    """
+    import shapely
+
+    pieces = shapely.linestrings(_segments(shapely.segmentize(lines, coarse_m)))
+    dense = shapely.segmentize(pieces, fine_m)
+    places, piece = shapely.get_coordinates(dense, return_index=True)
+    chosen = np.bincount(piece, is_fine(places), len(pieces)) > 0
+    return np.asarray(np.where(chosen, dense, pieces))
+
+
+def ends_at_border(lines: Sequence[NDArray[np.object_]], local: Bounds) -> Floats:
+    """Return the points of lines on the border of a tile, moved exactly onto it, ``(n, 2)``."""
+    points = np.unique(_segments(_noded(lines)).reshape(-1, 2), axis=0)
+    moved, at_border = _moved(points, local)
+    return moved[at_border]
+
+
+def apart_from(points: Floats, lines: Sequence[NDArray[np.object_]], distance_m: float) -> Bools:
+    """Return which points, ``(n, 2 or more)``, are not within a distance (m) of the lines, ``(n,)``."""
+    import shapely
+
+    every = shapely.multilinestrings(np.concatenate(lines))
+    shapely.prepare(every)
+    return np.asarray(~shapely.dwithin(every, shapely.points(points[:, :2]), distance_m))
+
+
+def points_and_segments(
+    lines: Sequence[NDArray[np.object_]], border: Floats, local: Bounds, same_m: float
+) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the points of lines, ``(n, 2)``, and the segments between them, ``(m, 2)``.
+
+    Parameters
+    ----------
+    lines : sequence of ndarray
+        Lines within the tile.
+    border : ndarray, (b, 2)
+        The vertices on the border of the tile. Lines that reach the border end in the nearest one, or before
+        the border if none is near.
+    local : tuple of float
+        West, south, east and north of the tile (m).
+    same_m : float
+        Largest distance of such a vertex (m).
+    """
+    segments = _segments(_noded(lines))
+    points, number = np.unique(segments.reshape(-1, 2), axis=0, return_inverse=True)
+    _, at_border = _moved(points, local)
+    reached = np.flatnonzero(at_border)
+    away = np.linalg.norm(points[reached, None] - border, axis=2)
+    nearest = away.argmin(axis=1)
+    points[reached] = border[nearest]
+    lost = np.zeros(len(points), np.bool_)
+    lost[reached[away.min(axis=1) > same_m]] = True
+    pairs = number.reshape(-1, 2)
+    pairs = pairs[~lost[pairs].any(axis=1)]
+    points, number = np.unique(points, axis=0, return_inverse=True)
+    pairs = np.unique(np.sort(number.reshape(-1)[pairs], axis=1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    return points, pairs
+
+
+def _noded(lines: Sequence[NDArray[np.object_]]) -> shapely.Geometry:
+    """Return lines that have no points in common but ends."""
+    import shapely
+
+    every = shapely.multilinestrings(np.concatenate(lines))
+    return every if len(lines) == 1 else shapely.union_all(every, grid_size=GRID_M)
+
+
+def _segments(lines: shapely.Geometry) -> Floats:
+    """Return the segments of lines, ``(n, 2, 2)``."""
+    import shapely
+
+    points, line = shapely.get_coordinates(shapely.get_parts(lines), return_index=True)
+    joined = line[1:] == line[:-1]
+    return np.stack([points[:-1][joined], points[1:][joined]], axis=1)
+
+
+def _moved(points: Floats, local: Bounds) -> tuple[Floats, Bools]:
+    """Return points with those close to the border moved onto it, and which these are."""
+    moved = points.copy()
+    at_border = np.zeros(len(points), np.bool_)
+    for axis, at in zip((0, 1, 0, 1), local, strict=True):
+        near = np.abs(points[:, axis] - at) <= AT_BORDER_M
+        moved[near, axis] = at
+        at_border |= near
+    return moved, at_border

@@ -1,0 +1,119 @@
+"""The limit of the survey as lines: meshes end there, and not at the next vertex of a coarse lattice.
+
+The lines run half-way between the centres of cells with data and of cells beyond the survey ("marching
+squares"), and are simplified by less than the distance to any centre. So every centre with data stays inside,
+every other one outside, and the lines follow the limit to within a cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Bools, Floats
+
+if TYPE_CHECKING:
+    import shapely
+
+TOLERANCE = 0.3
+"""Largest distance by which the lines are simplified (cells): centres are at least 0.35 cells away."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyLimit:
+    """Where the survey ends on a tile."""
+
+    lines: shapely.MultiLineString
+    """Lines through the tile, each closed or from border to border."""
+    covered: shapely.MultiPolygon
+    """The part of the tile that the survey covers."""
+
+    def covers(self, points: Floats) -> Bools:
+        """Return which points, ``(n, 2 or more)``, the survey covers, ``(n,)``."""
+        import shapely
+
+        shapely.prepare(self.covered)
+        return np.asarray(shapely.intersects_xy(self.covered, points[:, 0], points[:, 1]))
+
+
+def survey_limit(outside: Bools, corner: tuple[float, float], cell: float, within: Bounds) -> SurveyLimit:
+    """Return the limit of the survey on a tile.
+
+    Parameters
+    ----------
+    outside : ndarray of bool, (H, W)
+        The tile's cells beyond the survey, without halo; row 0 in the north.
+    corner : tuple of float
+        X and y of the north-western corner of the cells (m).
+    cell : float
+        Cell size (m).
+    within : tuple of float
+        West, south, east and north of the area to be meshed (m): the cells or the hull of their centres.
+    """
+    import shapely
+
+    west, south, east, north = within
+    low = np.array([west - corner[0], corner[1] - north]) / cell
+    high = np.array([east - corner[0], corner[1] - south]) / cell
+    steps = np.clip(_steps(outside), low, high)
+    steps = steps[(steps[:, 0] != steps[:, 1]).any(axis=1)]
+    merged = shapely.line_merge(shapely.multilinestrings(shapely.linestrings(steps)))
+    lines = shapely.simplify(shapely.multilinestrings(shapely.get_parts(merged)), TOLERANCE)
+    covered = _covered(lines, shapely.box(*low, *high), outside)
+
+    def placed(points: Floats) -> Floats:
+        return np.asarray(np.array(corner) + points * [cell, -cell])
+
+    return SurveyLimit(shapely.transform(lines, placed), shapely.transform(covered, placed))
+
+
+def _steps(outside: Bools) -> Floats:
+    """Return the segments of the limit, ``(n, 2, 2)``: ends as (column, row) of cell corners.
+
+    Each square between four cell centres has none, one or two of them, from side to side. Beyond the tile
+    cells are taken as those at its border, so that the limit meets the border at the corner of a cell.
+    """
+    padded = np.pad(outside, 1, mode="edge")
+    north_west, north_east = padded[:-1, :-1], padded[:-1, 1:]
+    south_west, south_east = padded[1:, :-1], padded[1:, 1:]
+    row, col = np.indices(north_west.shape, dtype=np.float64)
+    shifts = {"west": (-0.5, 0.0), "east": (0.5, 0.0), "north": (0.0, -0.5), "south": (0.0, 0.5)}
+    middle = {side: np.stack([col + x, row + y], axis=-1) for side, (x, y) in shifts.items()}
+    passed = {
+        "west": north_west != south_west,
+        "east": north_east != south_east,
+        "north": north_west != north_east,
+        "south": south_west != south_east,
+    }
+    crossed = passed["west"] & passed["east"] & passed["north"] & passed["south"]
+    # Cells with data that touch at a corner are joined; those beyond the survey are not.
+    cuts = {
+        ("west", "east"): passed["west"] & passed["east"] & ~crossed,
+        ("north", "south"): passed["north"] & passed["south"] & ~crossed,
+        ("north", "west"): (passed["north"] & passed["west"] & ~crossed) | (crossed & north_west),
+        ("south", "east"): (passed["south"] & passed["east"] & ~crossed) | (crossed & north_west),
+        ("north", "east"): (passed["north"] & passed["east"] & ~crossed) | (crossed & ~north_west),
+        ("south", "west"): (passed["south"] & passed["west"] & ~crossed) | (crossed & ~north_west),
+    }
+    parts = [np.stack([middle[a][at], middle[b][at]], axis=1) for (a, b), at in cuts.items()]
+    return np.concatenate(parts)
+
+
+def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Bools) -> shapely.MultiPolygon:
+    """Return the parts of an area between the lines whose cells have data, in columns and rows."""
+    import shapely
+    from rasterio.features import rasterize
+    from rasterio.transform import Affine
+
+    network = shapely.union_all([lines, shapely.boundary(area)])
+    parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(network)))
+    number = rasterize(
+        list(zip(parts, range(1, len(parts) + 1), strict=True)),
+        out_shape=outside.shape, transform=Affine.identity(), dtype=np.int32,
+    )  # fmt: skip
+    cells = np.bincount(number.ravel(), minlength=len(parts) + 1)
+    beyond = np.bincount(number.ravel(), outside.ravel(), len(parts) + 1)
+    return shapely.multipolygons(list(parts[(2 * beyond < cells)[1:]]))

@@ -1,0 +1,196 @@
+"""Delaunay triangulation in plan, and the same with given edges.
+
+An edge that the Delaunay triangulation lacks is put in place of the edges that cross it: the faces that it
+crosses are removed, and the polygons on both sides are triangulated anew (Anglada 1997). No point is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import startinpy
+from numpy.typing import NDArray
+
+from flexroad.tasks.types import Floats
+
+SNAP_TOLERANCE_M = 1e-9
+"""Points closer to each other than this are one point (m); callers keep theirs farther apart."""
+
+Faces = NDArray[np.int32]
+Edges = NDArray[np.intp]
+
+
+def delaunay(points: Floats) -> Faces:
+    """Return the faces of the Delaunay triangulation in plan, ``(F, 3)``, counter-clockwise.
+
+    Points of a lattice are cocircular; the order of insertion (corners of the bounding box, then by northing
+    and easting) makes the triangulation unique.
+    """
+    plan = np.zeros((len(points), 3))
+    plan[:, :2] = points[:, :2]
+    triangulation = startinpy.DT()
+    triangulation.snap_tolerance = SNAP_TOLERANCE_M
+    triangulation.insert(plan, insertionstrategy="BBox")
+    # Vertex 0 of startinpy is at infinity; the points follow in the order of insertion.
+    faces: Faces = triangulation.triangles.astype(np.int32) - 1
+    # The object must be deleted in the thread that created it. A sampling profiler such as Dask's may keep
+    # this frame and its locals alive in another thread.
+    del triangulation
+    return faces
+
+
+def constrained(points: Floats, segments: Edges) -> Faces:
+    """Return the faces of a triangulation in plan that has the segments as edges, ``(F, 3)``.
+
+    Parameters
+    ----------
+    points : ndarray, (n, 2 or more)
+        No two at the same place in plan.
+    segments : ndarray of int, (m, 2)
+        Numbers of the points at their ends. A segment that passes through a point is two edges. One that
+        crosses an earlier segment is left out.
+
+    Returns
+    -------
+    ndarray of int32, (F, 3)
+        Counter-clockwise; beside the segments the triangulation is Delaunay's.
+    """
+    faces = delaunay(points)
+    missing = segments[~_has_edges(faces, segments, len(points))]
+    if not len(missing):
+        return faces
+    star = _Star(points, faces, segments)
+    for a, b in missing.tolist():
+        star.insert(a, b)
+    return star.faces
+
+
+def _has_edges(faces: Faces, segments: Edges, count: int) -> NDArray[np.bool_]:
+    """Return which segments, ``(m, 2)``, are edges of the faces."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    wanted = np.sort(segments, axis=1)
+    keys, wanted_keys = (np.asarray(p, np.int64) @ [count, 1] for p in (pairs, wanted))
+    return np.isin(wanted_keys, keys)
+
+
+class _Star:
+    """A triangulation in which faces are looked up by their directed edges."""
+
+    def __init__(self, points: Floats, faces: Faces, segments: Edges) -> None:
+        self.x: list[float] = points[:, 0].tolist()
+        self.y: list[float] = points[:, 1].tolist()
+        self.apex: dict[tuple[int, int], int] = {}
+        """The third vertex of the face on the left of an edge."""
+        self.neighbour: dict[int, int] = {}
+        """For each vertex the end of an edge from it."""
+        self.kept = {(min(a, b), max(a, b)) for a, b in segments.tolist()}
+        """Edges that are not to be removed."""
+        for face in faces.tolist():
+            self._add(*face)
+
+    @property
+    def faces(self) -> Faces:
+        """The faces, each from its smallest vertex on, in ascending order."""
+        ordered = sorted((a, b, c) for (a, b), c in self.apex.items() if a < b and a < c)
+        return np.array(ordered, np.int32).reshape(-1, 3)
+
+    def insert(self, a: int, b: int) -> None:
+        """Make the segment an edge, or several ones if it passes through points."""
+        while a != b:
+            crossed = self._crossed(a, b)
+            if crossed is None:
+                return
+            end, removed, left, right = crossed
+            if removed:
+                added = [*self._fill(left, a, end), *self._fill(right[::-1], end, a)]
+                # Rounding may leave no room for a face; the triangulation then stays as it is.
+                if min(self._side(*face) for face in added) <= 0.0:
+                    return
+                for p, q, r in removed:
+                    for edge in ((p, q), (q, r), (r, p)):
+                        del self.apex[edge]
+                for face in added:
+                    self._add(*face)
+            self.kept.add((min(a, end), max(a, end)))
+            a = end
+
+    def _add(self, a: int, b: int, c: int) -> None:
+        for p, q, r in ((a, b, c), (b, c, a), (c, a, b)):
+            self.apex[p, q] = r
+            self.neighbour[p] = q
+
+    def _side(self, a: int, b: int, c: int) -> float:
+        """Return twice the area of the face a, b, c; negative if c is on the right of a to b."""
+        x, y = self.x, self.y
+        return (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
+
+    def _crossed(self, a: int, b: int) -> tuple[int, list[tuple[int, int, int]], list[int], list[int]] | None:
+        """Return the first vertex on the segment after a, the faces crossed before it, the vertices beside.
+
+        The vertices are those on the left and on the right, each from a on. None if an edge to be kept is in
+        the way.
+        """
+        start = self._first_face(a, b)
+        if start is None:
+            return None
+        right, left = start
+        if b in start:
+            return b, [], [], []
+        for vertex in start:
+            if self._side(a, b, vertex) == 0.0:
+                return vertex, [], [], []
+        removed, on_left, on_right = [(a, right, left)], [left], [right]
+        while True:
+            if (min(left, right), max(left, right)) in self.kept or (left, right) not in self.apex:
+                return None
+            vertex = self.apex[left, right]
+            removed.append((left, right, vertex))
+            side = self._side(a, b, vertex)
+            if vertex == b or side == 0.0:
+                return vertex, removed, on_left, on_right
+            if side > 0:
+                left = vertex
+                on_left.append(left)
+            else:
+                right = vertex
+                on_right.append(right)
+
+    def _first_face(self, a: int, b: int) -> tuple[int, int] | None:
+        """Return the two other vertices of the face at a through which the segment leaves it."""
+        start = v = self.neighbour[a]
+        while (v, a) in self.apex and self.apex[v, a] != start:
+            v = self.apex[v, a]  # clockwise, up to the rim of the triangulation or once around
+        start = v
+        while (a, v) in self.apex:
+            w = self.apex[a, v]
+            if self._side(a, v, b) >= 0.0 >= self._side(a, w, b):
+                return v, w
+            v = w
+            if v == start:
+                break
+        return None
+
+    def _fill(self, chain: Sequence[int], a: int, b: int) -> list[tuple[int, int, int]]:
+        """Return the faces between the edge from a to b and a chain of vertices on its left, from a to b."""
+        faces, open_parts = [], [(list(chain), a, b)]
+        while open_parts:
+            part, a, b = open_parts.pop()
+            if not part:
+                continue
+            best = 0
+            for i in range(1, len(part)):
+                if self._in_circle(a, b, part[best], part[i]):
+                    best = i
+            c = part[best]
+            faces.append((a, b, c))
+            open_parts += [(part[:best], a, c), (part[best + 1 :], c, b)]
+        return faces
+
+    def _in_circle(self, a: int, b: int, c: int, d: int) -> bool:
+        """Return whether d lies inside the circle through a, b and c (counter-clockwise)."""
+        x, y = self.x, self.y
+        rows = [(x[p] - x[d], y[p] - y[d]) for p in (a, b, c)]
+        (ax, ay), (bx, by), (cx, cy) = rows
+        aa, bb, cc = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
+        return ax * (by * cc - cy * bb) - ay * (bx * cc - cx * bb) + aa * (bx * cy - cx * by) > 0.0
