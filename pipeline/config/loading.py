@@ -104,9 +104,8 @@ def compose(raw: Mapping[str, Any], name: str) -> Config:
             )
             for stage in stages
         }
-    export = _validate(
-        TypeAdapter(Export), raw.get("export") or {"variants": _main_variant(chains)}, f"{name}: export"
-    )
+    given = _mapping(raw.get("export") or {}, name, "export")
+    export = _validate(TypeAdapter(Export), {"variants": _main_variant(chains)} | given, f"{name}: export")
     for variant in export.variants:
         if variant not in chains:
             raise ConfigError(

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import BaseModel, Field, TypeAdapter, model_validator
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.methods import HOMES, methods
@@ -40,6 +40,24 @@ class Export(Options):
         ("glb", "ply", "cog", "npz"),
         description="glb and ply: the mesh; cog: height and road mask; npz: the NURBS surface itself",
     )
+    texture: bool = Field(
+        False, description="whether the GLB has the tile's orthophoto (layer dop) as its colours"
+    )
+    texture_px: int = Field(
+        4096,
+        ge=64,
+        le=16384,
+        description="largest width and height of the texture (pixels); a finer photo is averaged",
+    )
+    texture_quality: int = Field(85, ge=1, le=95, description="quality of the texture's JPEG")
+
+    @model_validator(mode="after")
+    def _texture_has_a_mesh(self) -> Export:
+        if self.texture and "glb" not in self.formats:
+            raise ValueError(
+                f"texture needs the format glb, not only {', '.join(self.formats)}; add it to formats"
+            )
+        return self
 
 
 class Config(BaseModel):

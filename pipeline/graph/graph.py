@@ -23,12 +23,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Catalog, Tile
+from flexroad.catalog import Catalog, Layer, Tile
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
 from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, BorderTask, has_borders
-from flexroad.pipeline.graph.products import product_versions
+from flexroad.pipeline.graph.products import product_layers, product_options, product_versions
 from flexroad.pipeline.graph.sources import Recorded, SourceFiles, Stat, hashed, to_json
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
@@ -86,14 +86,23 @@ class TileGraph:
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names of the source layers that its stages read."""
+        """Names of the source layers that its stages and its products are made of."""
+        return self._stage_reads.union(product_layers(self.export))
+
+    @property
+    def _stage_reads(self) -> frozenset[str]:
         return _reads(node.options for node in self.nodes.values())
 
     @property
     def readable(self) -> Tile:
         """The tile with only the layers that its stages read: files of others may lie anywhere."""
-        reads = self.reads
+        reads = self._stage_reads
         return replace(self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in reads))
+
+    @property
+    def product_sources(self) -> tuple[Layer, ...]:
+        """The source layers that its products are made of, with the files that reach the tile."""
+        return _product_sources(self.tile, self.export)
 
     def chain(self, variant: str) -> list[Node]:
         """Return the variant's nodes in the paper's order."""
@@ -150,7 +159,7 @@ class Pattern:
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
-        exported = to_json([config.export.model_dump(mode="json"), product_versions(config.export)])
+        exported = to_json([product_options(config.export), product_versions(config.export)])
         halo_m = max(chain["load"].halo_m for chain in config.chains.values())
         return cls(tuple(steps[key] for key in numbers), variants, config.export, exported, halo_m)
 
@@ -198,17 +207,26 @@ class Pattern:
             variant: {stage: names[number] for stage, number in numbers.items()}
             for variant, numbers in self.variants.items()
         }
-        fingerprint = self._fingerprint(tile, variants)
+        fingerprint = self._fingerprint(tile, variants, sources)
         return TileGraph(own, tile, nodes, variants, self.export, sources.entries, sources.stats, fingerprint)
 
-    def _fingerprint(self, tile: Tile, variants: Mapping[str, Mapping[str, str]]) -> str:
-        requested = [
+    def _fingerprint(
+        self, tile: Tile, variants: Mapping[str, Mapping[str, str]], sources: SourceFiles
+    ) -> str:
+        requested: list[Any] = [
             tile.id,
             tile.stratum,
             [[variant, names["evaluate"], names["assess"]] for variant, names in variants.items()],
             [variants[variant]["sample"] for variant in self.export.variants],
+            *(sources.entry(layer) for layer in _product_sources(tile, self.export)),
         ]
         return hashed(f"{to_json(requested)[:-1]},{self.exported}]")
+
+
+def _product_sources(tile: Tile, export: Export) -> tuple[Layer, ...]:
+    layers = (tile.layer(name) for name in product_layers(export))
+    reaching = (layer.reaching(tile.grid.bounds) for layer in layers if layer)
+    return tuple(layer for layer in reaching if layer)
 
 
 def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
@@ -273,8 +291,9 @@ def files_read(graph: TileGraph, node: Node) -> list[Location]:
 
 
 def layers_read(config: Config) -> frozenset[str]:
-    """Return the names of the layers read by any stage of any variant."""
-    return _reads(options for chain in config.chains.values() for options in chain.values())
+    """Return the names of the layers read by any stage of any variant, or for the products."""
+    stages = _reads(options for chain in config.chains.values() for options in chain.values())
+    return stages.union(product_layers(config.export))
 
 
 def _reads(chosen: Iterable[Options]) -> frozenset[str]:

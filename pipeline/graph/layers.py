@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.products import product_layers
 from flexroad.pipeline.graph.stages import stage_module, stage_version
 
 PRODUCTION = {"road_mask": "production", "roads": "production_vector"}
@@ -43,13 +44,20 @@ def lacking(tiles: Sequence[Tile], config: Config) -> Iterator[tuple[str, str, l
             yield layer, stage, ids
 
 
+def without_photo(tiles: Sequence[Tile], config: Config) -> list[str]:
+    """Return the ids of tiles whose mesh would have no texture, though the configuration wants one."""
+    wanted = product_layers(config.export)
+    return [tile.id for tile in tiles if any(tile.layer(layer) is None for layer in wanted)]
+
+
 def check_layers(config: Config, catalog: Catalog) -> None:
     """Check that the catalog has every layer that the configuration needs, on one tile at least.
 
     Raises
     ------
     ConfigError
-        If no tile has such a layer: then all of them would fail. The message names the remedies.
+        If no tile has such a layer: then all of them would fail; or if no mesh would have the texture that
+        the configuration wants. The message names the remedies.
     """
     tiles = catalog.usable
     for layer, stage, ids in lacking(tiles, config):
@@ -59,6 +67,11 @@ def check_layers(config: Config, catalog: Catalog) -> None:
                 f"{config.name}: no tile of the catalog has {title} (layer {layer}), which {stage} needs; "
                 f"{_remedy(layer, catalog)}"
             )
+    if tiles and len(without_photo(tiles, config)) == len(tiles):
+        raise ConfigError(
+            f"{config.name}: no tile of the catalog has {TITLES['dop']} (layer dop), which export.texture "
+            f"needs; {_remedy('dop', catalog)}, or set export.texture to false"
+        )
 
 
 def fitting_config(catalog: Catalog) -> str:

@@ -17,7 +17,7 @@ from flexroad.catalog.storage.paths import Location, StatCache
 from flexroad.catalog.text import count
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
-from flexroad.pipeline.graph.layers import lacking
+from flexroad.pipeline.graph.layers import lacking, without_photo
 from flexroad.tasks.load import READS
 
 MAX_SHOWN = 5
@@ -57,6 +57,11 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
         yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")
     yield from _missing(usable, layers)
     yield from _unfit(usable, config)
+    if plain := without_photo(usable, config):
+        yield Finding(
+            f"{len(plain)} of {count(len(usable), 'tile')} would have no texture: no dop, which "
+            f"export.texture needs: {some(plain)}"
+        )
 
 
 def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Finding:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import traceback
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import stat
+from flexroad.catalog.storage.paths import Location, stat
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -113,9 +113,7 @@ class Evaluator:
             return node.function(*(inputs or [self.graph.readable]), node.options, **framed)
         finally:
             # Also after an error: a file that is being replaced may be unreadable.
-            for file in files_read(self.graph, node):
-                if stat(file) != self.graph.file_stats[str(file)]:
-                    raise SourceChanged(str(file))
+            check_unchanged(self.graph, files_read(self.graph, node))
 
     def _store(self, node: Node, result: Any, seconds: Mapping[str, float]) -> None:
         try:
@@ -126,6 +124,19 @@ class Evaluator:
             failed = StageError(failure_of(self.graph.tile, "store", full))
             self.errors[node.fingerprint] = failed
             raise failed from error
+
+
+def check_unchanged(graph: TileGraph, files: Iterable[Location]) -> None:
+    """Compare files with their state when the tile's graph was made.
+
+    Raises
+    ------
+    SourceChanged
+        If one has changed.
+    """
+    for file in files:
+        if stat(file) != graph.file_stats[str(file)]:
+            raise SourceChanged(str(file))
 
 
 def failure_of(tile: Tile, stage: str, error: BaseException) -> Failure:

@@ -41,12 +41,14 @@ class Product:
 
 @dataclass(frozen=True)
 class Reference:
-    """What coordinates of products refer to."""
+    """What the products of a tile share, besides its results."""
 
     origin: tuple[float, float]
     """Whole-metre (easting, northing) that mesh translations are relative to."""
     vertical: str | None
     """Vertical CRS of heights, None if it is not known."""
+    texture: glb.Texture | None
+    """The photo on the mesh, None if it has none."""
 
 
 GLB = Kind("mesh", glb.NAME, glb.MEDIA_TYPE, "Mesh for viewers: small coordinates, Y up")
@@ -70,7 +72,10 @@ def file_name(tile_id: str, variant: str, kind: Kind) -> str:
 
 
 def products(
-    graph: TileGraph, evaluate: Callable[[str], Any], origin: tuple[float, float]
+    graph: TileGraph,
+    evaluate: Callable[[str], Any],
+    origin: tuple[float, float],
+    texture: glb.Texture | None = None,
 ) -> dict[str, Product]:
     """Return the products of the graph's export variants and formats, by file name.
 
@@ -82,9 +87,11 @@ def products(
         Returns the result of a node by its fingerprint.
     origin : tuple of float
         Origin of the run: whole-metre (easting, northing) that mesh translations are relative to.
+    texture : Texture, optional
+        The photo on the mesh.
     """
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
-    reference = Reference(origin, vertical)
+    reference = Reference(origin, vertical, texture)
     files: dict[str, Product] = {}
     for variant in graph.export.variants:
         for name in graph.export.formats:
@@ -97,7 +104,8 @@ def products(
 def _glb(
     graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
 ) -> dict[Kind, bytes]:
-    return {GLB: glb.encode(evaluate(nodes["sample"]), (*reference.origin, 0.0))}
+    origin = (*reference.origin, 0.0)
+    return {GLB: glb.encode(evaluate(nodes["sample"]), origin, reference.texture)}
 
 
 def _ply(

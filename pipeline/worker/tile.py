@@ -32,6 +32,7 @@ from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
 from flexroad.pipeline.worker.exports import Product, products
 from flexroad.pipeline.worker.profiling import StageCost, utc_now
 from flexroad.pipeline.worker.stac import EXTENSIONS, assets, links
+from flexroad.pipeline.worker.texture import tile_texture
 from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
@@ -131,7 +132,7 @@ def process_tile(job: TileJob) -> TileResult:
     entry = None
     if not failures:
         try:
-            entry = _finish(job, evaluator, rows, notes)
+            entry, notes = _finish(job, evaluator, rows, notes)
         except StageError as error:
             failures.append(error.failure)
         except Exception as error:
@@ -207,17 +208,21 @@ def _notes(node: Node, evaluator: Evaluator) -> tuple[str, ...]:
     return notes
 
 
-def _finish(job: TileJob, evaluator: Evaluator, rows: list[MetricsRow], notes: tuple[str, ...]) -> TileRecord:
-    """Write the products and the item of a finished tile; return its record."""
+def _finish(
+    job: TileJob, evaluator: Evaluator, rows: list[MetricsRow], notes: tuple[str, ...]
+) -> tuple[TileRecord, tuple[str, ...]]:
+    """Write the products and the item of a finished tile; return its record and all notes."""
     span = evaluator.spans["export"]
     with span.measure():
-        files = products(job.graph, evaluator, job.origin)
+        texture = tile_texture(job.graph)
+        files = products(job.graph, evaluator, job.origin, texture.image)
+        notes = (*notes, texture.note) if texture.note else notes
         seconds = round(_seconds(evaluator), 4)
         written = _item(job, rows, files, notes, seconds)
         job.folder.finish(written, {name: file.data for name, file in files.items()}, job.flushed)
     span.computed += 1
     span.bytes += sum(len(file.data) for file in files.values())
-    return from_item(written, marker_stat(job.folder, "done"))
+    return from_item(written, marker_stat(job.folder, "done")), notes
 
 
 def _item(

@@ -2,15 +2,19 @@
 
 glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
 and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
+An orthophoto is embedded as one JPEG image that both nodes share.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flexroad.tasks.types import Bools, Floats, Mesh
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Bools, Floats, Mesh, Orthophoto
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,8 +27,39 @@ ROAD_COLOUR = (11, 11, 13, 255)
 TERRAIN_COLOUR = (141, 131, 108, 255)
 """Red, green, blue and alpha in linear light, as glTF requires (sRGB #3a3a40 and #c4beae)."""
 
+SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+"""Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border takes no colour of the opposite one."""
 
-def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An orthophoto as the image of a mesh."""
+
+    jpeg: bytes
+    bounds: Bounds
+    """West, south, east and north of the image's outer edges (m, in the mesh's CRS)."""
+
+
+def texture(photo: Orthophoto, quality: int) -> Texture:
+    """Return an orthophoto as a JPEG image; pixels without a colour have the mean of the others.
+
+    Parameters
+    ----------
+    photo : Orthophoto
+        With one known pixel at least.
+    quality : int
+        Quality of the JPEG encoder, 1 to 95.
+    """
+    from PIL import Image
+
+    mean = photo.colour[:, photo.known].mean(axis=1).round().astype(np.uint8)
+    colour = np.where(photo.known, photo.colour, mean[:, None, None])
+    encoded = io.BytesIO()
+    Image.fromarray(np.moveaxis(colour, 0, -1)).save(encoded, "JPEG", quality=quality)
+    return Texture(encoded.getvalue(), photo.grid.bounds)
+
+
+def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture | None = None) -> bytes:
     """Return a mesh as GLB.
 
     Parameters
@@ -33,6 +68,9 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
         The mesh of one tile, with at least one face.
     run_origin : tuple of float
         Whole-metre (easting, northing, height) shared by all tiles of a run; the origin of the scene.
+    texture : Texture, optional
+        The image seen from above; by default road and terrain have one colour each. Positions, normals and
+        faces do not depend on it.
 
     Returns
     -------
@@ -45,13 +83,15 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float]) -> bytes:
 
     whole = trimesh.Trimesh(_y_up(mesh.vertices), mesh.faces, process=False)
     scene = trimesh.Scene(metadata=_georeference(mesh, run_origin))
+    uv = _uv(mesh, texture.bounds) if texture else None
     shift = _y_up(np.subtract(mesh.origin, run_origin))
     scene.graph.update(frame_to="tile", matrix=trimesh.transformations.translation_matrix(shift))
     for name, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
         if faces.any():
-            part = _part(whole, faces, name, colour)
+            part = _part(whole, faces, _material(name, colour, textured=texture is not None), uv)
             scene.add_geometry(part, node_name=name, geom_name=name, parent_node_name="tile")
-    encoded: bytes = scene.export(file_type="glb", include_normals=True)
+    embed = _Embedded(texture.jpeg).options if texture else {}
+    encoded: bytes = scene.export(file_type="glb", include_normals=True, **embed)
     return encoded
 
 
@@ -70,18 +110,57 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
     }
 
 
-def _part(whole: trimesh.Trimesh, faces: Bools, name: str, colour: tuple[int, ...]) -> trimesh.Trimesh:
+def _uv(mesh: Mesh, bounds: Bounds) -> Floats:
+    """Return the vertices' places in the image, ``(V, 2)``: 0 to 1 from west to east, south to north."""
+    west, south, east, north = bounds
+    place = mesh.vertices[:, :2] + mesh.origin[:2]
+    return (place - (west, south)) / (east - west, north - south)
+
+
+def _material(name: str, colour: tuple[int, ...], textured: bool) -> trimesh.visual.material.PBRMaterial:
+    import trimesh
+
+    look = {"roughnessFactor": 1.0} if textured else {"baseColorFactor": colour, "roughnessFactor": 0.95}
+    return trimesh.visual.material.PBRMaterial(name=name, metallicFactor=0.0, **look)
+
+
+def _part(
+    whole: trimesh.Trimesh, faces: Bools, material: trimesh.visual.material.PBRMaterial, uv: Floats | None
+) -> trimesh.Trimesh:
     """Return the faces of one class with the whole mesh's vertex normals, so that shading shows no seam."""
     import trimesh
 
     used, corners = np.unique(whole.faces[faces], return_inverse=True)
-    material = trimesh.visual.material.PBRMaterial(
-        name=name, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.95
-    )
     return trimesh.Trimesh(
         whole.vertices[used],
         corners.reshape(-1, 3),
         vertex_normals=whole.vertex_normals[used],
-        visual=trimesh.visual.TextureVisuals(material=material),
+        # trimesh's v is upward and is turned into glTF's, which is downward, when it is written.
+        visual=trimesh.visual.TextureVisuals(uv=None if uv is None else uv[used], material=material),
         process=False,
     )
+
+
+@dataclass(frozen=True)
+class _Embedded:
+    """The image of all materials, added to trimesh's file: trimesh itself would encode it again."""
+
+    jpeg: bytes
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of trimesh's exporter that add the image."""
+        return {"buffer_postprocessor": self._add_bytes, "tree_postprocessor": self._add_texture}
+
+    def _add_bytes(self, buffers: dict[str, bytes], _: dict[str, Any]) -> None:
+        padding = -len(self.jpeg) % 4
+        buffers["image"] = self.jpeg + bytes(padding)
+
+    def _add_texture(self, tree: dict[str, Any]) -> None:
+        views = tree["bufferViews"]
+        views[-1]["byteLength"] = len(self.jpeg)
+        tree["images"] = [{"name": "orthophoto", "bufferView": len(views) - 1, "mimeType": "image/jpeg"}]
+        tree["samplers"] = [SAMPLER]
+        tree["textures"] = [{"source": 0, "sampler": 0}]
+        for material in tree["materials"]:
+            material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}

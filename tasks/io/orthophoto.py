@@ -27,7 +27,7 @@ BITS = {"uint8": 8, "uint16": 16}
 """Bits per colour of the supported types, unless the file declares fewer."""
 
 
-def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthophoto:
+def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m: float = 0.0) -> Orthophoto:
     """Read the orthophoto over a grid's bounds.
 
     A grey photo is returned as three equal bands; of more than three bands (near infrared) the first three
@@ -41,6 +41,8 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
         The area to read; only its bounds and CRS are used.
     gsd_m : float, optional
         Ground sampling distance of the result (m); by default that of the first file that reaches the grid.
+    finest_m : float
+        Smallest ground sampling distance (m) if ``gsd_m`` is None: finer photos are averaged.
 
     Returns
     -------
@@ -61,7 +63,7 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None) -> Orthop
     with quiet():
         for path in source.paths:
             try:
-                part = _read(path, source, grid, gsd_m)
+                part = _read(path, source, grid, gsd_m, finest_m)
             except Unreadable as error:
                 broken.append(error)
                 continue
@@ -95,7 +97,7 @@ def _under(first: Orthophoto | None, second: Orthophoto) -> Orthophoto:
 
 
 def _read(
-    path: Location, source: Source, grid: Grid, gsd_m: float | None
+    path: Location, source: Source, grid: Grid, gsd_m: float | None, finest_m: float
 ) -> tuple[Orthophoto, RasterGrid] | None:
     """Return a file's pixels over the grid, and the file's lattice; None if it does not overlap the grid."""
     name = f"{source.name} {path.name}"
@@ -104,7 +106,7 @@ def _read(
         if lattice is None or lattice.window_for(grid) is None:
             return None
         depth = _depth(src, path, name)
-        pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or _gsd_m(lattice, grid))
+        pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or max(_gsd_m(lattice, grid), finest_m))
         colour, known = _warped(src, lattice, pixels)
     if src.count < 3:
         colour = np.repeat(colour, 3, axis=0)

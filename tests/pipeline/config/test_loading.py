@@ -93,6 +93,12 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
         ({"variants": {"a": {"sample": {"road": 1}}}}, "x: variants.a.sample.road: unknown key"),
         ({"variants": ["a"]}, "x: variants: expected a mapping"),
         ({"export": {"variants": ["b"]}}, "x: export.variants: no variant 'b', only flexroad"),
+        ({"export": ["glb"]}, "x: export: expected a mapping, not ['glb']"),
+        (
+            {"export": {"texture": True, "formats": ["ply"]}},
+            "x: export: texture needs the format glb, not only ply; add it to formats",
+        ),
+        ({"export": {"texture_quality": 96}}, "x: export.texture_quality: input should be less than"),
         ({"fit": {"degree": 5, "control_points": [4, 20]}}, "x: fit"),
     ],
 )
@@ -101,6 +107,11 @@ def test_compose_invalid_option_raises_one_line(raw, message):
         compose(raw, "x")
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
+
+
+def test_compose_export_without_variants_takes_the_main_one():
+    raw = {"variants": {"plane": {"fit": "plane"}, "smooth": {}}, "export": {"texture": True}}
+    assert compose(raw, "x").export.variants == ("smooth",)
 
 
 def test_load_config_unusable_file_raises(tmp_path):

@@ -13,7 +13,13 @@ import pytest
 from flexroad.catalog import Catalog, Layer
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
-from flexroad.pipeline.graph.graph import Pattern, any_file_missing, own_files_missing, tile_graph
+from flexroad.pipeline.graph.graph import (
+    Pattern,
+    any_file_missing,
+    layers_read,
+    own_files_missing,
+    tile_graph,
+)
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_module, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.segment import mask
@@ -224,6 +230,63 @@ def test_files_of_layers_that_no_stage_reads_may_lie_anywhere(survey):
     assert own_files_missing(replace(graph, file_stats={"/missing": None})) == ["/missing"]
     node = graph.nodes[graph.variants["flexroad"]["load"]]
     assert node.function(graph.readable, node.options).dop is None
+
+
+def with_photo(tile, folder, *names):
+    """Return the tile with photos: the first lies on it, the others beside it."""
+    west, south, east, north = tile.grid.bounds
+    extents = [(west, south, east, north), (east, south, 2 * east - west, north)]
+    for name in names:
+        (folder / name).write_bytes(b"old")
+    layer = Layer("dop", names, extents=tuple(extents[: len(names)]))
+    return replace(tile, root=str(folder), layers=(*tile.layers, layer))
+
+
+TEXTURED = {**PAPER, "export": {"texture": True}}
+
+
+@pytest.mark.parametrize("checksum", [False, True])
+def test_photo_changes_fingerprint_of_tile_only_as_its_texture(survey, checksum):
+    tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif", "beside.tif")
+
+    def prints(raw):
+        graph = tile_graph(tile, compose(raw, "x"), checksum)
+        return graph.fingerprint, graph.variants
+
+    plain, textured = prints(PAPER), prints(TEXTURED)
+    assert plain[0] != textured[0]
+    assert plain[1] == textured[1]
+    (survey.parent / "beside.tif").write_bytes(b"newer")
+    assert (prints(PAPER), prints(TEXTURED)) == (plain, textured)
+    (survey.parent / "own.tif").write_bytes(b"newer")
+    assert prints(PAPER) == plain
+    newer = prints(TEXTURED)
+    assert newer[0] != textured[0]
+    assert newer[1] == textured[1]
+    (survey.parent / "own.tif").unlink()
+    assert prints(TEXTURED)[0] != newer[0]
+
+
+def test_options_of_texture_change_fingerprint_only_with_a_texture(survey):
+    tile = Catalog.read(survey).tiles[0]
+
+    def fingerprint(**export):
+        return tile_graph(tile, compose({**PAPER, "export": export}, "x")).fingerprint
+
+    for options in ({"texture_px": 512}, {"texture_quality": 60}):
+        assert fingerprint(**options) == fingerprint()
+        assert fingerprint(texture=True, **options) != fingerprint(texture=True)
+
+
+def test_photo_of_texture_is_read_for_products_and_by_no_stage(survey):
+    tile = with_photo(Catalog.read(survey).tiles[0], survey.parent, "own.tif")
+    config = compose(TEXTURED, "x")
+    graph = tile_graph(tile, config)
+    assert "dop" in graph.reads & layers_read(config)
+    assert "dop" not in {layer.name for layer in graph.readable.layers}
+    (survey.parent / "own.tif").unlink()
+    assert own_files_missing(tile_graph(tile, config)) == [str(survey.parent / "own.tif")]
+    assert own_files_missing(tile_graph(tile, compose(PAPER, "x"))) == []
 
 
 def test_largest_halo_of_the_variants_counts(survey):

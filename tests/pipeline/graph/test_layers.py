@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, Layer
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.layers import ADD_ROADS, check_layers, fitting_config
+from flexroad.pipeline.graph.layers import ADD_ROADS, check_layers, fitting_config, without_photo
 
 
 @pytest.fixture
@@ -43,6 +43,19 @@ def test_check_layers_looks_at_every_variant(tiles):
     config = compose({"variants": {"flexroad": {}, "other": {"segment": "vector"}}}, "mine")
     with pytest.raises(ConfigError, match="which segment: vector needs"):
         check_layers(config, Catalog(tuple(without(tile, "roads") for tile in tiles)))
+
+
+def test_check_layers_texture_needs_one_tile_with_a_photo(tiles):
+    config = load_config("production", ["export.texture=true"])
+    with pytest.raises(ConfigError) as refused:
+        check_layers(config, Catalog(tiles))
+    (line,) = str(refused.value).splitlines()
+    assert "no tile of the catalog has an orthophoto (layer dop), which export.texture needs" in line
+    assert line.endswith("(`flexroad catalog rasters --dop`), or set export.texture to false")
+    photographed = replace(tiles[0], layers=(*tiles[0].layers, Layer("dop", ("dop.tif",))))
+    check_layers(config, Catalog((photographed, *tiles[1:])))
+    assert without_photo([photographed, *tiles[1:]], config) == [tile.id for tile in tiles[1:]]
+    assert without_photo(tiles, load_config("production")) == []
 
 
 def test_fitting_config_takes_the_layer_of_most_tiles(tiles):

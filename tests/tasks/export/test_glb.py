@@ -1,13 +1,17 @@
 import io
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from scipy.ndimage import map_coordinates
 
+from flexroad.catalog import Grid
 from flexroad.tasks.export import glb
-from flexroad.tasks.types import Mesh
+from flexroad.tasks.types import Mesh, Orthophoto
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
 RUN_ORIGIN = (295000.0, 5629000.0, 100.0)
@@ -119,3 +123,100 @@ def test_encode_keeps_non_ascii_wkt():
     named = Mesh('PROJCRS["Réunion"]', mesh.origin, mesh.vertices, mesh.faces, mesh.road)
     data = glb.encode(named, RUN_ORIGIN)
     assert gltf_json(data)["scenes"][0]["extras"]["crs"] == 'PROJCRS["Réunion"]'
+
+
+def colour_by_place(cell: float, size: float = 12.0) -> Orthophoto:
+    """Return a photo of the hills and 2 m more in the east and south: red is easting, green is northing."""
+    grid = Grid("EPSG:25832", ORIGIN[0], ORIGIN[1] + 10, cell, round(size / cell), round(size / cell))
+    red = (grid.eastings - grid.west) / size * 255
+    green = (grid.northings - grid.south) / size * 255
+    colour = np.stack([*np.broadcast_arrays(red, green[:, None]), np.full(grid.shape, 128.0)])
+    return Orthophoto(grid, colour.round().astype(np.uint8), np.ones(grid.shape, bool))
+
+
+def view(data: bytes, index: int) -> bytes:
+    """Return the bytes of a buffer view."""
+    content = gltf_json(data)["bufferViews"][index]
+    start = data.index(b"BIN\0", 20) + 4 + content["byteOffset"]
+    return data[start : start + content["byteLength"]]
+
+
+def attribute(data: bytes, node: str, name: str) -> np.ndarray:
+    """Return an attribute of a node's vertices as the file has it, ``(V, 2)`` or ``(V, 3)``."""
+    tree = gltf_json(data)
+    (mesh,) = [mesh for mesh in tree["meshes"] if mesh["name"] == node]
+    accessor = tree["accessors"][mesh["primitives"][0]["attributes"][name]]
+    assert accessor["componentType"] == 5126
+    return np.frombuffer(view(data, accessor["bufferView"]), "<f4").reshape(accessor["count"], -1)
+
+
+def image(data: bytes) -> np.ndarray:
+    """Return the only image, ``(h, w, 3)``."""
+    (only,) = gltf_json(data)["images"]
+    assert only["mimeType"] == "image/jpeg"
+    return np.asarray(Image.open(io.BytesIO(view(data, only["bufferView"]))), float)
+
+
+def looked_up(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Return the colour at texture coordinates as glTF defines them: (0, 0) is the first texel's corner."""
+    height, width, _ = texels.shape
+    place = [uv[:, 1] * height - 0.5, uv[:, 0] * width - 0.5]
+    bands = np.moveaxis(texels, -1, 0)
+    return np.stack([map_coordinates(band, place, order=1, mode="nearest") for band in bands], axis=1)
+
+
+@pytest.mark.parametrize("cell", [0.4, 0.6])
+def test_encode_texture_colour_of_each_vertex_tells_its_place(cell):
+    photo = colour_by_place(cell)
+    data = glb.encode(hills(), RUN_ORIGIN, glb.texture(photo, 95))
+    errors = []
+    for node in ("road", "terrain"):
+        x, _, z = attribute(data, node, "POSITION").T
+        colour = looked_up(image(data), attribute(data, node, "TEXCOORD_0"))
+        # The mesh starts 2 m north of the photo's south-west corner. Beyond the outermost texel centres
+        # the colour is that of the border.
+        for band, place in ((0, x), (1, 2 - z)):
+            errors.append(colour[:, band] / 255 * 12 - np.clip(place, cell / 2, 12 - cell / 2))
+    assert max(np.abs(error).max() for error in errors) < cell
+    # A shift by half a texel would show in the mean.
+    assert max(abs(error.mean()) for error in errors) < 0.15 * cell
+
+
+def test_encode_texture_keeps_positions_normals_and_faces():
+    plain = glb.encode(hills(), RUN_ORIGIN)
+    textured = glb.encode(hills(), RUN_ORIGIN, glb.texture(colour_by_place(0.5), 85))
+    for node in ("road", "terrain"):
+        for name in ("POSITION", "NORMAL"):
+            np.testing.assert_array_equal(attribute(textured, node, name), attribute(plain, node, name))
+        np.testing.assert_array_equal(placed(read(textured), node).faces, placed(read(plain), node).faces)
+
+
+def test_encode_texture_is_one_clamped_image_of_both_nodes():
+    texture = glb.texture(colour_by_place(0.5), 85)
+    data = glb.encode(hills(), RUN_ORIGIN, texture)
+    tree = gltf_json(data)
+    assert view(data, tree["images"][0]["bufferView"]) == texture.jpeg
+    assert [len(tree[name]) for name in ("images", "textures", "samplers")] == [1, 1, 1]
+    assert (tree["samplers"][0]["wrapS"], tree["samplers"][0]["wrapT"]) == (33071, 33071)
+    used = [tree["materials"][mesh["primitives"][0]["material"]] for mesh in tree["meshes"]]
+    look = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "baseColorTexture": {"index": 0}}
+    assert [material["pbrMetallicRoughness"] for material in used] == [look, look]
+    parts = read(data).geometry.values()
+    assert [part.visual.material.baseColorTexture.size for part in parts] == [(24, 24), (24, 24)]
+
+
+def test_texture_pixels_without_colour_take_the_mean_of_the_others():
+    photo = colour_by_place(0.5)
+    west = np.broadcast_to(photo.grid.eastings < ORIGIN[0] + 4, photo.grid.shape)
+    black = replace(photo, colour=np.where(west, 0, photo.colour).astype(np.uint8), known=~west)
+    texels = image(glb.encode(hills(), RUN_ORIGIN, glb.texture(black, 95)))
+    mean = photo.colour[:, ~west].mean(axis=1)
+    np.testing.assert_allclose(texels[:, :7].mean(axis=(0, 1)), mean, atol=3)
+
+
+def test_texture_higher_quality_has_smaller_errors():
+    noise = np.random.default_rng(0).integers(0, 255, (3, 24, 24)).astype(np.uint8)
+    photo = replace(colour_by_place(0.5), colour=noise)
+    images = [image(glb.encode(hills(), RUN_ORIGIN, glb.texture(photo, quality))) for quality in (20, 90)]
+    errors = [np.abs(texels - np.moveaxis(noise, 0, -1)).mean() for texels in images]
+    assert errors[1] < errors[0]

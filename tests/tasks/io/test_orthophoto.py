@@ -67,6 +67,14 @@ def test_read_photo_coarser_pixels_are_means(tmp_path, cell):
     assert np.abs(photo.colour - means(values, round(cell / 0.5))).max() <= 0.5
 
 
+@pytest.mark.parametrize(("finest_m", "cell"), [(0.2, 0.5), (0.5, 0.5), (1.0, 1.0)])
+def test_read_photo_finest_averages_only_finer_photos(tmp_path, finest_m, cell):
+    values = bands()
+    photo = read_photo(source(write(tmp_path / "a.tif", values)), GRID, finest_m=finest_m)
+    assert photo.grid.cell == cell
+    assert np.abs(photo.colour - means(values, round(cell / 0.5))).max() <= 0.5
+
+
 def test_read_photo_finer_pixels_are_interpolated(tmp_path):
     ramp = np.broadcast_to(np.arange(40, dtype=np.uint8) * 4, (3, 24, 40))
     photo = read_photo(source(write(tmp_path / "a.tif", ramp)), GRID, 0.25)

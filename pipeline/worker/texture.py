@@ -1,0 +1,56 @@
+"""The orthophoto of a tile as the texture of its meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.worker.evaluator import check_unchanged
+from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.export import glb
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.types import Source
+
+NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
+
+
+@dataclass(frozen=True)
+class TileTexture:
+    """The texture of a tile's meshes."""
+
+    image: glb.Texture | None = None
+    """None if there is none: the configuration wants none, or the tile has no photo."""
+    note: str = ""
+    """What the photo lacks, or empty."""
+
+
+def tile_texture(graph: TileGraph) -> TileTexture:
+    """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
+
+    Raises
+    ------
+    TaskError
+        If a file of the photo is missing, broken, or not one of a photo.
+    SourceChanged
+        If a file has changed after the graph was made.
+    """
+    export, tile = graph.export, graph.tile
+    if not export.texture:
+        return TileTexture()
+    if not graph.product_sources:
+        return TileTexture(note=NO_PHOTO)
+    (layer,) = graph.product_sources
+    files = tile.paths(layer)
+    source = Source(layer.name, files, layer.crs, allowed=tile.allowed)
+    west, south, east, north = tile.grid.bounds
+    try:
+        photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / export.texture_px)
+    except LayerMissing:
+        return TileTexture(note=NO_PHOTO)
+    finally:
+        check_unchanged(graph, files)
+    unknown = 1 - photo.known.mean()
+    if unknown == 1:
+        return TileTexture(note=NO_PHOTO)
+    note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
+    return TileTexture(glb.texture(photo, export.texture_quality), note)
