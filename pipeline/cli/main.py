@@ -15,7 +15,8 @@ from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.configs import configs
 from flexroad.pipeline.cli.init import init
 from flexroad.pipeline.cli.prepare import prepare
-from flexroad.pipeline.cli.results import figures, query, report, tables
+from flexroad.pipeline.cli.query import query
+from flexroad.pipeline.cli.results import figures, report, tables
 from flexroad.pipeline.cli.run import rerun, run, status
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.cli.train import train

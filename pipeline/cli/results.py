@@ -1,15 +1,12 @@
-"""``flexroad report``, ``tables``, ``figures`` and ``query``: results of a run."""
+"""``flexroad report``, ``tables`` and ``figures``: results of a run."""
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo, echo_document
 
@@ -101,29 +98,3 @@ def figures(
     for note in write_figures(Run.open(path, allow or ()), output, tile):
         echo(f"note: {note}", err=True)
     echo(f"figures in {output / 'figures.md'}")
-
-
-def query(
-    path: options.Run,
-    points: Annotated[Path, typer.Option(metavar="FILE", help="CSV with columns easting and northing (m).")],
-    variant: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
-    ] = None,
-    allow: options.Allow = None,
-) -> None:
-    """Print height, unit normal, tile and class at points, as CSV."""
-    from flexroad.pipeline.inspect.points import query_csv
-
-    answer = query_csv(path, points, variant, sys.stdout, allow or ())
-    if number := len(answer.earlier):
-        echo(
-            f"note: sources or options of {count(number, 'tile')} have changed since; the values are of "
-            f"the last finished state; next: flexroad rerun {shlex.quote(str(path))}",
-            err=True,
-        )
-    if outside := int((answer.tile == "").sum()):
-        verb, whose = ("lies", "its") if outside == 1 else ("lie", "their")
-        echo(
-            f"note: {count(outside, 'point')} {verb} on no finished tile; {whose} columns are empty", err=True
-        )

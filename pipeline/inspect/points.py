@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
@@ -141,41 +139,3 @@ class Ground:
             return evaluate(nodes["fit"]), evaluate(nodes["segment"])
         except StageError as error:
             raise ConfigError(f"tile {graph.tile.id}: {error}") from error
-
-
-def query_csv(
-    run: Location, csv: Path, variant: str | None, out: TextIO, allow: Sequence[str | Path] = ()
-) -> Answer:
-    """Read a CSV of points and write it with the added columns height_m, nx, ny, nz, tile and class.
-
-    Parameters
-    ----------
-    allow : sequence of str or Path
-        See `Run.open`.
-
-    Returns
-    -------
-    Answer
-        The values at the points, also of tiles of which sources or options have changed since.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or lacks the columns easting and northing, or a value is not a number.
-    """
-    try:
-        table = pd.read_csv(csv)
-        easting = table["easting"].to_numpy(np.float64)
-        northing = table["northing"].to_numpy(np.float64)
-    except KeyError as error:
-        raise ConfigError(f"{csv}: no column {error}; it needs easting and northing (m)") from error
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{csv}: not readable as a table of points: {error}") from error
-    answer = Ground.open(run, variant, allow, earlier=True).at(easting, northing)
-    table["height_m"] = answer.height
-    for i, name in enumerate(("nx", "ny", "nz")):
-        table[name] = answer.normal[:, i]
-    table["tile"] = answer.tile
-    table["class"] = answer.kind
-    table.to_csv(out, index=False, float_format="%.9g")
-    return answer

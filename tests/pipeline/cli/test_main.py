@@ -121,7 +121,7 @@ def test_query_writes_csv_with_heights(finished, made_survey, tmp_path):
 
 def _without_columns(folder: Path) -> Path:
     path = folder / "no_columns.csv"
-    path.write_text("x,y\n1,2\n")
+    path.write_text("a,b\n1,2\n")
     return path
 
 

@@ -703,9 +703,9 @@ def test_simultaneous_runs_share_a_store(survey, quick_config, tmp_path):
         ("status", "Missing argument 'RUN'"),
         ("status nowhere", "nowhere is no run"),
         ("status SURVEY", "is no run"),
-        ("query CSV --points RUN", "not readable as a table of points"),
+        ("query RUN --points RUN", "not readable as a table of points: Is a directory"),
         ("query RUN --points nowhere.csv", "No such file"),
-        ("query RUN --points CSV", "no column 'easting'"),
+        ("query RUN --points CSV", "no columns of coordinates; it needs easting and northing"),
         ("report RUN --format pdf", "'pdf'"),
         ("rerun RUN --tile x", "no tile 'x' in the catalog; did you mean"),
         ("rerun RUN --from evaluation", "'evaluation'"),
@@ -749,7 +749,7 @@ def finished(made_survey, tmp_path_factory) -> Path:
 def argument_paths(made_survey, finished, tmp_path_factory):
     """Paths by their placeholder in the tested commands."""
     folder = tmp_path_factory.mktemp("slips")
-    (folder / "p.csv").write_text("x,y\n1,2\n")
+    (folder / "p.csv").write_text("a,b\n1,2\n")
     return {
         "RUN": finished,
         "CSV": folder / "p.csv",

@@ -1,0 +1,115 @@
+"""``flexroad query``: heights, normals and classes of a run at points or along lines."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexroad.catalog.text import count
+from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.errors import ConfigError
+
+STDIN = Path("-")
+
+
+def query(
+    path: options.Run,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON; - reads a CSV from standard "
+            "input.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
+    line: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|'X Y, X Y'",
+            help="Profile along the lines of a vector file, or along a line through these points.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
+    step: Annotated[
+        float,
+        typer.Option(min=0.001, metavar="M", help="Step along a line (m).", rich_help_panel=options.INPUTS),
+    ] = 1.0,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EPSG:N",
+            help="CRS of the points or the line, if it is another one; first east, then north.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
+    lonlat: Annotated[
+        bool,
+        typer.Option(
+            "--lonlat",
+            help="Coordinates are longitude, latitude in degrees: --crs EPSG:4326.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = False,
+    layer: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Layer of a GeoPackage.", rich_help_panel=options.INPUTS),
+    ] = None,
+    variant: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Variant of the surface; default: the exported one."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="Write a .csv or .gpkg instead of printing CSV.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ] = None,
+    allow: options.Allow = None,
+) -> None:
+    """Print heights, normals and classes at points or along lines.
+
+    The output is CSV: the columns of the points and height_m, nx, ny, nz, tile and class; with --line also
+    distance and grade.
+    """
+    from flexroad.pipeline.inspect.answers import along_lines, at_points, outside, required_crs
+    from flexroad.pipeline.inspect.point_files import LONLAT, parse_csv, read_points
+    from flexroad.pipeline.inspect.points import Ground
+    from flexroad.pipeline.inspect.profile import read_lines
+
+    if (points is None) == (line is None):
+        raise ConfigError("give the points with --points FILE, or a line with --line")
+    if lonlat and crs:
+        raise ConfigError(f"--lonlat means --crs {LONLAT}; give one of --lonlat and --crs {crs}")
+    if output is not None and output.suffix.lower() not in (".csv", ".gpkg"):
+        raise ConfigError(f"-o {output}: give a name that ends in .csv or .gpkg")
+    given = LONLAT if lonlat else crs
+    ground = Ground.open(path, variant, allow or (), earlier=True)
+    if line is not None:
+        result = along_lines(ground, read_lines(line, given, layer, required_crs(ground)), step)
+    elif points == STDIN:
+        result = at_points(ground, parse_csv(sys.stdin.buffer.read(), "standard input", given))
+    else:
+        assert points is not None
+        result = at_points(ground, read_points(points, given, layer))
+    if output is not None and output.suffix.lower() == ".gpkg":
+        result.write_geopackage(output)
+    else:
+        result.write_csv(output or sys.stdout)
+    if number := len(result.answer.earlier):
+        echo(
+            f"note: sources or options of {count(number, 'tile')} have changed since; the values are of "
+            f"the last finished state; next: flexroad rerun {shlex.quote(str(path))}",
+            err=True,
+        )
+    for note in filter(None, (*result.notes, outside(result, ground))):
+        echo(f"note: {note}", err=True)

@@ -1,0 +1,185 @@
+"""Answers of ``flexroad query``: tables of points or profiles with what a run has there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+
+from flexroad.catalog.crs import short
+from flexroad.catalog.headers.open_vector import ERRORS
+from flexroad.catalog.storage.paths import parse_location, write
+from flexroad.catalog.storage.scratch import ScratchFolder
+from flexroad.catalog.text import count, reason
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.inspect.point_files import Points, to_crs
+from flexroad.pipeline.inspect.points import Answer, Ground
+from flexroad.pipeline.inspect.profile import stations
+from flexroad.tasks.types import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MILLIMETRES = ("distance_m", "easting", "northing")
+"""Columns that are written with three decimals; other numbers have nine digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class AnswerTable:
+    """A table of n points and what a run has there."""
+
+    table: pd.DataFrame
+    """One row per point: the given columns, then those of the answer."""
+    easting: Floats
+    northing: Floats
+    """``(n,)``, m, in the CRS of the run; NaN where there are none."""
+    crs: str | None
+    """CRS of the run; None if its tiles have several."""
+    answer: Answer
+    notes: tuple[str, ...] = ()
+    """Lines for the user."""
+    separator: str = ","
+    decimal: str = "."
+
+    def write_csv(self, out: TextIO | Path) -> None:
+        """Write the table as CSV.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        table = self.table.copy()
+        for name in MILLIMETRES:
+            if name in table and table[name].dtype.kind == "f":
+                texts = (f"{value:.3f}".replace(".", self.decimal) for value in table[name])
+                table[name] = ["" if text == "nan" else text for text in texts]
+        text = table.to_csv(sep=self.separator, decimal=self.decimal, index=False, float_format="%.9g")
+        if isinstance(out, Path):
+            write(parse_location(out), text.encode())
+        else:
+            out.write(text)
+
+    def write_geopackage(self, path: Path) -> None:
+        """Write the table as a GeoPackage of points in the CRS of the run.
+
+        Raises
+        ------
+        ConfigError
+            If a column cannot be written.
+        OSError
+            If the file cannot be written.
+        """
+        import geopandas
+        import shapely
+
+        known = np.isfinite(self.easting) & np.isfinite(self.northing)
+        shapes = np.full(len(known), None, dtype=object)
+        shapes[known] = shapely.points(self.easting[known], self.northing[known])
+        frame = geopandas.GeoDataFrame(self.table, geometry=shapes, crs=self.crs)
+        with ScratchFolder() as folder:
+            file = Path(folder, "query.gpkg")
+            try:
+                frame.to_file(file, layer="query", driver="GPKG", engine="pyogrio")
+            except ERRORS as error:
+                raise ConfigError(f"{path}: cannot be written: {reason(error)}; write a CSV") from error
+            write(parse_location(path), file.read_bytes())
+
+
+def crs_of(ground: Ground) -> str | None:
+    """Return the CRS of a run, None if its tiles have several."""
+    systems = {tile.grid.crs for tile in ground.run.catalog.usable}
+    return systems.pop() if len(systems) == 1 else None
+
+
+def required_crs(ground: Ground) -> str:
+    """Return the CRS of a run.
+
+    Raises
+    ------
+    ConfigError
+        If its tiles have several.
+    """
+    crs = crs_of(ground)
+    if crs is None:
+        raise ConfigError(
+            f"the tiles of {ground.run.path} have several CRSs; give points in that of the tile, as a CSV "
+            "with easting and northing"
+        )
+    return crs
+
+
+def at_points(ground: Ground, points: Points) -> AnswerTable:
+    """Return what a run has at points: the columns height_m, nx, ny, nz, tile and class.
+
+    Points of a vector file also get the columns easting and northing (m), in the CRS of the run.
+
+    Raises
+    ------
+    ConfigError
+        If the points have a CRS and the tiles of the run have several, or a result of a tile is missing.
+    """
+    easting, northing, table = points.x, points.y, points.table
+    if points.crs is not None:
+        easting, northing = to_crs(points.x, points.y, points.crs, required_crs(ground))
+    if points.vector:
+        table = table.assign(easting=easting, northing=northing)
+    answer = ground.at(easting, northing)
+    whole = table.assign(**_columns(answer))
+    return AnswerTable(
+        whole, easting, northing, crs_of(ground), answer, points.notes, points.separator, points.decimal
+    )
+
+
+def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTable:
+    """Return profiles: what a run has every ``step_m`` along lines, and at their ends.
+
+    The columns are line (only if there are several), distance_m, easting, northing, height_m, grade_percent,
+    nx, ny, nz, tile and class. The grade is that of the surface in the direction of the line, positive
+    uphill.
+
+    Raises
+    ------
+    ConfigError
+        If there are too many points, or a result of a tile is missing.
+    """
+    import pandas as pd
+
+    points = stations(lines, step_m)
+    answer = ground.at(points.easting, points.northing)
+    # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
+    slope = -(answer.normal[:, :2] * points.direction).sum(axis=1) / answer.normal[:, 2]
+    place = {"distance_m": points.distance, "easting": points.easting, "northing": points.northing}
+    heights = {"height_m": answer.height, "grade_percent": 100 * slope}
+    table = pd.DataFrame(place | heights | _columns(answer))
+    if len(lines) > 1:
+        table.insert(0, "line", points.line)
+    return AnswerTable(table, points.easting, points.northing, crs_of(ground), answer)
+
+
+def _columns(answer: Answer) -> dict[str, Any]:
+    normal = dict(zip(("nx", "ny", "nz"), answer.normal.T, strict=True))
+    return {"height_m": answer.height, **normal, "tile": answer.tile, "class": answer.kind}
+
+
+def outside(result: AnswerTable, ground: Ground) -> str:
+    """Return a line about the points that lie on no finished tile, empty if there are none.
+
+    If all points do, it says where the tiles lie.
+    """
+    number = int((result.answer.tile == "").sum())
+    if not number:
+        return ""
+    verb, whose = ("lies", "its") if number == 1 else ("lie", "their")
+    line = f"{count(number, 'point')} {verb} on no finished tile; {whose} columns are empty"
+    if number < len(result.answer.tile):
+        return line
+    bounds = np.array([tile.grid.bounds for tile in ground.run.catalog.usable])
+    west, south = bounds[:, :2].min(axis=0)
+    east, north = bounds[:, 2:].max(axis=0)
+    line += f"; the tiles lie in W {west:.0f} S {south:.0f} E {east:.0f} N {north:.0f}"
+    line += f" ({short(result.crs)})" if result.crs else ""
+    degrees = (np.abs(result.easting) <= 180) & (np.abs(result.northing) <= 90)
+    return line + ("; longitude and latitude need --lonlat" if degrees.all() else "")

@@ -1,0 +1,273 @@
+"""``flexroad query`` on tilted ground of known heights: points in several files and CRSs, and profiles."""
+
+import io
+import sys
+from pathlib import Path
+
+import geopandas
+import numpy as np
+import pandas as pd
+import pyproj
+import pytest
+from shapely import LineString, MultiLineString, MultiPoint, Point
+
+from tests import command_line
+from tests.make_rasters import UTM, write
+
+WEST, SOUTH, SIZE = 500_000.0, 5_600_000.0, 40
+EAST_SLOPE, NORTH_SLOPE = 0.05, -0.02
+POINTS = np.array([[WEST + 10.25, SOUTH + 20.5], [WEST + 31.0, SOUTH + 7.75]])
+
+
+def ground(easting, northing):
+    """The height of the made ground (m)."""
+    return 100.0 + EAST_SLOPE * (easting - WEST) + NORTH_SLOPE * (northing - SOUTH)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run whose surface is the made ground, with a road of 10 m in the middle."""
+    folder = tmp_path_factory.mktemp("ground")
+    centres = np.arange(SIZE) + 0.5
+    heights = ground(WEST + centres[None, :], SOUTH + centres[::-1, None])
+    road = np.zeros((SIZE, SIZE), np.uint8)
+    road[15:25] = 1
+    for name, values in (("dsm", heights), ("dtm", heights), ("road_mask", road)):
+        write(folder / f"{name}.tif", values, WEST, SOUTH + SIZE)
+    catalog, config = folder / "catalog.json", folder / "plane.yaml"
+    config.write_text("fit: plane\nvariants:\n  flexroad: {}\n")
+    layers = ["--dsm", "dsm.tif", "--dtm", "dtm.tif", "--road-mask", "road_mask.tif", "--road-value", 1]
+    command_line.call("catalog", "rasters", folder, *layers, "--tile-size", SIZE, "-o", catalog).expected(0)
+    words = ["--config", config, "--catalog", catalog, "--executor", "serial"]
+    command_line.call("run", *words, "--out", folder / "run").expected(0)
+    return folder / "run"
+
+
+def answer(said, **form) -> pd.DataFrame:
+    return pd.read_csv(io.StringIO(said.expected(0).out), **form)
+
+
+def assert_truth(table: pd.DataFrame) -> None:
+    """The table has the heights of the ground and its normal at `POINTS`."""
+    np.testing.assert_allclose(table.height_m, ground(*POINTS.T), atol=2e-3)
+    np.testing.assert_allclose(-table.nx / table.nz, EAST_SLOPE, atol=1e-5)
+    np.testing.assert_allclose(-table.ny / table.nz, NORTH_SLOPE, atol=1e-5)
+    assert list(table["class"]) == ["road", "terrain"]
+
+
+def degrees() -> np.ndarray:
+    """Longitudes and latitudes of `POINTS`."""
+    to_degrees = pyproj.Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
+    return np.column_stack(to_degrees.transform(*POINTS.T))
+
+
+def csv(path: Path, header: str, rows, form: str = "{:.9f},{:.9f}") -> Path:
+    path.write_text("\n".join([header, *(form.format(*row) for row in rows)]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("longitude,latitude", []),
+        ("LON,Lat", []),
+        ("lon,lat", ["--lonlat"]),
+        ("x,y", ["--lonlat"]),
+        ("x,y", ["--crs", "EPSG:4326"]),
+        # ETRS89, which the projected CRS is based on.
+        ("lon,lat", ["--crs", "EPSG:4258"]),
+    ],
+)
+def test_query_of_degrees_gives_heights_of_the_ground(run, flexroad, tmp_path, header, words):
+    points = csv(tmp_path / "points.csv", header, degrees())
+    said = flexroad("query", run, "--points", points, *words)
+    assert_truth(answer(said))
+    read_as = f"note: {header.replace(',', ', ')} are read as EPSG:4326\n"
+    assert said.err == ("" if words else read_as)
+
+
+def test_query_of_another_projected_crs_takes_east_first(run, flexroad, tmp_path):
+    # The register has northing first for this one.
+    other = pyproj.Transformer.from_crs(UTM, "EPSG:3035", always_xy=True)
+    rows = np.column_stack(other.transform(*POINTS.T))
+    points = csv(tmp_path / "points.csv", "easting,northing", rows)
+    assert_truth(answer(flexroad("query", run, "--points", points, "--crs", "EPSG:3035")))
+
+
+def test_query_keeps_semicolons_and_decimal_commas(run, flexroad, tmp_path):
+    points = tmp_path / "points.csv"
+    lines = [f"{i};{x:.2f};{y:.2f};a, b".replace(".", ",") for i, (x, y) in enumerate(POINTS)]
+    points.write_text("\ufeffNr; Easting ;Northing;note\r\n" + "\r\n".join(lines) + "\r\n")
+    said = flexroad("query", run, "--points", points)
+    table = answer(said, sep=";", decimal=",")
+    assert_truth(table)
+    assert list(table.columns[:4]) == ["Nr", "Easting", "Northing", "note"]
+    assert said.out.splitlines()[1].startswith("0;500010,25;5600020,50;a, b;")
+
+
+def test_query_of_tabs_and_dots(run, flexroad, tmp_path):
+    points = csv(tmp_path / "points.txt", "x\ty", POINTS, "{}\t{}")
+    assert_truth(answer(flexroad("query", run, "--points", points), sep="\t"))
+
+
+def test_query_reads_standard_input(run, flexroad, tmp_path, monkeypatch):
+    text = csv(tmp_path / "points.csv", "easting,northing", POINTS).read_bytes()
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text)))
+    assert_truth(answer(flexroad("query", run, "--points", "-")))
+
+
+@pytest.mark.parametrize(("name", "crs"), [("a.gpkg", "EPSG:25833"), ("a.geojson", "EPSG:4326")])
+def test_query_of_vector_points_gives_heights_and_coordinates_of_the_run(run, flexroad, tmp_path, name, crs):
+    shapes = [MultiPoint([POINTS[0]]), Point(POINTS[1])]
+    frame = geopandas.GeoDataFrame({"tree": ["oak", "elm"]}, geometry=shapes, crs=UTM)
+    frame.to_crs(crs).to_file(tmp_path / name)
+    table = answer(flexroad("query", run, "--points", tmp_path / name))
+    assert_truth(table)
+    assert list(table.tree) == ["oak", "elm"]
+    np.testing.assert_allclose(table[["easting", "northing"]], POINTS, atol=2e-3)
+
+
+def test_query_writes_geopackage_in_crs_of_the_run(run, flexroad, tmp_path):
+    points = csv(tmp_path / "points.csv", "lon,lat,name", [*degrees()], "{:.9f},{:.9f},a")
+    with points.open("a") as file:
+        file.write(",,no place\n")
+    said = flexroad("query", run, "--points", points, "-o", tmp_path / "answer.gpkg")
+    assert said.expected(0).out == ""
+    assert "1 point lies on no finished tile" in said.err
+    table = geopandas.read_file(tmp_path / "answer.gpkg")
+    assert table.crs == UTM
+    assert_truth(table[:2])
+    np.testing.assert_allclose(table.geometry[:2].get_coordinates(), POINTS, atol=1e-3)
+    assert table.geometry.isna().tolist() == [False, False, True]
+    flexroad("query", run, "--points", points, "-o", tmp_path / "answer.csv").expected(0)
+    assert_truth(pd.read_csv(tmp_path / "answer.csv")[:2])
+
+
+def test_profile_along_points_has_distances_heights_and_grades(run, flexroad):
+    corner = [(WEST + 5, SOUTH + 5), (WEST + 5, SOUTH + 5), (WEST + 25, SOUTH + 5), (WEST + 25, SOUTH + 11.5)]
+    line = ", ".join(f"{x} {y}" for x, y in corner)
+    table = answer(flexroad("query", run, "--line", line, "--step", 4))
+    assert list(table.columns) == [
+        "distance_m", "easting", "northing", "height_m", "grade_percent",
+        "nx", "ny", "nz", "tile", "class",
+    ]  # fmt: skip
+    assert list(table.distance_m) == [0, 4, 8, 12, 16, 20, 24, 26.5]
+    assert list(table.easting - WEST) == [5, 9, 13, 17, 21, 25, 25, 25]
+    assert list(table.northing - SOUTH) == [5, 5, 5, 5, 5, 5, 9, 11.5]
+    np.testing.assert_allclose(table.height_m, ground(table.easting, table.northing), atol=2e-3)
+    # Uphill to the east, downhill to the north; at the corner the grade of the part that follows.
+    np.testing.assert_allclose(table.grade_percent, [5, 5, 5, 5, 5, -2, -2, -2], atol=1e-3)
+
+
+def test_profile_of_line_in_degrees_equals_that_of_the_run(run, flexroad):
+    line = ", ".join(f"{x:.10f} {y:.10f}" for x, y in degrees())
+    table = answer(flexroad("query", run, "--line", line, "--lonlat"))
+    length = np.hypot(*(POINTS[1] - POINTS[0]))
+    assert len(table) == int(length) + 2
+    assert table.distance_m.iloc[-1] == pytest.approx(length, abs=2e-3)
+    rise = (ground(*POINTS[1]) - ground(*POINTS[0])) / length
+    np.testing.assert_allclose(table.grade_percent, 100 * rise, atol=1e-3)
+
+
+def test_profile_of_several_lines_counts_them(run, flexroad, tmp_path):
+    east, north = LineString([(WEST, SOUTH), (WEST + 3, SOUTH)]), LineString([POINTS[0], POINTS[0] + [0, 2]])
+    touching = MultiLineString(
+        [[(WEST, SOUTH), (WEST + 2, SOUTH)], [(WEST + 2, SOUTH), (WEST + 2, SOUTH + 1)]]
+    )
+    path = tmp_path / "lines.gpkg"
+    geopandas.GeoDataFrame(geometry=[east, north, touching], crs=UTM).to_file(path)
+    table = answer(flexroad("query", run, "--line", path))
+    assert list(table.line) == [1] * 4 + [2] * 3 + [3] * 4
+    assert list(table.distance_m) == [0, 1, 2, 3, 0, 1, 2, 0, 1, 2, 3]
+    assert set(table.grade_percent.round(2)) == {5.0, -2.0}
+
+
+def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad, tmp_path):
+    points = csv(tmp_path / "points.csv", "x,y", degrees())
+    said = flexroad("query", run, "--points", points)
+    assert answer(said).height_m.isna().all()
+    assert said.err == (
+        "note: 2 points lie on no finished tile; their columns are empty; the tiles lie in "
+        "W 500000 S 5600000 E 500040 N 5600040 (EPSG:25832); longitude and latitude need --lonlat\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "message"),
+    [
+        ("a,b\n1,2\n", "", "it needs easting and northing, or x and y, or longitude and latitude"),
+        ("easting,northing\n1,2\n", "--lonlat", "it needs longitude and latitude"),
+        ("", "", "no columns of coordinates"),
+        ("x,y\n1,2\n\n3,4 m\n", "", "points.csv, line 4: y is '4 m', not a number"),
+        ("x;y\n1,5;2\n3.000,5;4\n", "", "points.csv, line 3: x is '3.000,5', not a number"),
+        ("x,y\n1,5,2,5\n", "", "points.csv, line 2: 4 values, but the header has 2"),
+        ("x,y\n1,2\n", "--crs EPSG:1", "unknown CRS 'EPSG:1'"),
+        ("x,y\n1,2\n", "--crs EPSG:25832 --lonlat", "give one of --lonlat and --crs"),
+        ("x,y\n1,2\n", "-o a.shp", "ends in .csv or .gpkg"),
+        ("x,y\n1,2\n", "--line 1", "give the points with --points FILE, or a line with --line"),
+    ],
+)
+def test_query_of_unusable_points_gives_one_error(run, flexroad, tmp_path, text, words, message):
+    points = tmp_path / "points.csv"
+    points.write_text(text)
+    said = flexroad("query", run, "--points", points, *words.split()).expected(2)
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+def test_query_of_csv_in_another_encoding_gives_one_error(run, flexroad, tmp_path):
+    points = tmp_path / "points.csv"
+    points.write_bytes("x,y,Straße\n1,2,3\n".encode("latin-1"))
+    assert "save it as CSV in UTF-8" in flexroad("query", run, "--points", points).expected(2).err
+
+
+@pytest.mark.parametrize(
+    ("option", "shapes", "crs", "words", "message"),
+    [
+        (
+            "--points",
+            [LineString([(0, 0), (1, 1)])],
+            UTM,
+            "",
+            "type LineString, not points; lines go to --line",
+        ),
+        ("--line", [Point(0, 0)], UTM, "", "type Point, not lines; points go to --points"),
+        ("--points", [Point(0, 0)], None, "", "carries no CRS; give it with --crs"),
+        ("--points", [Point(0, 0)], UTM, "--lonlat", "is in EPSG:25832, not EPSG:4326"),
+        ("--points", [Point(0, 0)], UTM, "--layer b", "no layer 'b'; it has points"),
+        ("--line", [LineString([(0, 0), (0, 0)])], UTM, "", "has no length"),
+        ("--line", [LineString([(200, 95), (201, 96)])], "EPSG:4326", "", "cannot be transformed"),
+        ("--line", [LineString([(0, 0), (9e9, 1)])], UTM, "", "at most 10000000"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:'crs' was not provided")
+def test_query_of_unusable_features_gives_one_error(
+    run, flexroad, tmp_path, option, shapes, crs, words, message
+):
+    path = tmp_path / "points.gpkg"
+    geopandas.GeoDataFrame(geometry=shapes, crs=crs).to_file(path)
+    said = flexroad("query", run, option, path, *words.split()).expected(2)
+    assert message in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_query_of_geopackage_with_layers_names_them(run, flexroad, tmp_path):
+    path = tmp_path / "points.gpkg"
+    for layer, shift in (("old", 1.0), ("new", 0.0)):
+        frame = geopandas.GeoDataFrame(geometry=[Point(*point + shift) for point in POINTS], crs=UTM)
+        frame.to_file(path, layer=layer)
+    assert "has the layers old, new; name one with --layer" in flexroad("query", run, "--points", path).err
+    assert_truth(answer(flexroad("query", run, "--points", path, "--layer", "new")))
+
+
+def test_query_of_vector_file_that_leads_elsewhere_is_refused(run, flexroad, tmp_path):
+    path = tmp_path / "points.geojson"
+    path.write_text("<OGRVRTDataSource><OGRVRTLayer name='a'/></OGRVRTDataSource>")
+    assert "is not a vector file" in flexroad("query", run, "--points", path).expected(2).err
+
+
+@pytest.mark.parametrize("line", ["1 2", "1 2, 3", "1 2; 3 4", "nowhere.gpkg"])
+def test_query_of_text_that_is_no_line_gives_one_error(run, flexroad, line):
+    said = flexroad("query", run, "--line", line).expected(2)
+    assert said.err.count("\n") == 1
