@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -194,16 +194,30 @@ def rerun(
 
 @contextlib.contextmanager
 def _locked(path: Location, create: bool = False) -> Iterator[None]:
-    """Hold the lock of a run folder; ``create`` makes a missing folder."""
+    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty."""
     from flexroad.pipeline.run.lock import run_lock
 
+    made: list[Path] = []
     try:
         if create and isinstance(path, Path):
+            made = [folder for folder in (path, *path.parents) if not folder.exists()]
             path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        _remove_empty(made)
         raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
-    with run_lock(path, lambda line: warn(line, "note")):
-        yield
+    try:
+        with run_lock(path, lambda line: warn(line, "note")):
+            yield
+    except BaseException:
+        _remove_empty(made)
+        raise
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    """Remove folders, the innermost first, up to the first one that is not empty."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def _executor(

@@ -123,6 +123,7 @@ def test_run_that_cannot_start_notifies(flexroad, nightly, survey, notification,
     assert "choose another --out or --store" in said
     # There is no summary of this run.
     assert "tiles" not in received
+    (tmp_path / "run").mkdir()
     with run_lock(tmp_path / "run"):
         flexroad(*nightly, *notification.words, expect=2)
     assert f"is in use by pid {os.getpid()}" in notification.received["text"]
@@ -133,6 +134,42 @@ def test_run_that_cannot_start_notifies(flexroad, nightly, survey, notification,
     assert "is no run" in notification.received["text"]
     flexroad("status", tmp_path / "nowhere", "--wach", expect=2)
     assert notification.received is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--catalog", "ROADLESS"], "no tile of the catalog has a road mask"),
+        (["--config", "nowhere"], "neither a file nor a shipped name"),
+        (["--set", "fit.iteration=4"], "unknown key"),
+        (["--set", "segment={method: pixels, model: nowhere.skops}"], "nowhere.skops does not exist"),
+        (["--catalog", "nowhere.json"], "nowhere.json does not exist"),
+        (["--store", "CATALOG"], "cannot write the run"),
+        (["--prometheus", "/"], "cannot write --prometheus"),
+        (["--tile", "x"], "no tile 'x'"),
+        (["--wrokers", "2"], "No such option"),
+    ],
+)
+def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_path, words, message):
+    paths = {"CATALOG": survey, "ROADLESS": survey.with_name("roadless.parquet")}
+    roadless = [
+        replace(tile, layers=tuple(layer for layer in tile.layers if "road" not in layer.name))
+        for tile in Catalog.read(survey).tiles
+    ]
+    Catalog(tuple(roadless)).write(paths["ROADLESS"])
+    words = [paths.get(word, word) for word in words]
+    new = tmp_path / "new" / "city" / "run"
+    # The last of repeated options counts.
+    assert message in flexroad(*nightly, *words, "--out", new, expect=2)
+    assert not (tmp_path / "new").exists()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    flexroad(*nightly, *words, "--out", empty / "run", expect=2)
+    assert list(empty.iterdir()) == []
+    flexroad(*nightly, *words, "--out", empty, expect=2)
+    assert empty.is_dir()
+    flexroad("rerun", new, expect=2)
+    assert not (tmp_path / "new").exists()
 
 
 def test_run_interrupted_notifies_and_failed_notification_only_warns(
