@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 TILE_ID = "arrays"
 """The tile id of data that come from no catalog."""
+WITHOUT_ROAD = (
+    "road_mask has no road cell on the grid of the dsm, so the surface is that of the terrain; "
+    "a road cell is True or not 0, for example landcover == 1"
+)
+"""Note on a mask without road cells."""
 
 
 def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, options: Options) -> TileData:
@@ -39,13 +44,14 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     -------
     TileData
         The DTM and the mask are copied where their cells coincide with those of the DSM. Otherwise they are
-        resampled (heights bilinearly, the mask to the nearest cell), with a note.
+        resampled (heights bilinearly, the mask to the nearest cell), with a note. A mask without road cells
+        gives a note, too.
 
     Raises
     ------
     TaskError
         If an array has no CRS, is in degrees or feet, is rotated, has pixels that are not square or more
-        than two dimensions; if the CRS of two arrays differ; if there are too few heights or no road cell.
+        than two dimensions; if the CRS of two arrays differ; if there are too few heights.
     """
     patches = {
         name: _patch(name, array) for name, array in (("dsm", dsm), ("dtm", dtm), ("road_mask", road_mask))
@@ -59,11 +65,7 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     _check_valid("dsm", heights["dsm"][window], options.min_valid)
     _check_valid("dtm", heights["dtm"][window], 0.0)
     road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
-    if not road[window].any():
-        raise TaskError(
-            "road_mask has no road cell on the grid of the dsm; a road cell is True or not 0, "
-            "for example landcover == 1"
-        )
+    notes += [] if road[window].any() else [WITHOUT_ROAD]
     return TileData(
         TILE_ID, grid, core, heights["dsm"], heights["dtm"], road, notes=tuple(filter(None, notes))
     )

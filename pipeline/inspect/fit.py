@@ -45,7 +45,9 @@ def fit(
         DSM, it is resampled bilinearly, with a warning.
     road_mask : xarray.DataArray, (H, W)
         Road where True or not 0, in the same CRS. If its cells do not coincide with those of the DSM, the
-        nearest cell is taken, with a warning. It replaces the configuration's ``segment``.
+        nearest cell is taken, with a warning. It replaces the configuration's ``segment``. Without any road
+        cell, also after the filter, the surface is that of the terrain, as in a run, and has the flag
+        ``no-road`` (`Surface.flags`); a mask without road cells also gives a warning.
     config : str or Path
         A shipped configuration (``production``, ``paper``) or a YAML file.
     variant : str, optional
@@ -60,7 +62,7 @@ def fit(
     ------
     TaskError
         If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if the CRS of
-        two arrays differ; if the DSM has too few heights, or the mask no road cell; if a stage fails.
+        two arrays differ; if the DSM has too few heights; if a stage fails.
     ConfigError
         If there is no such configuration or variant.
 

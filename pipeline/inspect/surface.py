@@ -17,6 +17,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import sample, types
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
+from flexroad.tasks.quality.assess import NO_ROAD
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask
 
@@ -68,10 +69,28 @@ class Surface:
         if self.road is not None and self.clusters is not None:
             given, kept = (_cut(mask, self.road).sum() for mask in (self.road.mask, self.clusters.mask))
             road = f"road: {given} cells given, {kept} kept by the filter"
+            road += f"; {', '.join(self.flags)}" if self.flags else ""
         return (
             f"<flexroad.Surface: {kind}{f', config {self.config}' if self.config else ''}>\n"
             f"{crs}, {size}, bounds {west} {south} {east} {north}\n{road}"
         )
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """``("no-road",)`` if there is no road cell after the filter, so that it is the terrain's surface.
+
+        Empty if there is one, or if the surface has no mask.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> scene = flexroad.example(size_m=60)
+        >>> flexroad.fit(scene.dsm, scene.dtm, scene.road_mask).flags
+        ()
+        """
+        if self.road is None or self.clusters is None:
+            return ()
+        return () if _cut(self.clusters.mask, self.road).any() else (NO_ROAD,)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
         """Return the height at points.

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import rioxarray
 import trimesh
 import xarray as xr
@@ -147,6 +148,34 @@ def test_fit_equals_run_over_same_rasters(tmp_path, rasters):
     assert sum(len(part.faces) for part in mesh.geometry.values()) == len(fitted.to_mesh().faces)
 
 
+def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
+    catalog = Catalog.read(write_scenes(tmp_path / "survey", 1, seed=0, size_m=60))
+    for layer in ("road_mask", "reference_road"):
+        with rasterio.open(tmp_path / "survey" / layer / "499980_5599980.tif", "r+") as file:
+            file.write(np.zeros((1, *file.shape), file.dtypes[0]))
+    run_tiles(Run.create(tmp_path / "run", load_config("nightly"), catalog), SerialExecutor())
+    run = flexroad.open_run(tmp_path / "run")
+    assert run.metrics["flags"].item() == "no-road"
+    with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is that of the terrain"):
+        fitted = flexroad.fit(rasters["dsm"], rasters["dtm"], rasters["road_mask"] * 0)
+    assert fitted.flags == ("no-road",)
+    assert "road: 0 cells given, 0 kept by the filter; no-road" in repr(fitted)
+    west, south, east, north = fitted.bounds
+    x, y = np.random.default_rng(0).uniform((west, south), (east, north), (500, 2)).T
+    np.testing.assert_allclose(fitted.height(x, y), run.height(x, y), rtol=0, atol=1e-9)
+    assert not fitted.to_mesh().face_attributes["road"].any()
+    fitted.save(tmp_path / "terrain.npz")
+    assert flexroad.open_surface(tmp_path / "terrain.npz").flags == ("no-road",)
+
+
+def test_fit_whose_road_the_filter_drops_is_flagged(scene, surface):
+    assert surface.flags == ()
+    # Less than the smallest area that the filter keeps.
+    speck = scene.road_mask & (scene.road_mask.cumsum("x").cumsum("y") <= 5)
+    assert 0 < speck.sum() <= 25
+    assert flexroad.fit(scene.dsm, scene.dtm, speck).flags == ("no-road",)
+
+
 def test_fit_with_reversed_coordinates_equals_original(scene, surface):
     reversed_scene = scene.isel(y=slice(None, None, -1), x=slice(None, None, -1)).transpose("x", "y")
     same = flexroad.fit(
@@ -205,7 +234,6 @@ def rotated(array):
         ("dsm", lambda a: a.assign_coords(x=500200 + np.arange(60.0) ** 2), "dsm has x in steps of 1 to 117"),
         ("dtm", lambda a: a.rio.write_crs(25833), "dtm is in EPSG:25833, the dsm in EPSG:25832"),
         ("dtm", lambda a: a.assign_coords(x=a.x + 5000), "dtm .* does not overlap the dsm"),
-        ("road_mask", lambda a: a & False, "road_mask has no road cell on the grid of the dsm"),
         ("dsm", lambda a: a.where(a.x < 500206), "dsm has 10.0% valid cells, below 25%"),
         ("dtm", lambda a: a * np.nan, "dtm has only nodata"),
         ("dsm", lambda a: a.to_dataset(), "dsm is a Dataset; give an xarray.DataArray"),
