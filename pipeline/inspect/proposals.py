@@ -85,9 +85,9 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
     from flexroad.catalog.sources import nrw
 
     rasters = [download for layer in LAYERS for download in by_kind[layer]]
-    systems = dict.fromkeys(download.crs for download in rasters if download.kind in ("dsm", "dtm"))
+    systems = dict.fromkeys(download.crs for download in by_kind["dsm"] or by_kind["dtm"])
     for number, crs in enumerate(systems):
-        chosen = [download for download in rasters if download.crs == crs]
+        chosen = _for_system(rasters, crs)
         output = Path(f"{_title(folder)}{number + 1 if number else ''}.parquet")
         layers = {download.kind for download in chosen}
         lacking = [f"--{layer} FILES" for layer in ("dsm", "dtm") if layer not in layers]
@@ -103,6 +103,7 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
                 lacking.append(f"--{layer.replace('_', '-')} FILES: no one pattern has just these files")
         roads = [] if "road_mask" in layers else _roads(by_kind)
         words += roads
+        words += ["--reproject"] if any(download.crs != crs for download in chosen) else []
         has = "road_mask" if "road_mask" in layers else "roads" if roads else ""
         if roads and by_kind["roads"][0].question:
             lacking.append(LAYER)
@@ -113,6 +114,14 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
         if crs is None:
             lacking.append("--crs")
         yield Proposal(shlex.join([*words, "-o", str(output)]), output, has, _listed(lacking))
+
+
+def _for_system(rasters: Sequence[Download], crs: str | None) -> list[Download]:
+    """Return the rasters in a CRS, and in others those of layers that it lacks: they can be reprojected."""
+    own = [download for download in rasters if download.crs == crs]
+    layers = {download.kind for download in own}
+    others = [download for download in rasters if download.kind not in layers and download.crs and crs]
+    return own + others
 
 
 def _listed(lacking: Sequence[str]) -> str:
