@@ -66,6 +66,7 @@ class _Asset(_Schema):
     extents: Any = Field(None, alias="flexroad:extents")
     reproject: bool | None = Field(None, alias="flexroad:reproject")
     height_unit: Text | None = Field(None, alias="flexroad:height_unit")
+    sublayer: Text | None = Field(None, alias="flexroad:sublayer")
 
 
 class _Assets(_Schema):
@@ -206,7 +207,8 @@ class TileReader:
                 _check_crs(system, "flexroad:crs")
             files = self._files(names)
             extents = _extents(asset, len(names))
-            return Layer(name, files, tuple(values), system, extents, *_conversion(asset))
+            reproject, unit = _conversion(asset)
+            return Layer(name, files, tuple(values), system, extents, reproject, _sublayer(asset), unit)
         except CatalogError as error:
             raise CatalogError(f"assets.{name}.{error}") from error
 
@@ -354,6 +356,14 @@ def _conversion(asset: dict[str, Any]) -> tuple[bool, str | None]:
     if unit is not None and unit not in HEIGHT_UNITS:
         raise CatalogError(f"flexroad:height_unit: {shown(unit)} is not one of {', '.join(HEIGHT_UNITS)}")
     return bool(reproject), unit
+
+
+def _sublayer(asset: dict[str, Any]) -> str | None:
+    # Older catalogs do not have this field.
+    name = asset.get("flexroad:sublayer")
+    if name is not None and not _is_text(name):
+        raise TypeError
+    return name
 
 
 def _is_text(value: Any) -> bool:

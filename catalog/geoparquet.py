@@ -28,12 +28,8 @@ class Unreadable:
         return f"<{self.reason}>"
 
 
-FIELDS = (
-    ".flexroad:files",
-    ".flexroad:values",
-    ".flexroad:crs",
-    ".flexroad:reproject",
-    ".flexroad:height_unit",
+FIELDS = tuple(
+    f".flexroad:{name}" for name in ("files", "values", "crs", "reproject", "sublayer", "height_unit")
 )
 """Fields of an asset that make a layer, without its extents."""
 

@@ -255,6 +255,7 @@ def _asset(layer: Layer, root: str) -> Item:
         "flexroad:extents": [edge for extent in layer.extents for edge in extent] or None,
         "flexroad:reproject": layer.reproject,
         "flexroad:height_unit": layer.height_unit,
+        "flexroad:sublayer": layer.sublayer,
     }
 
 
@@ -294,7 +295,9 @@ def _to_parquet(items: list[Item]) -> bytes:
 def _full_item() -> Item:
     """Return an item with all layers and fields."""
     extents = ((0.0, 0.0, 1.0, 1.0),)
-    layers = tuple(Layer(name, ("file",), (1,), "EPSG:25832", extents, True, "foot") for name in LAYERS)
+    layers = tuple(
+        Layer(name, ("file",), (1,), "EPSG:25832", extents, True, "roads", "foot") for name in LAYERS
+    )
     grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 1, 1)
     whole = item(Tile("", grid, layers, "", datetime(2000, 1, 1, tzinfo=UTC)))
     whole["properties"] |= {"proj:wkt2": "", "flexroad:fault": ""}

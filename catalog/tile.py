@@ -47,6 +47,8 @@ class Layer:
     they are unknown (published datasets, older catalogs): each file may then lie anywhere."""
     reproject: bool = False
     """Whether rasters in another CRS than the tile's are warped when they are read, or are an error."""
+    sublayer: str | None = None
+    """Layer of vector files that have several; None: their only one, or the road layers of the OSM format."""
     height_unit: str | None = None
     """Unit of heights, a key of `to_metres.HEIGHT_UNITS`, of files that declare none; None: metres or, of a
     file that is reprojected, the unit of its eastings."""

@@ -187,7 +187,9 @@ def _source(tile: Tile, name: str) -> Source | None:
     needed = (layer.reaching(tile.grid.bounds) or layer).files
     paths = zip(layer.files, tile.paths(layer), strict=True)
     files = tuple(path for file, path in paths if file in needed or stat(path))
-    return Source(name, files, layer.crs, allowed=tile.allowed, reproject=layer.reproject)
+    return Source(
+        name, files, layer.crs, allowed=tile.allowed, reproject=layer.reproject, sublayer=layer.sublayer
+    )
 
 
 def _optional(source: Source | None) -> Source | None:

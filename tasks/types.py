@@ -32,6 +32,8 @@ class Source:
     """Where the files that a VRT names may lie; None: anywhere on disk."""
     reproject: bool = False
     """Whether rasters in another CRS than the tile's are warped; else they are an error."""
+    sublayer: str | None = None
+    """Layer of vector files that have several."""
 
 
 @dataclass(frozen=True, eq=False)

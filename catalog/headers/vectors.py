@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
@@ -16,7 +16,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.text import reason
+from flexroad.catalog.text import count, reason
 from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 MARGIN_M = 1.0
@@ -35,9 +35,11 @@ class VectorFile:
     """False if the file has no CRS and the caller's is used."""
     extents: tuple[tuple[str, Bounds], ...] | None
     """CRS and bounds of each layer with features, or None if the format does not store them."""
+    sublayer: str | None = None
+    """The layer of the roads, if it was chosen."""
 
 
-def find(root: Path, given: str, crs: str | None) -> list[VectorFile]:
+def find(root: Path, given: str, crs: str | None, sublayer: str | None = None) -> list[VectorFile]:
     """Open vector files.
 
     Parameters
@@ -48,29 +50,52 @@ def find(root: Path, given: str, crs: str | None) -> list[VectorFile]:
         A file, or a glob pattern relative to ``root``.
     crs : str, optional
         CRS of files without one.
+    sublayer : str, optional
+        Layer of files with several.
 
     Raises
     ------
     CatalogError
-        If there is no such file, or a file is not a vector file or has no CRS.
+        If there is no such file, a file is not a vector file or has no CRS, or the layer is not in it, or it
+        has several and ``sublayer`` is None.
     """
     paths = [Path(given)] if Path(given).is_file() else matching(root.resolve(), "roads", given)
-    return [opened(path, crs) for path in paths]
+    return [opened(path, crs, sublayer) for path in paths]
 
 
-def opened(path: Path, crs: str | None) -> VectorFile:
-    """Open one vector file.
+def layers(path: Path) -> dict[str, str]:
+    """Return the layers with geometries of a vector file, each with its type and number of features.
 
     Raises
     ------
-    CatalogError
-        If it is not a vector file, or has no CRS and ``crs`` is None.
+    Refused, or one of `ERRORS`
+        If the file cannot be read as vectors.
     """
+    import pyogrio
+
+    file = vector_name(path)
+    kinds = {name: kind for name, kind in pyogrio.list_layers(file) if kind is not None}
+    counts = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
+    # OSM files do not know their number of features.
+    return {
+        name: f"{kind}, {count(counts[name], 'feature')}" if counts[name] >= 0 else kind
+        for name, kind in kinds.items()
+    }
+
+
+def listed(found: Mapping[str, str]) -> str:
+    """Return the layers of a vector file for a message: ``roads (LineString, 12 features), ...``."""
+    return ", ".join(f"{name} ({about})" for name, about in found.items())
+
+
+def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFile:
+    """Open one vector file; see `find`."""
     import pyogrio
 
     try:
         file = vector_name(path)
-        names = [name for name, kind in pyogrio.list_layers(file) if kind is not None]
+        found = layers(path)
+        names = [name for name in found if sublayer in (None, name)]
         infos = [pyogrio.read_info(file, layer=name) for name in names]
         # The bounds of an OSM file are known only after reading all of it.
         no_bounds = any(info["driver"] == "OSM" for info in infos)
@@ -80,6 +105,12 @@ def opened(path: Path, crs: str | None) -> VectorFile:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:
         raise CatalogError(f"--roads {path} is not a vector file: {reason(error)}") from error
+    if found and not names:
+        raise CatalogError(f"--roads {path} has no layer {sublayer!r}; it has {listed(found)}")
+    if len(names) > 1 and not no_bounds:
+        raise CatalogError(
+            f"--roads {path} has {count(len(names), 'layer')}: {listed(found)}; name one with --roads-layer"
+        )
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
     has_crs = all(info["crs"] for info in infos)
@@ -93,7 +124,7 @@ def opened(path: Path, crs: str | None) -> VectorFile:
         for info in infos
         if info["total_bounds"] is not None
     )
-    return VectorFile(path.resolve(), has_crs, None if no_bounds else extents)
+    return VectorFile(path.resolve(), has_crs, None if no_bounds else extents, sublayer)
 
 
 def with_roads(tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None) -> tuple[Tile, ...]:
@@ -153,5 +184,6 @@ def _with_layer(
         file.path.relative_to(root).as_posix() if file.path.is_relative_to(root) else str(file.path)
         for file in files
     )
-    roads = Layer("roads", names, crs=crs, extents=tuple(map(tuple, extents.tolist())))
+    bounds = tuple(map(tuple, extents.tolist()))
+    roads = Layer("roads", names, crs=crs, extents=bounds, sublayer=files[0].sublayer)
     return replace(tile, layers=(*tile.layers, roads))

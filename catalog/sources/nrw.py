@@ -71,6 +71,7 @@ def index(
     derived: Path | None = None,
     roads: str | None = None,
     allow: Sequence[str] = (),
+    roads_layer: str | None = None,
     reproject: bool = False,
 ) -> TilingResult:
     """Cut the downloads below a folder into tiles; where years overlap, the newest one is used.
@@ -96,6 +97,8 @@ def index(
         Vector files of roads: a file, or a glob pattern relative to ``root``.
     allow : sequence of str
         Folders besides ``root`` that the files named by a VRT of the mask may lie below.
+    roads_layer : str, optional
+        Layer of the vector files, if they have several.
     reproject : bool
         Warp a mask in another CRS when it is read.
 
@@ -136,7 +139,7 @@ def index(
         dataset=DATASET,
         conversion=Conversion(reproject),
     )
-    vectors = find(root, roads, CRS) if roads is not None else []
+    vectors = find(root, roads, CRS, roads_layer) if roads is not None else []
     return replace(
         indexed,
         tiles=with_roads(indexed.tiles, vectors, CRS),

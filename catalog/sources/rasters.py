@@ -25,6 +25,7 @@ def index(
     crs: str | None = None,
     min_cover: float = MIN_COVER,
     allow: Sequence[str] = (),
+    roads_layer: str | None = None,
     conversion: Conversion = NO_CONVERSION,
 ) -> TilingResult:
     """Cut the area that the DSM files cover into tiles.
@@ -49,6 +50,8 @@ def index(
         Tiles with a DSM height in less than this share (0 to 1) of their cells are left out.
     allow : sequence of str
         Folders besides ``root`` that the files named by a VRT may lie below.
+    roads_layer : str, optional
+        Layer of the vector files, if they have several.
     conversion : Conversion
         Whether and where to files in other CRSs are reprojected.
 
@@ -76,7 +79,7 @@ def index(
         min_cover=min_cover,
         conversion=conversion,
     )
-    roads = find(root, patterns["roads"], crs) if "roads" in patterns else []
+    roads = find(root, patterns["roads"], crs, roads_layer) if "roads" in patterns else []
     return replace(indexed, tiles=with_roads(indexed.tiles, roads, crs), notes=(*notes, *indexed.notes))
 
 

@@ -42,6 +42,7 @@ RoadValue = Annotated[
     list[int] | None, _files("Values of the mask that mean road; default: all except 0.", "N")
 ]
 Roads = Annotated[str | None, _files("Vector files of roads: a file, or a pattern relative to ROOT.")]
+RoadsLayer = Annotated[str | None, _files("Layer of the roads, if --roads has several.", "NAME")]
 Crs = Annotated[str | None, _files("CRS of files without one: EPSG:25832.", "CRS")]
 Reproject = Annotated[
     bool,
@@ -85,6 +86,7 @@ def catalog_rasters(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
+    roads_layer: RoadsLayer = None,
     reference: Annotated[str | None, _files("Reference heights, for the evaluation.")] = None,
     reference_road: Annotated[str | None, _files("Reference road mask, for the evaluation.")] = None,
     crs: Crs = None,
@@ -131,6 +133,7 @@ def catalog_rasters(
         crs=crs,
         min_cover=min_cover,
         allow=allow or (),
+        roads_layer=roads_layer,
         conversion=Conversion(reproject, to_crs, height_unit),
     )
     _write_catalog(result, output)
@@ -146,6 +149,7 @@ def catalog_nrw(
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
     roads: Roads = None,
+    roads_layer: RoadsLayer = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
     date: Date = None,
@@ -168,6 +172,7 @@ def catalog_nrw(
         derived=output.parent / f"{output.stem}_bridges",
         roads=roads,
         allow=allow or (),
+        roads_layer=roads_layer,
         reproject=reproject,
     )
     _write_catalog(result, output)

@@ -88,6 +88,7 @@ class SourceFiles:
 def _entry(layer: Layer, files: list[File]) -> Entry:
     # Only where they are set, so that older fingerprints stay valid.
     how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject or layer.height_unit else []
+    how += [["sublayer", layer.sublayer]] if layer.sublayer else []
     return [layer.name, files, list(layer.values), layer.crs, *how]
 
 

@@ -186,16 +186,15 @@ def _cloud(path: Path) -> Download:
 
 
 def _vectors(path: Path) -> Download:
-    import pyogrio
-
-    from flexroad.catalog.headers.open_vector import vector_name
+    from flexroad.catalog.headers.vectors import layers as layers_of
+    from flexroad.catalog.headers.vectors import listed
 
     try:
-        layers = [f"{name} ({kind})" for name, kind in pyogrio.list_layers(vector_name(path)) if kind]
+        layers = layers_of(path)
     except (RuntimeError, ValueError, OSError) as error:
         return Download(path, "vector", question=f"it cannot be read as vectors: {error}")
-    question = "which layer are the roads (--roads-layer, segment.layer)?" if len(layers) > 1 else ""
+    question = "which layer are the roads (--roads-layer)?" if len(layers) > 1 else ""
     if not any(re.search(ROADS, name.lower()) for name in (path.stem, *layers)):
         question = "are these roads? If so, give it with --roads"
     kind = "vector" if "are these roads" in question else "roads"
-    return Download(path, kind, ", ".join(layers), question=question)
+    return Download(path, kind, listed(layers), question=question)

@@ -14,7 +14,7 @@ from flexroad.pipeline.inspect.downloads import Download
 
 LAYERS = ("dsm", "dtm", "dop", "road_mask")
 """Layers that rasters are given for."""
-LAYER = "the layer of the roads (--roads-layer of `prepare`, segment.layer in a configuration)"
+LAYER = "--roads-layer with the layer of the roads"
 """What to add for a vector file of several layers."""
 
 

@@ -17,7 +17,8 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.open_vector import vector_name
-from flexroad.catalog.headers.vectors import VectorFile, opened
+from flexroad.catalog.headers.vectors import VectorFile, layers, listed, opened
+from flexroad.catalog.text import count
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
@@ -71,23 +72,23 @@ def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
     mask = burn(common.roads, common.roads_layer, common.roads_where, writer.grid)
     if mask is not None:
         writer.write("road_mask", writer.grid, mask)
-    vectors = _vectors(common.roads)
+    vectors = _vectors(common.roads, common.roads_layer)
     if vectors is not None:
         writer.attach_roads(vectors, *([] if mask is not None else [_lines_note(common)]))
     return mask is not None
 
 
-def _vectors(path: Path) -> VectorFile | None:
+def _vectors(path: Path, layer: str | None) -> VectorFile | None:
     """Return the header of a vector file, or None if the file is not a vector file."""
     try:
-        return opened(path, None)
+        return opened(path, None, layer)
     except CatalogError:
         return None
 
 
 def _lines_note(common: PrepareOptions) -> str:
-    selection = {"layer": common.roads_layer, "where": common.roads_where}
-    chosen = "".join(f", {name}: {json.dumps(text)}" for name, text in selection.items() if text)
+    # The catalog has the layer.
+    chosen = f", where: {json.dumps(common.roads_where)}" if common.roads_where else ""
     return (
         f"{common.roads} has lines, so no road mask is made; run with a configuration that has "
         f"segment: {{method: vector{chosen}}}"
@@ -195,23 +196,26 @@ def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> A
 
 def _osm(path: Path, layer: str | None) -> bool:
     """Return whether a file is OSM's own format: mostly lines, and slow to read as a whole."""
-    vectors = _vectors(path)
+    vectors = _vectors(path, layer)
     return vectors is not None and vectors.extents is None and layer is None
 
 
 def _read(path: Path, layer: str | None, where: str | None, rows: int | None = None) -> Any:
     """Return the features of a layer; ``rows`` limits their number."""
     import geopandas
-    from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError
 
     try:
         file = vector_name(path)
-        names = list(list_layers(file)[:, 0])
+        found = layers(path)
+        names = list(found)
         if layer is None and len(names) > 1:
-            raise ConfigError(f"{path} has several layers: {', '.join(names)}; select one with --roads-layer")
+            raise ConfigError(
+                f"--roads {path} has {count(len(names), 'layer')}: {listed(found)}; "
+                "name one with --roads-layer"
+            )
         if layer is not None and layer not in names:
-            raise ConfigError(f"{path} has no layer {layer!r}; its layers: {', '.join(names)}")
+            raise ConfigError(f"--roads {path} has no layer {layer!r}; it has {listed(found)}")
         features = geopandas.read_file(file, layer=layer or names[0], where=where, rows=rows)
     except (DataSourceError, DataLayerError, ValueError, OSError) as error:
         raise ConfigError(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,9 +26,10 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.vectors import listed
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.catalog.storage.scratch import ScratchFolder
-from flexroad.catalog.text import reason
+from flexroad.catalog.text import count, reason
 from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools
@@ -135,12 +136,26 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
         spatial = [name for name, kind in kinds.items() if kind is not None]
         names = [request.layer] if request.layer else list(OSM) if set(OSM) <= set(spatial) else spatial
         if request.layer and request.layer not in kinds:
-            raise _error(request, f"has no layer {request.layer!r}; there are {', '.join(kinds)}")
+            raise _error(request, f"has no layer {request.layer!r}; it has {_listed(file, kinds)}")
         if not names or (len(names) > 1 and names != list(OSM)):
-            raise _error(request, f"has the layers {', '.join(kinds)}; name one with segment.layer")
+            raise _error(
+                request,
+                f"has {count(len(kinds), 'layer')}: {_listed(file, kinds)}; make the catalog with "
+                "--roads-layer, or name one with segment.layer",
+            )
         return tuple(_described(request, name, pyogrio.read_info(file, layer=name)) for name in names)
     except ERRORS as error:
         raise _error(request, f"cannot be read as vectors: {reason(error)}") from error
+
+
+def _listed(file: str, kinds: Mapping[str, str | None]) -> str:
+    """Return the layers of an opened file for a message, with type and number of features."""
+    import pyogrio
+
+    numbers = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
+    return listed(
+        {name: f"{kinds[name] or 'no geometry'}, {count(n, 'feature')}" for name, n in numbers.items()}
+    )
 
 
 def _file(request: Query, version: FileStat) -> str:

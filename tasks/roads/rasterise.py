@@ -120,7 +120,10 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     columns = _columns(options)
     parts = [
         _from_table(
-            read_near(Query(path, options.layer, options.where, columns, source.crs, grid.crs), bounds),
+            read_near(
+                Query(path, options.layer or source.sublayer, options.where, columns, source.crs, grid.crs),
+                bounds,
+            ),
             options,
         )
         for path in source.paths

@@ -87,6 +87,24 @@ def test_roads_of_all_tiles_have_the_crs_of_files_without_one(survey):
     assert [tile.layer("roads").crs for tile in tiles] == ["EPSG:25832"] * 3
 
 
+def test_file_of_several_layers_needs_the_choice_of_one(survey):
+    write_roads(
+        survey / "r.gpkg", [LineString([(295_500, 5_629_300), (295_600, 5_629_300)])] * 3, layer="ways"
+    )
+    write_roads(survey / "r.gpkg", [box(296_000, 5_629_250, 296_010, 5_629_260)], layer="plots")
+    both = r"ways \(LineString, 3 features\), plots \(Polygon, 1 feature\)"
+    with pytest.raises(CatalogError, match=rf"r.gpkg has 2 layers: {both}; name one with --roads-layer$"):
+        indexed(survey, "r.gpkg")
+    patterns = {"dsm": "dsm.tif", "roads": "r.gpkg"}
+    with pytest.raises(CatalogError, match=rf"r.gpkg has no layer 'roads'; it has {both}$"):
+        rasters.index(survey, patterns, roads_layer="roads")
+    result = rasters.index(survey, patterns, roads_layer="ways")
+    assert named(result.tiles) == [["r.gpkg"], ["r.gpkg"], []]
+    for name in ("c.parquet", "c.json"):
+        Catalog(result.tiles).write(survey / name)
+        assert Catalog.read(survey / name).tiles[0].layer("roads").sublayer == "ways"
+
+
 def test_nrw_index_accepts_roads(tmp_path):
     for product in ("dom1", "dgm1"):
         write(tmp_path / f"{product}_32_356_5699_1_nw_2020.tif", HEIGHTS[:, :250], 356_000, 5_700_000)

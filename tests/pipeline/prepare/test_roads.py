@@ -77,6 +77,11 @@ def test_burn_raster_larger_than_memory_raises_before_it_is_read(tmp_path, monke
         burn(path, None, None, GRID)
 
 
+LAYERS = (
+    r"has 2 layers: ways \(LineString, 1 feature\), areas \(Polygon, 1 feature\); name one with --roads-layer"
+)
+
+
 def published(folder, roads, **options):
     """The only tile of a flat area with these roads, and the notes."""
     with RasterWriter(folder, GRID, None, {}) as writer:
@@ -96,7 +101,12 @@ def test_add_roads_lines_are_in_catalog_without_mask(tmp_path):
     tile, notes = published(tmp_path / "out", roads, roads_layer="ways", roads_where="kind = 'road'")
     assert tile.layer("road_mask") is None
     assert tile.paths(tile.layer("roads")) == (roads,)
-    assert 'segment: {method: vector, layer: "ways", where: "kind = \'road\'"}' in notes[0]
+    assert tile.layer("roads").sublayer == "ways"
+    assert "segment: {method: vector, where: \"kind = 'road'\"}" in notes[0]
+    with pytest.raises(ConfigError, match=LAYERS):
+        published(tmp_path / "again", roads)
+    with pytest.raises(ConfigError, match="has no layer 'lanes'; it has ways"):
+        published(tmp_path / "again", roads, roads_layer="lanes")
 
 
 def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):

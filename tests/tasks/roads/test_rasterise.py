@@ -1,5 +1,6 @@
 """Selection of road features, conversion to areas, and reading of vector files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,11 +136,16 @@ def test_joint_of_bridges_only_is_bridge(tmp_path):
 def test_layer_and_where_select_features(tmp_path):
     path = strips(tmp_path, "class", ["lane", "yard"])
     write(path, [WEST_EAST], layer="more", width=[20])
-    with pytest.raises(TaskError, match="has the layers r, more; name one with segment.layer"):
+    with pytest.raises(
+        TaskError,
+        match=r"has 2 layers: r \(LineString, 2 features\), more \(LineString, 1 feature\); .* segment.layer",
+    ):
         area(path)
     assert area(path, layer="r") == pytest.approx(2 * 160)
     assert area(path, layer="r", where="class = 'yard'") == pytest.approx(160)
     assert area(path, layer="more") == pytest.approx(80 * 20)
+    chosen = replace(tile(path).roads, sublayer="more")
+    assert shapely.area(roads(chosen, GRID, Options()).areas).sum() == pytest.approx(80 * 20)
 
 
 # --- OSM's own format ---------------------------------------------------------------------------------
