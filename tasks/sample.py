@@ -7,7 +7,8 @@ The lattices are anchored at the south-west corner of the domain: the hull of th
 the tile has neither frame nor halo, else the core's bounds, so that neighbouring tiles meet. With a frame,
 the points on the border and their heights are those of the neighbours too: the meshes join without a gap.
 
-A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`).
+A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
+roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.lines import apart_from, divided, ends_at_border, points_and_segments
+from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
-from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
+from flexroad.tasks.meshing.triangulate import Faces, constrained
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,
@@ -101,8 +103,7 @@ def sample(
         west, south, east, north = (round(edge, DECIMALS) for edge in local)
         local = west, south, east, north
     if options.method == "dynamic":
-        points, faces = _dynamic(surface, road, mask, local, options, frame)
-        return _mesh(points, faces, road, mask)
+        return _dynamic(surface, road, mask, local, options, frame)
     step = options.road_m if options.method == "uniform" else np.inf
     points, faces = _regular(surface, origin, local, step, frame)
     inside = np.ones(len(faces), np.bool_)
@@ -159,31 +160,32 @@ def _regular(
 
 def _dynamic(
     surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
-) -> tuple[Floats, Faces]:
-    """Return road, terrain and border points, by northing, then easting, and the faces within the survey."""
-    free = np.concatenate(
-        [
-            _lattice(surface, road, mask, local, options.road_m),
-            _lattice(surface, road, ~mask, local, options.terrain_m),
-        ]
-    )
-    limit = _limit(road, local, frame)
+) -> Mesh:
+    """Return the mesh of road, terrain and border points, with the limit of the survey and roads as edges."""
+    fine = _lattice(surface, road, mask, local, options.road_m)
+    coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
+    limit, outline = _limit(road, local, frame), None
     lines = [] if limit is None else [_divided(limit, road, mask, options)]
+    if road.areas is not None and options.mask == "raw":
+        outline = road_outline(road.areas, local, options.road_m)
+        lines.append(outline.lines)
+        fine = fine[outline.contains(fine)]
+    free = np.concatenate([fine, coarse])
     if frame:
         free = free[~on_border(free, local)]
         border = _shared_border(surface, road.core, local, options, frame)
     else:
         border = _border(surface, road.core.origin, local, options, lines)
-    if limit is None:
-        points, _ = _without_duplicates(np.concatenate([free, border]))
-        return points, delaunay(points)
+    free = free[apart_from(free, lines, options.road_m / 2)]
+    if limit:
+        free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     z = surface.height(*(plan + road.core.origin).T)
-    free = free[limit.covers(free) & apart_from(free, lines, options.road_m / 2)]
-    every = np.concatenate([free, border, np.column_stack([plan, z])])
-    points, number = _without_duplicates(every)
+    points, number = _without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
     faces = constrained(points, number[len(free) + len(border) + segments])
-    return points, faces[limit.covers(points[faces].mean(axis=1))]
+    if limit:
+        faces = faces[limit.covers(points[faces].mean(axis=1))]
+    return _mesh(points, faces, road, mask, outline)
 
 
 def _without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
@@ -261,18 +263,21 @@ def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options
     return np.column_stack([plan, z])
 
 
-def _mesh(points: Floats, faces: NDArray[np.int32], road: RoadMask, mask: Bools) -> Mesh:
+def _mesh(
+    points: Floats, faces: Faces, road: RoadMask, mask: Bools, outline: RoadOutline | None = None
+) -> Mesh:
     """Return the mesh of the faces that have heights, without unused vertices."""
     east, north = road.core.origin
-    x, y, z = points.T
-    faces = faces[np.isfinite(z)[faces].all(axis=1)]
+    faces = faces[np.isfinite(points[:, 2])[faces].all(axis=1)]
     if not len(faces):
         raise TaskError("the surface has no height where the tile has data; check the layers of the tile")
-    cells = road.grid.cells(x[faces].mean(axis=1) + east, y[faces].mean(axis=1) + north)
+    middles = points[faces].mean(axis=1)
+    cells = road.grid.cells(middles[:, 0] + east, middles[:, 1] + north)
     used = np.zeros(len(points), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     vertices = points[used]
     datum = float(np.floor(vertices[:, 2].min()))
     vertices[:, 2] -= datum
-    return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], mask[cells])
+    is_road = outline.contains(middles) if outline else mask[cells]
+    return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], is_road)

@@ -82,6 +82,9 @@ class RoadMask:
     """Probability of road, ``(H, W)``, 0 to 1, or None if the method gives none."""
     bridge: Bools | None = None
     """Cells of the mask that lie on bridges, ``(H, W)``, or None if the method does not detect bridges."""
+    areas: NDArray[np.uint8] | None = None
+    """The road as polygons (WKB of `tasks.meshing.road_outline.encoded`), of which the mask has the cells.
+    None if there are none, or if the mask is not that of polygons."""
     notes: tuple[str, ...] = ()
     """Warnings about the mask (such as a photo shifted against the heights), one line each."""
 
@@ -136,7 +139,8 @@ class Mesh:
     faces: NDArray[np.int32]
     """``(F, 3)``, indices of vertices."""
     road: Bools
-    """``(F,)``, True where the cell under the face's centroid is road by the mask used for sampling."""
+    """``(F,)``, True where the cell under the face's centroid is road by the mask used for sampling, or where
+    the centroid is in the road's polygons, if the mesh has their outline."""
 
 
 @dataclass(frozen=True)

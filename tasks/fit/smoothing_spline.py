@@ -132,6 +132,7 @@ def edge(
     ends : tuple of Corner
         The corners at the western and eastern, or the southern and northern end; their points are held.
     """
+    from flexroad.tasks.meshing.road_outline import crossings
     from flexroad.tasks.spline.frame import Edge, rounded
 
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
@@ -157,6 +158,7 @@ def edge(
         road=road.mask[second].ravel()[order],
         kept=clusters.mask[second].ravel()[order],
         outside=outside,
+        crossings=crossings(road.areas, border),
     )
 
 

@@ -53,6 +53,8 @@ def apart_from(points: Floats, lines: Sequence[NDArray[np.object_]], distance_m:
     """Return which points, ``(n, 2 or more)``, are not within a distance (m) of the lines, ``(n,)``."""
     import shapely
 
+    if not lines:
+        return np.ones(len(points), np.bool_)
     every = shapely.multilinestrings(np.concatenate(lines))
     shapely.prepare(every)
     return np.asarray(~shapely.dwithin(every, shapely.points(points[:, :2]), distance_m))
@@ -75,6 +77,8 @@ def points_and_segments(
     same_m : float
         Largest distance of such a vertex (m).
     """
+    if not lines:
+        return np.empty((0, 2)), np.empty((0, 2), np.intp)
     segments = _segments(_noded(lines))
     points, number = np.unique(segments.reshape(-1, 2), axis=0, return_inverse=True)
     _, at_border = _moved(points, local)

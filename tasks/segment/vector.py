@@ -7,12 +7,13 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean
 from flexroad.tasks.types import RoadMask, TileData
 
-VERSION = 1
+VERSION = 2
 READS = ("roads",)
 NEEDS = ("roads",)
 
@@ -22,6 +23,11 @@ class Options(rasterise.Options):
 
     method: Literal["vector"] = "vector"
     cleanup: Cleanup = Field(NOTHING, description="cleanup of the mask; none by default")
+    outlines: bool = Field(
+        True,
+        description="meshes have the outlines of the areas as edges, instead of steps from cell to cell; "
+        "without cleanup, and with sample: {method: dynamic, mask: raw}",
+    )
 
 
 def segment(data: TileData, options: Options) -> RoadMask:
@@ -47,11 +53,14 @@ def segment(data: TileData, options: Options) -> RoadMask:
             f"segment: no road of {files} lies on this tile; if there are roads, check segment.layer, "
             "segment.where and segment.left_out",
         )
+    # Cleanup changes cells, which have no outline.
+    outlines = options.outlines and options.cleanup == NOTHING
     return RoadMask(
         grid=data.grid,
         core=data.core,
         mask=mask,
         outside=beyond_extent(data),
         bridge=rasterise.cells(roads.areas[roads.bridge], data.grid) & mask,
+        areas=encoded(roads.areas, data.core) if outlines else None,
         notes=notes,
     )

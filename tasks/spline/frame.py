@@ -43,6 +43,10 @@ class Edge:
     """Whether the cells along the edge lie beyond the survey, ``(2, cells)``: those in the north or west of
     it, and those in the south or east. The cells at its ends are as its corners say, for both edges there."""
 
+    crossings: Floats
+    """Where the outline of roads from vectors crosses the edge, ``(n,)``: ascending, m from the start. Empty
+    if the roads are cells."""
+
     @property
     def inside(self) -> Bools:
         """Whether the cells on both sides lie within the survey."""

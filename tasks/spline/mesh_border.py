@@ -45,7 +45,8 @@ def border_points(
 ) -> Floats:
     """Return the vertices on the border of a tile, ``(n, 2)``; corners are in it twice.
 
-    Among them are the places where the meshes of the tile or its neighbour end with the survey.
+    Among them are the places where the meshes of the tile or its neighbour end with the survey, and where the
+    outline of a road crosses the border.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ def border_points(
         Distances of possible vertices from the start of an edge, along easting and along northing (m): on the
         road and elsewhere. Both have the edge's two ends.
     raw : bool
-        Whether the raw road mask counts, instead of the filtered one.
+        Whether the raw road mask counts, with its outlines, instead of the filtered one.
     apart_m : float
         Other vertices are left out within this distance of such a place (m).
     """
@@ -73,7 +74,9 @@ def border_points(
         start, stop = local[axis], local[axis + 2]
         ends = coarse[axis][[0, -1]]
         marks = np.round(edge.limits * cell, DECIMALS)
-        marks = marks[apart(marks, ends, SAME_M)]
+        if raw:
+            marks = np.concatenate([marks, edge.crossings[apart(edge.crossings, marks, SAME_M)]])
+        marks = _spaced(marks[apart(marks, ends, SAME_M)])
         regular = np.concatenate(chosen)
         along = np.unique(np.concatenate([regular[apart(regular, marks, apart_m)], marks, ends]))
         along = np.where(along == coarse[axis][-1], stop, start + along)
@@ -86,6 +89,12 @@ def apart(positions: Floats, others: Floats, distance_m: float) -> Bools:
     """Return which positions on a line, ``(n,)``, have a distance (m) from all others, ``(m,)``."""
     away = np.abs(positions[:, None] - others).min(axis=1, initial=np.inf)
     return np.asarray(away >= distance_m)
+
+
+def _spaced(positions: Floats) -> Floats:
+    """Return ascending positions on a line, without those within `SAME_M` of the one before."""
+    ordered = np.sort(positions)
+    return ordered[np.diff(ordered, prepend=-np.inf) >= SAME_M]
 
 
 def on_border(points: Floats, local: Bounds) -> Bools:

@@ -20,7 +20,9 @@ WEST, SOUTH = 295500.0, 5629250.0
 
 def edge(rng, cells, share, inside=True):
     road = np.repeat(rng.random(cells // 5 + 1) < share, 5)[:cells]
-    return Edge(np.zeros((3, 0)), road, road & (rng.random(cells) < 0.8), np.full((2, cells), not inside))
+    return Edge(
+        np.zeros((3, 0)), road, road & (rng.random(cells) < 0.8), np.full((2, cells), not inside), np.empty(0)
+    )
 
 
 def block(rng, cell, size, share, inside=True):

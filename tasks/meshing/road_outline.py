@@ -1,0 +1,112 @@
+"""The outline of roads from vectors as lines, so that roads end in the mesh where they end in the vectors.
+
+Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Points are moved to multiples of
+`GRID_M`, equal ones for all tiles, before the areas are united.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.meshing.lines import GRID_M
+from flexroad.tasks.types import Bools, Floats
+
+if TYPE_CHECKING:
+    import shapely
+
+    from flexroad.catalog.borders import Border
+
+TOLERANCE_M = 0.01
+"""Largest distance by which an outline is simplified (m)."""
+MARGIN_M = 1.0
+"""Distance beyond a grid up to which its roads are kept (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoadOutline:
+    """Roads as areas, and their outline on a tile."""
+
+    areas: shapely.MultiPolygon
+    lines: NDArray[np.object_]
+    """Lines through the tile, each closed or from border to border."""
+
+    def contains(self, points: Floats) -> Bools:
+        """Return which points, ``(n, 2 or more)``, are on the road, ``(n,)``."""
+        import shapely
+
+        shapely.prepare(self.areas)
+        return np.asarray(shapely.contains_xy(self.areas, points[:, 0], points[:, 1]))
+
+
+def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
+    """Return the union of roads on a grid as WKB, None if no road reaches the grid.
+
+    Parameters
+    ----------
+    areas : ndarray of polygons
+        In the CRS of the grid.
+    """
+    import shapely
+
+    west, south, east, north = core.bounds
+    within = shapely.box(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
+    near = areas[shapely.intersects(areas, within)]
+    valid = np.where(shapely.is_valid(near), near, shapely.make_valid(near))
+    cut = shapely.transform(shapely.intersection(valid, within), lambda points: points - core.origin)
+    union = shapely.union_all(shapely.set_precision(cut, GRID_M), grid_size=GRID_M)
+    polygons = shapely.get_parts(union)
+    polygons = polygons[shapely.get_type_id(polygons) == 3]
+    if not len(polygons):
+        return None
+    return np.frombuffer(shapely.to_wkb(shapely.multipolygons(polygons)), np.uint8)
+
+
+def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> RoadOutline:
+    """Return the outline of roads on a tile, with points at most a distance (m) apart.
+
+    Parameters
+    ----------
+    areas : ndarray
+        The result of `encoded`.
+    local : tuple of float
+        West, south, east and north of the tile (m).
+    """
+    import shapely
+
+    united = shapely.from_wkb(areas.tobytes())
+    inside = shapely.intersection(shapely.boundary(united), shapely.box(*local))
+    parts = shapely.get_parts(shapely.line_merge(_lines_of(inside)))
+    simple = shapely.simplify(shapely.multilinestrings(parts), TOLERANCE_M)
+    return RoadOutline(united, shapely.get_parts(shapely.segmentize(simple, spacing_m)))
+
+
+def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
+    """Return where an edge crosses the outline of roads, in metres from its start, ascending, ``(n,)``.
+
+    Parameters
+    ----------
+    areas : ndarray or None
+        The result of `encoded` for ``border.grid``.
+    """
+    import shapely
+
+    if areas is None:
+        return np.empty(0)
+    west, south, east, north = border.within(0.0)
+    ends = np.array([[west, south], [east, north]]) - border.grid.origin
+    met = shapely.intersection(shapely.boundary(shapely.from_wkb(areas.tobytes())), shapely.linestrings(ends))
+    distances = (shapely.get_coordinates(met) - ends[0]).sum(axis=1)
+    return np.unique(np.round(distances / GRID_M) * GRID_M)
+
+
+def _lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:
+    """Return the lines of a geometry that may have points as well."""
+    import shapely
+
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    return shapely.multilinestrings(parts[shapely.get_type_id(parts) == 1])
