@@ -1,18 +1,36 @@
 """Point clouds for tests."""
 
+from datetime import date
 from pathlib import Path
 
 import laspy
 import numpy as np
+from laspy.header import GpsTimeType
 from pyproj import CRS
 
 
-def write_cloud(path: Path, xyz, kind=1, crs=None, colour=None, withheld=None, scale=0.01) -> Path:
-    """Write a LAS or LAZ file of points ``(n, 3)``; one class for all or per point; colours ``(n, 3)``."""
+def write_cloud(
+    path: Path,
+    xyz,
+    kind=1,
+    crs=None,
+    colour=None,
+    withheld=None,
+    scale=0.01,
+    gps=None,
+    standard=False,
+    created=None,
+) -> Path:
+    """Write a LAS or LAZ file of points ``(n, 3)``; one class for all or per point; colours ``(n, 3)``.
+
+    GPS times are ``standard`` or seconds of a week; ``created`` is the date in the header, by default today.
+    """
     xyz = np.asarray(xyz, np.float64).reshape(-1, 3)
     header = laspy.LasHeader(point_format=6 if colour is None else 7, version="1.4")
     header.scales = [scale] * 3
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else [0, 0, 0]
+    header.creation_date = created or date.today()
+    header.global_encoding.gps_time_type = GpsTimeType.STANDARD if standard else GpsTimeType.WEEK_TIME
     if crs:
         header.add_crs(CRS.from_user_input(crs))
     points = laspy.LasData(header)
@@ -20,6 +38,8 @@ def write_cloud(path: Path, xyz, kind=1, crs=None, colour=None, withheld=None, s
     points.classification = np.broadcast_to(np.asarray(kind, np.uint8), len(xyz))
     if colour is not None:
         points.red, points.green, points.blue = np.asarray(colour, np.uint16).T
+    if gps is not None:
+        points.gps_time = np.broadcast_to(gps, len(xyz))
     if withheld is not None:
         points.withheld = withheld
     path.parent.mkdir(parents=True, exist_ok=True)

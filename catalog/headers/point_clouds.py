@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from datetime import date
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +29,10 @@ CHUNK_BYTES = 256 * 2**20
 """Largest size of points decoded at a time; a point of an absurd format has 64 KiB."""
 RGB = ("red", "green", "blue")
 DEGREES = 360.0
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(seconds=10**9)
+"""The zero of adjusted standard GPS time (ASPRS LAS 1.4), without leap seconds."""
+FIRST_GPS = (datetime(1990, 1, 1, tzinfo=UTC) - GPS_EPOCH).total_seconds()
+WEEK_S = 604_800
 SLACK = 0.01
 """Points may exceed the header's bounds by this fraction of the extent plus one unit."""
 
@@ -49,6 +53,8 @@ class Cloud:
     """Whether the point format has colours; they may all be zero."""
     created: date | None
     """Date when the file was written (not of the survey), or None."""
+    has_dates: bool = False
+    """Whether the header declares GPS times as standard, so that they are dates and not seconds of a week."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +68,8 @@ class Chunk:
     """Class by ASPRS, ``(n,)``."""
     colour: NDArray[np.uint16] | None
     """Red, green, blue as stored, ``(n, 3)``, or None if the file has none."""
+    gps: Floats | None = None
+    """Seconds of GPS since 1980-01-06, less 10^9, ``(n,)``, or None if the file has no standard GPS times."""
 
 
 def find(inputs: Collection[Path]) -> tuple[Path, ...]:
@@ -120,7 +128,31 @@ def _cloud(path: Path, header: Any) -> Cloud:
         _crs(header, bounds),
         set(RGB) <= set(header.point_format.dimension_names),
         header.creation_date if header.creation_date and header.creation_date.year > 1 else None,
+        _has_dates(header),
     )
+
+
+def _has_dates(header: Any) -> bool:
+    has_times = "gps_time" in header.point_format.dimension_names
+    # 1 in LAS: adjusted standard GPS time; 0: seconds of the week.
+    return has_times and int(header.global_encoding.gps_time_type) == 1
+
+
+def survey_dates(gps: Floats) -> tuple[datetime, datetime] | None:
+    """Return the dates of the first and the last point, or None if no time can be one of a survey.
+
+    Parameters
+    ----------
+    gps : (n,) array
+        See `Chunk.gps`. Times of a week (0 to 604,800 s) are left out, as some files have them although
+        their header declares standard times; so are times before 1990 and in the future.
+    """
+    latest = (datetime.now(UTC) - GPS_EPOCH).total_seconds()
+    times = gps[np.isfinite(gps) & ((gps < 0) | (gps > WEEK_S)) & (gps > FIRST_GPS) & (gps < latest)]
+    if not len(times):
+        return None
+    first, last = (GPS_EPOCH + timedelta(seconds=float(time)) for time in (times.min(), times.max()))
+    return first, last
 
 
 def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iterator[Chunk]:
@@ -152,14 +184,16 @@ def chunks(path: Path, size: int = CHUNK, drop: Collection[int] = NOISE) -> Iter
                 break
             done += len(points)
             limits = low - slack, high + slack
-            yield _attempt(path, functools.partial(_chunk, path, points, limits, drop))
+            yield _attempt(path, functools.partial(_chunk, path, points, limits, drop, _has_dates(header)))
     if done != header.point_count:
         raise CatalogError(
             f"{path} is cut short: {done:,} of {header.point_count:,} points; download it again"
         )
 
 
-def _chunk(path: Path, points: Any, limits: tuple[Floats, Floats], drop: Collection[int]) -> Chunk:
+def _chunk(
+    path: Path, points: Any, limits: tuple[Floats, Floats], drop: Collection[int], has_dates: bool
+) -> Chunk:
     x, y, z = (np.asarray(axis, np.float64) for axis in (points.x, points.y, points.z))
     for axis, low, high in zip((x, y, z), *limits, strict=True):
         if axis.min() < low or axis.max() > high:
@@ -172,9 +206,11 @@ def _chunk(path: Path, points: Any, limits: tuple[Floats, Floats], drop: Collect
     if set(RGB) <= set(points.point_format.dimension_names):
         colour = np.stack([np.asarray(points[name], np.uint16) for name in RGB], axis=1)
     kept = ~(np.asarray(points.withheld, bool) | np.isin(kind, list(drop)))
+    gps = np.asarray(points.gps_time, np.float64) if has_dates else None
     if kept.all():
-        return Chunk(x, y, z, kind, colour)
-    return Chunk(x[kept], y[kept], z[kept], kind[kept], None if colour is None else colour[kept])
+        return Chunk(x, y, z, kind, colour, gps)
+    colour = None if colour is None else colour[kept]
+    return Chunk(x[kept], y[kept], z[kept], kind[kept], colour, None if gps is None else gps[kept])
 
 
 def _opened(path: Path) -> Any:

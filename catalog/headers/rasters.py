@@ -36,6 +36,10 @@ GDAL = {
 }
 
 
+DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITIONDATE", "ACQUISITION_DATE", "TIFFTAG_DATETIME")
+"""Tags with a date, the first one with a value wins."""
+
+
 @dataclass(frozen=True)
 class RasterFile:
     """The header of a raster file."""
@@ -224,14 +228,21 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
         cell=round(min(abs(transform.a), abs(transform.e)), 6),
         width=width,
         height=height,
-        taken=_taken(tags),
+        taken=date_of(tags),
         modified=datetime.fromtimestamp(path.stat().st_mtime, UTC),
         height_unit=unit or None,
     )
 
 
-def _taken(tags: Mapping[str, str]) -> datetime | None:
-    for tag in ("ACQUISITIONDATETIME", "TIFFTAG_DATETIME"):
+def date_of(tags: Mapping[str, str]) -> datetime | None:
+    """Return the date in a raster's tags, None if there is none.
+
+    Parameters
+    ----------
+    tags : Mapping[str, str]
+        Those of the file and of GDAL's domain IMAGERY; the acquisition goes before the writing of the image.
+    """
+    for tag in DATE_TAGS:
         text = tags.get(tag, "").strip()
         try:
             # TIFF writes dates as 2020:05:01, ISO 8601 as 2020-05-01.

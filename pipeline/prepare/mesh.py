@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +15,7 @@ from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
-from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.options import PrepareOptions, written
 from flexroad.pipeline.prepare.point_buckets import (
     PER_METRE,
     RECORD,
@@ -95,6 +95,7 @@ def prepare_mesh(
     check_roads(common)
     log(f"reading {path}")
     mesh = read_mesh(path, mesh_options.up, common.crs, mesh_options.offset, colours=mesh_options.dop)
+    common = replace(common, assumed_date=written([path]))
     return publish_mesh(mesh, path.name, out, common, mesh_options, options, executor, log)
 
 
@@ -146,7 +147,9 @@ def publish_mesh(
         if has_mask:
             _write_reference(writer)
             dataset = f"{dataset}; {reference.CIRCULAR}"
-        published = writer.publish(common.tile_size_m, common.date, dataset, common.min_cover)
+        published = writer.publish(
+            common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date
+        )
     return published.with_notes(*mesh.notes, *frame.notes)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.rasters import date_of
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.limits import SMALLER, prepared_grid
 from flexroad.pipeline.prepare.mesh import MeshOptions, prepare_mesh
-from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.options import PrepareOptions, written
 from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
@@ -98,7 +100,7 @@ def _from_rasters(
 ) -> PreparedDataset:
     check_roads(common)
     has_dtm, photo = (folder / DTM).is_file(), folder / PHOTO
-    frame, bounds = _frame(folder / DSM, common)
+    frame, bounds, date = _frame(folder / DSM, common)
     grid = prepared_grid(bounds, frame.target, common, str(folder / DSM), out, photo=photo.is_file())
     dop_cell = common.dop_cell_m if photo.is_file() else None
     dtm_source = (
@@ -118,21 +120,28 @@ def _from_rasters(
             log(f"resampling {photo} to {common.dop_cell_m:g} m")
             _resample_photo(writer, photo, frame)
         add_roads(writer, common)
-        published = writer.publish(common.tile_size_m, common.date, common.dataset or name, common.min_cover)
+        published = writer.publish(
+            common.tile_size_m,
+            common.date or date,
+            common.dataset or name,
+            common.min_cover,
+            written([folder / DSM]),
+        )
     present = {DTM: has_dtm, PHOTO: dop_cell is not None}
     missing = [f"{folder} has no {name}" for name, exists in present.items() if not exists]
     return published.with_notes(*frame.notes, *missing)
 
 
-def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Bounds]:
-    """Return the transform to metres, and the bounds of the surface model (m)."""
+def _frame(dsm: Path, common: PrepareOptions) -> tuple[MetricTransform, Bounds, datetime | None]:
+    """Return the transform to metres, the bounds of the surface model (m), and the date in its tags."""
     with _opened(dsm) as source:
         crs = source.crs.to_wkt() if source.crs else common.crs
         if crs is None:
             raise CatalogError(f"{dsm} carries no CRS; give it with --crs, such as --crs EPSG:32632")
         frame = MetricTransform.of(crs, source.bounds[:2], common.to_crs, common.height_unit)
         bounds = bounds_in(frame.target, crs, tuple(source.bounds))
-    return frame, bounds
+        date = date_of({**source.tags(), **source.tags(ns="IMAGERY")})
+    return frame, bounds, date
 
 
 def _resample_heights(

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 from flexroad.catalog.cover import MIN_COVER
 from flexroad.pipeline.errors import ConfigError
+
+
+def written(paths: Iterable[Path]) -> datetime:
+    """Return when the latest of some files was written."""
+    return datetime.fromtimestamp(max(path.stat().st_mtime for path in paths), UTC)
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,8 @@ class PrepareOptions:
     """Tiles with a DSM height in less than this share (0 to 1) of their cells are left out."""
     date: datetime | None = None
     """Acquisition date; takes precedence over the files."""
+    assumed_date: datetime | None = None
+    """Date, marked as assumed, if neither the option nor the files give one."""
     dataset: str | None = None
     """Name of the data in reports; by default the name of the source."""
 

@@ -18,7 +18,7 @@ from flexroad.catalog.headers.rasters import some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.mesh import MeshOptions, publish_mesh
-from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.options import PrepareOptions, written
 from flexroad.pipeline.prepare.point_buckets import disk_errors, scratch_folder
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset
 from flexroad.pipeline.prepare.roads import check_roads
@@ -108,7 +108,8 @@ def prepare_photos(
     """
     check_roads(common)
     sfm.colmap()
-    placed = place_photos([read_shot(path) for path in _files(images)], common.to_crs)
+    files = _files(images)
+    placed = place_photos([read_shot(path) for path in files], common.to_crs)
     control = photos_options.control and read_control(
         photos_options.control, placed, photos_options.control_crs
     )
@@ -140,7 +141,7 @@ def prepare_photos(
         name = f"{len(reconstruction.views)} photographs ({_cameras(placed)})"
         source = f"{name}; heights {placed.heights}, uncorrected; {method}; Poisson mesh"
         common = replace(common, to_crs=reconstruction.crs, height_unit=None, dataset=common.dataset or name)
-        common = replace(common, date=common.date or _date(placed))
+        common = replace(common, date=common.date or _date(placed), assumed_date=written(files))
         mesh_options = MeshOptions(
             density=(POINTS_PER_CELL / common.cell_m) ** 2, refine=photos_options.refine
         )

@@ -13,13 +13,14 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError, Grid
-from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks
+from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.limits import check_extent
@@ -184,6 +185,8 @@ class BucketedPoints:
     """Whether the points have colours, per file."""
     out_of_range: int
     """Number of points left out because their height is outside `LOWEST_M`..`HIGHEST_M`."""
+    dates: tuple[datetime, datetime] | None = None
+    """When the first and the last point were measured, or None if that is not known of every file."""
 
     @property
     def points(self) -> int:
@@ -219,14 +222,17 @@ def bucket_points(
     buckets, occupied, out_of_range = PointBuckets(folder, edge), set[BlockIndex](), 0
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     kinds, has_colours = [], []
+    dates: list[tuple[datetime, datetime] | None] = []
     for number, cloud in enumerate(clouds, 1):
         log(f"reading {cloud.path} ({number} of {len(clouds)}, {cloud.points:,} points)")
         counts, colours = np.zeros(256, np.int64), _ByteColours()
+        days: list[datetime] = []
         for chunk in chunks(cloud.path, CHUNK):
             try:
                 plan, records = _records(chunk, frame, colours)
             except CatalogError as error:
                 raise CatalogError(f"{cloud.path}: {error}") from error
+            days += (chunk.gps is not None and survey_dates(chunk.gps)) or ()
             out_of_range += len(chunk.z) - len(records)
             if not len(records):
                 continue
@@ -238,6 +244,7 @@ def bucket_points(
                 occupied |= buckets.append(plan[0], plan[1], records)
         kinds.append(counts)
         has_colours.append(colours.present)
+        dates.append((min(days), max(days)) if days else None)
     if not occupied:
         raise CatalogError(f"{clouds[0].path} has only noise points; leave it out")
     west, south, east, north = (float(side) / PER_METRE for side in (*low, *high))
@@ -248,7 +255,15 @@ def bucket_points(
         tuple(kinds),
         tuple(has_colours),
         out_of_range,
+        _over_all(dates),
     )
+
+
+def _over_all(dates: Sequence[tuple[datetime, datetime] | None]) -> tuple[datetime, datetime] | None:
+    known = [pair for pair in dates if pair]
+    if len(known) < len(dates):
+        return None
+    return min(first for first, _ in known), max(last for _, last in known)
 
 
 class _ByteColours:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, time
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +18,7 @@ from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
-from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.options import PrepareOptions, written
 from flexroad.pipeline.prepare.point_buckets import (
     RECORD,
     BucketedPoints,
@@ -101,16 +103,36 @@ def prepare_points(
         ]
         _require_no_gap(clouds, frame, bucketed, common.cell_m)
         grid = prepared_grid(bucketed.bounds, frame.target, common, names, out, photo=not colourless)
-        notes = (*frame.notes, *notes, *dense, *_left_out(bucketed, colourless))
+        common, dated = _dated(common, clouds, bucketed)
+        notes = (*frame.notes, *notes, *dense, *dated, *_left_out(bucketed, colourless))
         file_tags = _tags(clouds, frame, bucketed, options)
         dop_cell = None if colourless else common.dop_cell_m
         with RasterWriter(out, grid, dop_cell, file_tags, frame.vertical) as writer:
             write_blocks(writer, bucketed, options, executor, log)
             add_roads(writer, common)
             dataset = common.dataset or _name(files)
-            return writer.publish(common.tile_size_m, common.date, dataset, common.min_cover).with_notes(
-                *notes
+            published = writer.publish(
+                common.tile_size_m, common.date, dataset, common.min_cover, common.assumed_date
             )
+            return published.with_notes(*notes)
+
+
+def _dated(
+    common: PrepareOptions, clouds: Sequence[Cloud], bucketed: BucketedPoints
+) -> tuple[PrepareOptions, tuple[str, ...]]:
+    """Return the options with the date of the survey, and a note on its source.
+
+    It is that of the first point, by GPS time; else that of the latest file, which is only assumed.
+    """
+    if common.date is not None:
+        return common, ()
+    if bucketed.dates:
+        first, last = (f"{date:%Y-%m-%d}" for date in bucketed.dates)
+        span = first if first == last else f"{first} to {last}"
+        return replace(common, date=bucketed.dates[0]), (f"date of the survey: {span}, by GPS time",)
+    created = [cloud.created for cloud in clouds if cloud.created]
+    header = datetime.combine(max(created), time(), UTC) if created else None
+    return replace(common, assumed_date=header or written(cloud.path for cloud in clouds)), ()
 
 
 def _frame(clouds: Sequence[Cloud], common: PrepareOptions) -> MetricTransform:

@@ -31,7 +31,7 @@ from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import HEIGHTS
-from flexroad.catalog.tiling import assumed, cut
+from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Orthophoto
 
@@ -177,6 +177,7 @@ class RasterWriter:
         date: datetime | None = None,
         dataset: str = "",
         min_cover: float = MIN_COVER,
+        assumed: datetime | None = None,
     ) -> PreparedDataset:
         """Convert the rasters to COGs and write the catalog; existing outputs in the folder are replaced.
 
@@ -186,11 +187,13 @@ class RasterWriter:
             Side of a tile (m). An area no larger than this is a single tile; a larger one is divided at
             multiples of it.
         date : datetime, optional
-            Acquisition date.
+            Acquisition date; None: ``assumed`` is used, with a note.
         dataset : str
             Name of the data in reports.
         min_cover : float
             Tiles with heights in less than this share (0 to 1) of their cells are left out.
+        assumed : datetime, optional
+            When the source was written, with a time zone; None: now.
 
         Raises
         ------
@@ -204,11 +207,18 @@ class RasterWriter:
             with self._writing(layer):
                 self._open[layer].close()
                 _to_cog(self.scratch / f"{layer}.tmp.tif", self.scratch / f"{layer}.tif", layer)
-        tiles, notes = self._tiles(names, tile_size_m, date, dataset, min_cover)
+        survey = zoned(date or assumed or datetime.now(UTC))
+        tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
+        tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
         tiles = with_roads(tiles, self._roads, None)
         self._replace(names)
         Catalog(tiles).write(self.out / CATALOG)
-        return PreparedDataset(self.out / CATALOG, len(tiles), (*self._notes, *notes, *assumed(tiles)))
+        undated = (
+            f"the date of the survey is not known: {survey:%Y-%m-%d}, when its files were written, is used "
+            "instead (--date sets it)"
+        )
+        notes = (*self._notes, *notes, *([undated] if date is None else []))
+        return PreparedDataset(self.out / CATALOG, len(tiles), notes)
 
     def _replace(self, names: list[str]) -> None:
         # A catalog must only exist beside complete rasters: removed first, written last.
@@ -218,7 +228,7 @@ class RasterWriter:
             (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
 
     def _tiles(
-        self, names: list[str], size_m: float, date: datetime | None, dataset: str, min_cover: float
+        self, names: list[str], size_m: float, date: datetime, dataset: str, min_cover: float
     ) -> tuple[tuple[Tile, ...], tuple[str, ...]]:
         """Return the tiles with enough heights, and notes on the others."""
         if max(self.grid.width, self.grid.height) * self.grid.cell <= size_m:
@@ -229,8 +239,7 @@ class RasterWriter:
             layers = {name: opened(root, name, [root / f"{name}.tif"], None)[0] for name in names}
             indexed = cut(root, layers, tile_size_m=size_m, date=date, dataset=dataset, min_cover=0)
             tiles = tuple(replace(tile, root=str(self.out.resolve())) for tile in indexed.tiles)
-            # `publish` adds the note on assumed dates once, for the tiles that are kept.
-            notes = tuple(note for note in indexed.notes if "--date" not in note)
+            notes = indexed.notes
         shares = (height_share(tile.grid, [self.scratch / "dsm.tif"]) or 0.0 for tile in tiles)
         enough = [share >= max(min_cover, 1e-9) for share in shares]
         kept = tuple(compress(tiles, enough))
@@ -243,14 +252,13 @@ class RasterWriter:
         left_out = f"left out {some(sparse)}: heights in less than {min_cover:.0%} of the cells"
         return kept, (*notes, left_out) if sparse else notes
 
-    def _one_tile(self, names: list[str], date: datetime | None, dataset: str) -> Tile:
+    def _one_tile(self, names: list[str], date: datetime, dataset: str) -> Tile:
         return Tile(
             id=f"{self.grid.west:.0f}_{self.grid.south:.0f}",
             grid=self.grid,
             layers=tuple(Layer(name, (f"{name}.tif",), extents=(self.grid.bounds,)) for name in names),
             root=str(self.out.resolve()),
-            datetime=zoned(date) if date else datetime.now(UTC),
-            datetime_assumed=date is None,
+            datetime=date,
             dataset=dataset,
         )
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pyproj import CRS
 
 from flexroad.catalog import Catalog, CatalogError, Grid
+from flexroad.catalog.headers.rasters import date_of
 from flexroad.catalog.sources import nrw
 from flexroad.catalog.sources.rasters import index
 from tests.make_rasters import UTM, write, write_xyz
@@ -303,6 +304,21 @@ def test_tile_date_from_tag_file_time_or_option(tmp_path):
     assert {(t.datetime, t.datetime_assumed) for t in dated.tiles} == {
         (datetime(2019, 3, 4, tzinfo=UTC), False)
     }
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"ACQUISITIONDATE": "2020-05-01"}, "2020-05-01"),
+        ({"ACQUISITION_DATE": "20200501", "TIFFTAG_DATETIME": "2022:01:01 00:00:00"}, "2020-05-01"),
+        ({"ACQUISITIONDATE": "spring", "TIFFTAG_DATETIME": "2022:01:01 00:00:00"}, "2022-01-01"),
+        ({"TIFFTAG_DATETIME": "0000:00:00 00:00:00"}, None),
+        ({}, None),
+    ],
+)
+def test_date_of_a_raster_is_that_of_its_tags(tags, expected):
+    date = date_of(tags)
+    assert (date and f"{date:%Y-%m-%d}") == expected
 
 
 def test_acquisition_tag_overrides_file_tag(tmp_path):

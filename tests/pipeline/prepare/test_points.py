@@ -1,6 +1,7 @@
 """Rasters of synthetic clouds have the true heights, whatever the division into files, blocks and units."""
 
 import resource
+from datetime import UTC, date, datetime
 from pathlib import Path
 
 import numpy as np
@@ -328,3 +329,53 @@ def test_prepare_points_writes_the_vertical_crs_of_its_points(tmp_path, crs, dat
     assert vertical_crs(tile) == (datum and f"EPSG:{datum}")
     height = 30 * (0.3048 if crs.startswith("EPSG:2994") else 1)
     np.testing.assert_allclose(np.nanmedian(load(tile, LoadOptions()).dsm), height, atol=WITHIN)
+
+
+FLOWN = (datetime(2019, 4, 3, 9, tzinfo=UTC) - datetime(1980, 1, 6, tzinfo=UTC)).total_seconds() - 1e9
+"""Adjusted standard GPS time of a flight, without leap seconds."""
+
+
+def flight(path, **options):
+    """Write a plane of 40 x 40 m."""
+    east, north = np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 40, 0.5))
+    xyz = np.stack([east + 356_000.1, north + 5_699_000.1, ground(east, north)], axis=-1)
+    return write_cloud(path, xyz.reshape(-1, 3), 2, "EPSG:25832", created=date(2021, 6, 7), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected", "assumed"),
+    [
+        ({"gps": FLOWN, "standard": True}, "2019-04-03", False),
+        ({"gps": 300_000.0}, "2021-06-07", True),
+        ({"gps": 300_000.0, "standard": True}, "2021-06-07", True),
+        ({"gps": 0.0, "standard": True}, "2021-06-07", True),
+        ({"gps": -1e9, "standard": True}, "2021-06-07", True),
+        ({"gps": 5e9, "standard": True}, "2021-06-07", True),
+        ({}, "2021-06-07", True),
+    ],
+)
+def test_date_is_that_of_the_points_else_of_the_header(tmp_path, options, expected, assumed):
+    """Standard GPS times are dates; seconds of a week are none, even if the header says so."""
+    result, _ = prepare([flight(tmp_path / "a.las", **options)], tmp_path / "out")
+    (tile,) = Catalog.read(result.catalog).tiles
+    assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == (expected, assumed)
+    assert any(expected in note and ("--date sets it" in note) == assumed for note in result.notes)
+
+
+def test_date_of_several_flights_is_the_first_and_option_goes_before(tmp_path):
+    files = [flight(tmp_path / f"{day}.laz", gps=FLOWN + day * 86_400, standard=True) for day in (2, 0, 5)]
+    result, _ = prepare(files, tmp_path / "out", tile_size_m=20)
+    tiles = Catalog.read(result.catalog).tiles
+    assert len(tiles) > 1
+    assert {f"{tile.datetime:%Y-%m-%d}" for tile in tiles} == {"2019-04-03"}
+    assert "date of the survey: 2019-04-03 to 2019-04-08, by GPS time" in result.notes
+    result, _ = prepare(files, tmp_path / "other", date=datetime(2020, 5, 1))
+    (tile,) = Catalog.read(result.catalog).tiles
+    assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == ("2020-05-01", False)
+
+
+def test_date_is_only_assumed_if_one_file_has_none(tmp_path):
+    files = [flight(tmp_path / "a.las", gps=FLOWN, standard=True), flight(tmp_path / "b.las")]
+    result, _ = prepare(files, tmp_path / "out")
+    (tile,) = Catalog.read(result.catalog).tiles
+    assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == ("2021-06-07", True)

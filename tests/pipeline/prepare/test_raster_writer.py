@@ -1,6 +1,7 @@
 """The rasters of an area are valid COGs that `run` can read; a failure leaves no partial files."""
 
 import os
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -96,8 +97,9 @@ def test_write_photo_masks_pixels_without_colour(tmp_path):
 def test_publish_small_area_makes_one_tile(tmp_path):
     with RasterWriter(tmp_path, grid(150, 100), None, TAGS) as writer:
         write_layers(writer, dop=False)
-        published = writer.publish(date=None, dataset="made")
+        published = writer.publish(dataset="made", assumed=datetime(2019, 4, 3))
     (tile,) = Catalog.read(published.catalog).tiles
+    assert (tile.datetime.isoformat(), tile.datetime_assumed) == ("2019-04-03T00:00:00+00:00", True)
     assert tile.grid == grid(150, 100)
     assert (tile.id, tile.dataset) == ("400000_5699900", "made")
 
