@@ -7,12 +7,13 @@ Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Po
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.meshing.lines import GRID_M
 from flexroad.tasks.types import Bools, Floats
 
@@ -55,12 +56,11 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
 
     west, south, east, north = core.bounds
     within = shapely.box(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
-    near = areas[shapely.intersects(areas, within)]
-    valid = np.where(shapely.is_valid(near), near, shapely.make_valid(near))
+    near = areas[~shapely.is_empty(areas) & has_place(areas)]
+    valid = _polygons(np.where(shapely.is_valid(near), near, shapely.make_valid(near)))
+    valid = valid[shapely.intersects(valid, within)]
     cut = shapely.transform(shapely.intersection(valid, within), lambda points: points - core.origin)
-    union = shapely.union_all(shapely.set_precision(cut, GRID_M), grid_size=GRID_M)
-    polygons = shapely.get_parts(union)
-    polygons = polygons[shapely.get_type_id(polygons) == 3]
+    polygons = _polygons(shapely.union_all(shapely.set_precision(_polygons(cut), GRID_M), grid_size=GRID_M))
     if not len(polygons):
         return None
     return np.frombuffer(shapely.to_wkb(shapely.multipolygons(polygons)), np.uint8)
@@ -102,6 +102,14 @@ def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
     met = shapely.intersection(shapely.boundary(shapely.from_wkb(areas.tobytes())), shapely.linestrings(ends))
     distances = (shapely.get_coordinates(met) - ends[0]).sum(axis=1)
     return np.unique(np.round(distances / GRID_M) * GRID_M)
+
+
+def _polygons(geometries: Any) -> NDArray[np.object_]:
+    """Return the polygons in geometries of any kind."""
+    import shapely
+
+    parts = shapely.get_parts(shapely.get_parts(geometries))
+    return np.asarray(parts[shapely.get_type_id(parts) == 3])
 
 
 def _lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:

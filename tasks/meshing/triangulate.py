@@ -60,10 +60,11 @@ def constrained(points: Floats, segments: Edges) -> Faces:
     missing = segments[~_has_edges(faces, segments, len(points))]
     if not len(missing):
         return faces
-    star = _Star(points, faces, segments)
+    concerned = _beside(points, faces, missing)
+    star = _Star(points, faces[concerned], segments)
     for a, b in missing.tolist():
         star.insert(a, b)
-    return star.faces
+    return np.concatenate([faces[~concerned], star.faces])
 
 
 def _has_edges(faces: Faces, segments: Edges, count: int) -> NDArray[np.bool_]:
@@ -72,6 +73,15 @@ def _has_edges(faces: Faces, segments: Edges, count: int) -> NDArray[np.bool_]:
     wanted = np.sort(segments, axis=1)
     keys, wanted_keys = (np.asarray(p, np.int64) @ [count, 1] for p in (pairs, wanted))
     return np.isin(wanted_keys, keys)
+
+
+def _beside(points: Floats, faces: Faces, segments: Edges) -> NDArray[np.bool_]:
+    """Return the faces whose rectangle meets that of a segment, ``(F,)``: among them all that it crosses."""
+    low, high = (bound(points[faces, :2], axis=1) for bound in (np.min, np.max))
+    result = np.zeros(len(faces), np.bool_)
+    for ends in points[segments, :2]:
+        result |= ((low <= ends.max(axis=0)) & (high >= ends.min(axis=0))).all(axis=1)
+    return result
 
 
 class _Star:

@@ -154,6 +154,17 @@ def test_roads_without_outline_on_tile():
     assert encoded(np.array(far, object), grid) is None
 
 
+def test_invalid_and_empty_polygons_and_heights_are_no_trouble():
+    grid = grid_of(0, 0)
+    bow = shapely.Polygon([at(10, 10), at(30, 40), at(30, 10), at(10, 40)])
+    high = shapely.Polygon([(*at(60, 10), 5.0), (*at(90, 10), 5.0), (*at(90, 40), 6.0)])
+    nowhere = shapely.Polygon([(np.inf, 0), (np.inf, 1), (0, 1)])
+    spike = shapely.Polygon([at(50, 60), at(60, 60), at(60, 70), at(60, 95), at(60, 70), at(50, 70)])
+    mesh = meshed([bow, high, shapely.Polygon(), nowhere, spike], grid)
+    assert not faults(mesh)
+    assert drawn(mesh).area == pytest.approx(300 + 450 + 100, rel=1e-3)
+
+
 def test_outline_and_end_of_survey_cross():
     polygons, grid = ROADS["crossing"], grid_of(0, 0)
     x, y = np.meshgrid(grid.eastings - WEST, grid.northings - SOUTH)
