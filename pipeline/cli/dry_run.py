@@ -1,4 +1,4 @@
-"""Text of ``--dry-run``: the graph of a run and what is still to do."""
+"""Text of ``--dry-run``: why each tile is computed, and what is still to do."""
 
 from __future__ import annotations
 
@@ -6,51 +6,70 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import count
-from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.inspect.failures import expected_failures
+from flexroad.pipeline.inspect.reasons import Kind, reason
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.products import TileProducts
+
+STORED, TO_DO, DONE = "stored", "to do", "done"
 
 
-def plan(graphs: Iterable[TileGraph], store: Location, run: Location, config: Config) -> Iterator[str]:
-    """Yield one line per tile and stage node, then the totals, then what would fail of the tiles to do.
+def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False) -> Iterator[str]:
+    """Yield one line per tile with the reason why it is computed, then the totals, then what would fail.
 
-    A node is ``stored`` if its result is in the store, else ``to do``. Nodes that are never stored (the
-    rasters that `load` reads) are computed again when a later node needs them.
+    In the totals, a node of the graph is ``done`` if its tile is up to date, ``stored`` if its result is in
+    the store, else ``to do``. Nodes that are never stored (the rasters that `load` reads) are computed again
+    when a later node needs them.
+
+    Parameters
+    ----------
+    run : Run
+        The run, which need not exist yet (`Run.planned`).
+    tiles : iterable of Tile
+        The selected tiles.
+    verbose : bool
+        Whether each tile also has a line per node.
     """
-    artefacts, totals, tiles = ArtefactStore(store), Counter[tuple[str, str]](), 0
+    artefacts, totals, reasons = ArtefactStore(run.store), Counter[tuple[str, str]](), Counter[Kind]()
     todo: list[Tile] = []
     counted: set[str] = set()
-    for graph in graphs:
-        tiles += 1
-        done = TileProducts.of(run, graph.tile.id).done(graph) is not None
+    for status in peek_statuses(run, tiles):
+        graph, why = status.graph, reason(run, status)
+        yield f"{graph.tile.id}: {why.line}"
+        reasons[why.kind] += 1
+        done = why.kind == "up to date"
         todo += [] if done else [graph.tile]
-        yield f"{graph.tile.id}: {'done' if done else 'to do'}"
-        users = _users(graph)
-        for node in graph.nodes.values():
-            state = "stored" if node.stored and artefacts.has(node) else "to do"
-            if node.fingerprint not in counted:
-                totals[node.stage, "done" if done else state] += 1
+        states: dict[str, str] = {}
+        for name, node in graph.nodes.items():
+            stored = not done and node.stored and artefacts.has(node)
+            states[name] = DONE if done else STORED if stored else TO_DO
+            if name not in counted:
+                totals[node.stage, states[name]] += 1
             # Corners and edges are nodes of several tiles.
-            counted |= {node.fingerprint} if node.border else set()
-            needed = (*node.inputs, *node.frame)
-            inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in needed) or "files"
-            yield (
-                f"  {node.stage:9}{node.fingerprint[:8]}  {'done' if done else state:7} "
-                f"<- {inputs}  ({', '.join(users[node.fingerprint])})"
-            )
-    yield count(tiles, "tile")
+            counted |= {name} if node.border else set()
+        if verbose:
+            yield from _nodes(graph, states)
+    numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
+    yield f"{count(reasons.total(), 'tile')}: {numbers}"
     for stage in (*STAGE_NAMES, BORDER):
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
         if counts:
             yield f"  {stage:9}{counts}"
-    for finding in expected_failures(todo, config, layers_read(config)):
+    for finding in expected_failures(todo, run.config, layers_read(run.config)):
         yield f"warning: {finding.text}"
+
+
+def _nodes(graph: TileGraph, states: dict[str, str]) -> Iterator[str]:
+    """Yield a line per node of a tile: stage, fingerprint, state, inputs and variants."""
+    users = _users(graph)
+    for name, node in graph.nodes.items():
+        inputs = ", ".join(f"{graph.nodes[i].stage}:{i[:8]}" for i in (*node.inputs, *node.frame)) or "files"
+        yield f"  {node.stage:9}{name[:8]}  {states[name]:7} <- {inputs}  ({', '.join(users[name])})"
 
 
 def _users(graph: TileGraph) -> dict[str, list[str]]:

@@ -85,7 +85,11 @@ def run(
     on_failure: options.OnFailure = None,
     prometheus: options.Prometheus = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be computed and what would fail.")
+        bool,
+        typer.Option("--dry-run", help="Print why each tile would be computed, and what would fail."),
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="With --dry-run: also the stages of each tile.")
     ] = False,
 ) -> None:
     """Bring every tile of a run up to date.
@@ -97,7 +101,7 @@ def run(
     from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.graph import layers_read
-    from flexroad.pipeline.run.record import Run, check_inputs
+    from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
 
     path, catalog_path = parse_location(out), parse_location(catalog)
@@ -118,13 +122,11 @@ def run(
 
     if dry_run:
         from flexroad.pipeline.cli.dry_run import plan
-        from flexroad.pipeline.graph.graph import tile_graphs
 
         chosen = load_config(config, settings or ())
         whole, selected = read_catalog(chosen)
-        check_inputs(chosen, of_run(whole, selected))
-        graphs = tile_graphs(selected, chosen, checksum)
-        for line in plan(graphs, root or path / "store", path, chosen):
+        planned = Run.planned(path, chosen, of_run(whole, selected), root, checksum)
+        for line in plan(planned, selected.tiles, verbose):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:

@@ -17,13 +17,13 @@ node whose artefact is in the store is not computed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Catalog, Layer, Tile
+from flexroad.catalog import Layer, Tile
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
@@ -264,13 +264,6 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles) -> list[Node]:
         name = hashed(f"[{head},{place},{to_json(ends)},{text},{models}]")
         nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=task))
     return nodes
-
-
-def tile_graphs(catalog: Catalog, config: Config, checksum: bool = False) -> Iterator[TileGraph]:
-    """Yield the graph of every tile, in the catalog's order."""
-    pattern = Pattern.of(config)
-    for tile in catalog.tiles:
-        yield pattern.graph(tile, checksum)
 
 
 def tile_graph(tile: Tile, config: Config, checksum: bool = False) -> TileGraph:

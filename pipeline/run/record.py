@@ -99,6 +99,34 @@ class Run:
         ConfigError
             If the folder or the store cannot be written, no tile can be used, or `check_inputs` raises.
         """
+        run = cls.planned(path, config, catalog, store, checksum)
+        try:
+            for folder in (path, run.store):
+                check_writable(folder)
+            run._write()
+            register(run.store, path)
+        except OSError as error:
+            raise ConfigError(
+                f"cannot write the run to {path}: {error}; choose another --out or --store"
+            ) from error
+        return run
+
+    @classmethod
+    def planned(
+        cls,
+        path: Location,
+        config: Config,
+        catalog: Catalog,
+        store: Location | None = None,
+        checksum: bool = False,
+    ) -> Run:
+        """Return the run that `create` would make or update; nothing is written.
+
+        Raises
+        ------
+        ConfigError
+            If no tile can be used, or `check_inputs` raises.
+        """
         if not catalog.usable:
             raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
         check_inputs(config, catalog)
@@ -109,17 +137,7 @@ class Run:
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
         folders, collection = folders_of(catalog), _collection(old, path)
-        run = cls(path, config, catalog, store, origin, checksum, versions(), folders, exported, collection)
-        try:
-            for folder in (path, store):
-                check_writable(folder)
-            run._write()
-            register(store, path)
-        except OSError as error:
-            raise ConfigError(
-                f"cannot write the run to {path}: {error}; choose another --out or --store"
-            ) from error
-        return run
+        return cls(path, config, catalog, store, origin, checksum, versions(), folders, exported, collection)
 
     @classmethod
     def open(cls, path: Location | str, allow: Sequence[str | Path] = ()) -> Run:

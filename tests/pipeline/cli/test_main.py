@@ -153,15 +153,16 @@ def test_report_writes_every_format(finished, form):
         assert "http" not in text.split("<body>")[1].split("Configuration")[0]
 
 
-def test_run_dry_run_prints_graph_and_writes_nothing(made_survey, tmp_path):
-    said = flexroad(
-        "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
-        "--dry-run",
-    )  # fmt: skip
+def test_run_dry_run_prints_a_line_per_tile_and_writes_nothing(made_survey, tmp_path):
+    words = ["--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r"]
+    said = flexroad("run", *words, "--dry-run").splitlines()
     assert not (tmp_path / "r").exists()
-    assert said.count("fit ") == 4 * 3 + 1
-    assert "12 to do" in said.splitlines()[-1]
-    assert "(plane, rgt, flexroad)" in said
+    ids = [tile.id for tile in Catalog.read(made_survey / "catalog.parquet").tiles]
+    assert said[:5] == [*(f"{name}: new" for name in ids), "4 tiles: 4 new"]
+    assert "12 to do" in said[-1]
+    graph = flexroad("run", *words, "--dry-run", "--verbose")
+    assert graph.count("fit ") == 4 * 3 + 1
+    assert "(plane, rgt, flexroad)" in graph
 
 
 def test_run_with_tile_or_bbox_selects_tiles(made_survey, tmp_path):
@@ -171,16 +172,16 @@ def test_run_with_tile_or_bbox_selects_tiles(made_survey, tmp_path):
         "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
         "--tile", one.id, two.id, "--executor", "serial", "--dry-run",
     )  # fmt: skip
-    assert [line for line in said.splitlines() if line.endswith(": to do")] == [
-        f"{one.id}: to do",
-        f"{two.id}: to do",
+    assert [line for line in said.splitlines() if line.endswith(": new")] == [
+        f"{one.id}: new",
+        f"{two.id}: new",
     ]
     west, south, east, north = two.grid.bounds
     said = flexroad(
         "run", "--config", "paper", "--catalog", made_survey / "catalog.parquet", "--out", tmp_path / "r",
         "--bbox", west + 1, south + 1, east - 1, north - 1, "--dry-run",
     )  # fmt: skip
-    assert f"{two.id}: to do" in said
+    assert f"{two.id}: new" in said
     assert one.id not in said
 
 

@@ -351,7 +351,7 @@ def test_open_cluster_missing_program_raises(kind, remedy, monkeypatch, tmp_path
 
 def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     from flexroad.catalog import Catalog
-    from flexroad.pipeline.graph.graph import tile_graphs
+    from flexroad.pipeline.graph.graph import tile_graph
 
     text = "extends: paper\ncluster: {kind: slurm, queue: night}\n"
     (tmp_path / "night.yaml").write_text(text)
@@ -359,8 +359,11 @@ def test_fingerprints_do_not_depend_on_cluster(made_survey, tmp_path):
     heir = load_config(tmp_path / "heir.yaml")
     assert (heir.cluster.queue, heir.cluster.workers) == ("night", 9)
     catalog = Catalog.read(made_survey / "catalog.parquet")
-    plain = [graph.fingerprint for graph in tile_graphs(catalog, load_config("paper"))]
-    assert [graph.fingerprint for graph in tile_graphs(catalog, heir)] == plain
+    plain, same = (
+        [tile_graph(tile, config).fingerprint for tile in catalog.tiles]
+        for config in (load_config("paper"), heir)
+    )
+    assert same == plain
 
 
 def test_hanging_jobs_are_stopped_tried_again_and_lost(running):

@@ -15,7 +15,7 @@ from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE, BorderStages, check_tiles
-from flexroad.pipeline.graph.graph import files_read, tile_graphs
+from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
 
 NIGHTLY = load_config("nightly")
 SIZE_M = 250
@@ -60,7 +60,7 @@ def borders(graph):
 def names(catalog, config=NIGHTLY):
     """Return the fingerprints of tiles by id, and of corners and edges by kind and start."""
     tiles, parts = {}, defaultdict(set)
-    for graph in tile_graphs(catalog, config):
+    for graph in map(Pattern.of(config).graph, catalog.tiles):
         tiles[graph.tile.id] = graph.fingerprint
         for node in borders(graph):
             parts[node.border.border.kind, node.border.border.start].add(node.fingerprint)
@@ -72,7 +72,7 @@ def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
     _, parts = names(catalog_of(survey))
     assert len(parts) == 16 + 12 + 12
     assert all(len(fingerprints) == 1 for fingerprints in parts.values())
-    graph = next(tile_graphs(catalog_of(survey), NIGHTLY))
+    graph = tile_graph(catalog_of(survey).tiles[0], NIGHTLY)
     fit = graph.nodes[graph.variants["flexroad"]["fit"]]
     assert [graph.nodes[name].border.border.kind for name in fit.frame] == [
         *["corner"] * 4, "east", "east", "north", "north",
@@ -150,13 +150,13 @@ def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
 
 
 def test_paper_has_no_borders(survey):
-    for graph in tile_graphs(by_prepared(survey), load_config("paper")):
+    for graph in map(Pattern.of(load_config("paper")).graph, by_prepared(survey).tiles):
         assert not borders(graph)
         assert not any(node.frame for node in graph.nodes.values())
 
 
 def test_border_reads_only_files_around_it(survey):
-    graph = next(tile_graphs(by_prepared(survey), NIGHTLY))
+    graph = tile_graph(by_prepared(survey).tiles[0], NIGHTLY)
     corner = borders(graph)[3]
     assert corner.border.border.start == (500250, 5600250)
     read = {path.relative_to(survey).as_posix() for path in files_read(graph, corner)}
