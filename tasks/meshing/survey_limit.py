@@ -116,4 +116,4 @@ def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Boo
     )  # fmt: skip
     cells = np.bincount(number.ravel(), minlength=len(parts) + 1)
     beyond = np.bincount(number.ravel(), outside.ravel(), len(parts) + 1)
-    return shapely.multipolygons(list(parts[(2 * beyond < cells)[1:]]))
+    return shapely.MultiPolygon(list(parts[(2 * beyond < cells)[1:]]))
