@@ -38,7 +38,7 @@ class Options(widths.Options):
     )
     where: str | None = Field(None, description="SQL condition that selects features: class = 'road'")
     class_columns: tuple[str, ...] = Field(
-        (*CLASS_TAGS, "fclass", "class"),
+        (*CLASS_TAGS, "fclass", "class", "mtfcc", "bst_code", "bgt_functie", "bgt-functie"),
         description="columns (or OSM tags) with a road's class; the first with a value wins",
     )
     left_out: tuple[str, ...] = Field(
@@ -56,6 +56,9 @@ class Options(widths.Options):
                 "services",
                 "rest_area",
             ),
+            # TIGER: walkways, stairways, winter trails, bike and bridle paths; NWB, BGT: foot and bike paths.
+            *("s1710", "s1720", "s1810", "s1820", "s1830", "fp", "vp", "voetpad", "voetpad op trap"),
+            *("fietspad", "ruiterpad", "voetgangersgebied", "spoorbaan", "baan voor vliegverkeer"),
         ),
         description="classes that are not carriageways, or planned or removed ones",
     )
@@ -136,7 +139,8 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
 
 
 def _columns(options: Options) -> tuple[str, ...]:
-    names = (*options.width_columns, *options.class_columns, *CLASS_TAGS, "lanes", BRIDGE, AREA, *HIDDEN_TAGS)
+    of_width = (*options.width_columns, *options.lane_columns, *options.width_class_columns)
+    names = (*of_width, *options.class_columns, *CLASS_TAGS, BRIDGE, AREA, *HIDDEN_TAGS)
     return tuple(dict.fromkeys(name.lower() for name in names))
 
 

@@ -28,9 +28,19 @@ CLASS_WIDTH_M = {
     "service": 4.0,
     "busway": 6.5,
     "track": 3.0,
+    "s1100": 11.5,
+    "s1200": 9.0,
+    "s1400": 8.0,
+    "s1500": 3.0,
+    "s1630": 7.0,
+    "s1640": 6.0,
+    "s1730": 4.5,
+    "s1740": 4.0,
+    "s1780": 6.0,
 }
-"""Width of carriageways (m) by OSM class, after the German guidelines (RAL 2012: RQ 31 per direction, RQ 11;
-RASt 06); OSM maps each direction of a dual carriageway separately."""
+"""Width of carriageways (m) by class: of OSM, after the German guidelines (RAL 2012: RQ 31 per direction,
+RQ 11; RASt 06); OSM maps each direction of a dual carriageway separately. Of TIGER (MTFCC) they are assumed:
+lanes of 12 ft with shoulders on primary and secondary roads, streets with parking on one side."""
 
 FOOT_M, INCH_M = 0.3048, 0.0254
 UNITS_M = {
@@ -44,14 +54,26 @@ LENGTH = re.compile(rf"({NUMBER})\s*([a-z]+|'|\")?")
 FEET_INCHES = re.compile(rf"(\d+)\s*(?:'|ft|feet)\s*({NUMBER})\s*(?:\"|in|inch|inches)")
 PRIMES = str.maketrans({"’": "'", "′": "'", "”": '"', "″": '"', ",": "."})
 MOST_LANES = 16
+WIDEST_M = 1000.0
+"""Numbers from here on are codes for "unknown", as 9998."""
+CLASS_STEP_M, LOWEST_CLASS_M = 3.0, 6.0
+"""ATKIS gives ``breiteDesVerkehrsweges`` as the upper end of a class: 6 is up to 6 m, 9 is 6 to 9 m."""
 
 
 class Options(base.Options):
-    """Source of a line's width: its width attribute, else its number of lanes, else its class."""
+    """Source of a line's width: its width attribute, else lanes, else a class of widths, else its class."""
 
     width_columns: tuple[str, ...] = Field(
-        ("width:carriageway", "width", "width_m", "est_width"),
+        ("width:carriageway", "width", "width_m", "est_width", "brf", "breiteDerFahrbahn"),
         description="columns (or OSM tags) with a width, kerb to kerb; the first with a value wins",
+    )
+    lane_columns: tuple[str, ...] = Field(
+        ("lanes", "fsz", "anzahlDerFahrstreifen"),
+        description="columns (or OSM tags) with the number of lanes; the first with a value wins",
+    )
+    width_class_columns: tuple[str, ...] = Field(
+        ("brv", "breiteDesVerkehrsweges"),
+        description="columns with a width in classes of 3 m, with shoulders; used without width and lanes",
     )
     width_unit: Literal["m", "ft"] = Field("m", description="unit of widths without one")
     lane_width_m: float = Field(
@@ -103,7 +125,7 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
     Parameters
     ----------
     table : DataFrame
-        Its columns may hold widths and ``lanes``; names in lower case.
+        Its columns may hold widths and numbers of lanes; names in lower case.
     classes : sequence of str or None
         Class of each row.
     options : Options
@@ -118,10 +140,10 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
                 value = metres(text, bare_m)
                 unreadable += [text] if np.isnan(value) else []
                 # In many tables 0 means unknown.
-                width[i] = value if np.isnan(width[i]) and value > 0 else width[i]
+                width[i] = value if np.isnan(width[i]) and 0 < value < WIDEST_M else width[i]
     by_class = np.array([options.class_width_m.get(str(name), np.nan) for name in classes], float)
-    width = np.where(np.isnan(width), _by_lanes(table, options), width)
-    width = np.where(np.isnan(width), by_class, width)
+    for other in (_by_lanes(table, options), _by_width_class(table, options), by_class):
+        width = np.where(np.isnan(width), other, width)
     unknown = int(np.isnan(width).sum())
     notes = []
     if unreadable:
@@ -139,12 +161,25 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
 
 
 def _by_lanes(table: Any, options: Options) -> Floats:
-    lanes = np.full(len(table), np.nan)
-    for i, text in enumerate(table.get("lanes", ())):
-        if _has_value(text) and re.fullmatch(NUMBER, str(text).strip()):
-            lanes[i] = float(text)
-    lanes[(lanes < 1) | (lanes > MOST_LANES)] = np.nan
+    lanes = _numbers(table, options.lane_columns, 1, MOST_LANES)
     return lanes * options.lane_width_m + 2 * options.shoulder_m
+
+
+def _by_width_class(table: Any, options: Options) -> Floats:
+    """Return the middle of each row's class of widths (m), ``(n,)``."""
+    upper = _numbers(table, options.width_class_columns, LOWEST_CLASS_M, WIDEST_M)
+    return np.where(upper == LOWEST_CLASS_M, LOWEST_CLASS_M / 2, upper - CLASS_STEP_M / 2)
+
+
+def _numbers(table: Any, columns: tuple[str, ...], lowest: float, highest: float) -> Floats:
+    """Return the first number within limits of each row, ``(n,)``; NaN where no column has one."""
+    numbers = np.full(len(table), np.nan)
+    for column in map(str.lower, columns):
+        for i, text in enumerate(table.get(column, ())):
+            if np.isnan(numbers[i]) and _has_value(text) and re.fullmatch(NUMBER, str(text).strip()):
+                number = float(text)
+                numbers[i] = number if lowest <= number <= highest else np.nan
+    return numbers
 
 
 def _has_value(value: Any) -> bool:

@@ -3,11 +3,16 @@ import math
 import numpy as np
 import pandas
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from shapely import LineString
 
+from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.rasterise import roads
 from flexroad.tasks.roads.widths import Options, metres, widths
+from tests.make_roads import GRID, on_grid, tile, write
 
 
 @pytest.mark.parametrize(
@@ -91,3 +96,51 @@ def test_class_widths_replace_built_in_ones():
     assert options.class_width_m["residential"] == Options().class_width_m["residential"]
     with pytest.raises(ValidationError, match="above 0"):
         Options(class_width_m={"service": 0})
+
+
+ROADS = {
+    "OSM": {
+        "highway": ["residential", "primary", "tertiary", "service", "footway"],
+        "width": ["6.1", None, None, None, "2"],
+        "est_width": [None, "9", None, None, None],
+        "lanes": [None, "4", "2", None, None],
+    },
+    # Shapefiles shorten the names of attributes; 9998 is "not known".
+    "ATKIS": {
+        "BRF": [6.5, 0, 9998, 0, 0],
+        "FSZ": [2, 2, 0, 0, 9998],
+        "BRV": [12, 12, 9, 6, 9998],
+    },
+    "ATKIS in full": {
+        "breiteDerFahrbahn": ["6.5", None, None, None, None],
+        "anzahlDerFahrstreifen": [None, 2, None, None, None],
+        "breiteDesVerkehrsweges": [None, 12, 9, 6, None],
+    },
+    "TIGER": {"MTFCC": ["S1100", "S1200", "S1400", "S1730", "S1820"], "FULLNAME": list("abcde")},
+    "NWB": {"BST_CODE": ["RB", "RB", "HR", "OPR", "FP"], "WVK_ID": [1, 2, 3, 4, 5]},
+}
+EXPECTED = {
+    # Measured, estimated, two lanes of 3.25 m with 0.25 m beside them, by class; a footway is no road.
+    "OSM": [6.1, 9, 7, 4],
+    # Carriageway, lanes, the middle of 6 to 9 m and of 0 to 6 m, the default.
+    "ATKIS": [6.5, 7, 7.5, 3, 6],
+    "ATKIS in full": [6.5, 7, 7.5, 3, 6],
+    "TIGER": [11.5, 9, 8, 4.5],
+    "NWB": [6, 6, 6, 6],
+}
+
+
+@pytest.mark.parametrize("name", ROADS)
+def test_widths_by_the_attributes_of_a_dataset(tmp_path, name):
+    """Five parallel roads of 80 m in a file with the columns of each dataset."""
+    lines = [LineString(on_grid((10, 10 + 18 * k), (90, 10 + 18 * k))) for k in range(5)]
+    path = write(tmp_path / "r.gpkg", lines, **ROADS[name])
+    found = roads(tile(path).roads, GRID, rasterise.Options())
+    assert sorted(shapely.area(found.areas) / 80) == pytest.approx(sorted(EXPECTED[name]))
+
+
+def test_foot_and_bike_paths_of_bgt_are_no_roads(tmp_path):
+    kinds = ["rijbaan lokale weg", "voetpad", "fietspad", "parkeervlak", "voetgangersgebied"]
+    areas = [shapely.box(*on_grid((10, 10 + 18 * k))[0], *on_grid((90, 15 + 18 * k))[0]) for k in range(5)]
+    path = write(tmp_path / "bgt.gpkg", areas, bgt_functie=kinds)
+    assert len(roads(tile(path).roads, GRID, rasterise.Options()).areas) == 2
