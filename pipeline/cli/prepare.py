@@ -109,9 +109,18 @@ def prepare_points(
     bridge_class: Annotated[
         list[int] | None,
         typer.Option(
-            metavar="N", rich_help_panel=options.GROUND, help="Classes of bridge decks; default: 17."
+            metavar="N",
+            rich_help_panel=options.GROUND,
+            help="Classes of bridge decks; default: those of --class-scheme.",
         ),
     ] = None,
+    class_scheme: Annotated[
+        Literal["asprs", "ahn"],
+        typer.Option(
+            rich_help_panel=options.GROUND,
+            help="Meaning of the classes: bridges are 17 in asprs, 26 in the Dutch AHN.",
+        ),
+    ] = "asprs",
     dtm: Annotated[
         Literal["tin", "mean"] | None,
         typer.Option(
@@ -138,6 +147,7 @@ def prepare_points(
     They are DSM, DTM, bridge decks and orthophoto.
     """
     from flexroad.pipeline.prepare import points
+    from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES
 
     options = _points_options(
         slope,
@@ -147,7 +157,7 @@ def prepare_points(
         despike_m=despike,
         dtm=dtm,
         ground_classes=ground_class,
-        bridge_classes=bridge_class,
+        bridge_classes=bridge_class or BRIDGE_CLASSES[class_scheme],
     )
     _run(lambda: points.prepare_points(files, output, common, options, _executor(workers), _log, ground))
 

@@ -28,8 +28,9 @@ from flexroad.pipeline.prepare.point_buckets import (
 )
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
-from flexroad.tasks.acquire.points.to_rasters import Options, reach_m, tags
+from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, reach_m, tags
 
+AHN = BRIDGE_CLASSES["ahn"]
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01
 """A file with a smaller share of ground points is taken as not classified."""
@@ -104,7 +105,8 @@ def prepare_points(
         _require_no_gap(clouds, frame, bucketed, common.cell_m)
         grid = prepared_grid(bucketed.bounds, frame.target, common, names, out, photo=not colourless)
         common, dated = _dated(common, clouds, bucketed)
-        notes = (*frame.notes, *notes, *dense, *dated, *_left_out(bucketed, colourless))
+        notes = (*frame.notes, *notes, *dense, *dated, *_other_bridges(bucketed, options))
+        notes += _left_out(bucketed, colourless)
         file_tags = _tags(clouds, frame, bucketed, options)
         dop_cell = None if colourless else common.dop_cell_m
         with RasterWriter(out, grid, dop_cell, file_tags, frame.vertical) as writer:
@@ -197,6 +199,17 @@ def _for_density(options: Options, bucketed: BucketedPoints) -> tuple[Options, t
 
 def _classes(classes: Collection[int]) -> str:
     return "class " + ", ".join(map(str, classes))
+
+
+def _other_bridges(bucketed: BucketedPoints, options: Options) -> tuple[str, ...]:
+    """Return a note on points of a class that is one of bridges in another scheme."""
+    number = int(sum(kinds[list(AHN)].sum() for kinds in bucketed.kinds))
+    if not number or set(AHN) & {*options.bridge_classes, *options.ground_classes}:
+        return ()
+    return (
+        f"{number:,} points of {_classes(AHN)}, bridges and other structures in the Dutch AHN, are not used "
+        "as bridges; --class-scheme ahn does so",
+    )
 
 
 def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str, ...]:

@@ -21,6 +21,10 @@ from flexroad.tasks.acquire.points.orthophoto import photo
 from flexroad.tasks.acquire.types import Points, Rasters
 from flexroad.tasks.types import Bools, Floats, Orthophoto
 
+BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
+"""Classes of bridge decks by the scheme of a point cloud: ASPRS LAS 1.4, also in Switzerland, Sweden and
+North Rhine-Westphalia; the Dutch AHN, whose class of structures (kunstwerken) also has locks and weirs."""
+
 
 class Options(base.Options):
     """How points become rasters."""
@@ -36,7 +40,9 @@ class Options(base.Options):
         description="classes: ground points have a ground class; filter: the slope filter identifies them",
     )
     ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
-    bridge_classes: tuple[int, ...] = Field((17,), description="classes of bridge decks; never ground")
+    bridge_classes: tuple[int, ...] = Field(
+        BRIDGE_CLASSES["asprs"], description="classes of bridge decks; never ground"
+    )
     dtm: Literal["tin", "mean"] = Field(
         "tin",
         description="tin: linear between the cells' ground centroids; mean: mean ground height per cell",

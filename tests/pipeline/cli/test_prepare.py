@@ -114,3 +114,21 @@ def test_prepare_interrupted_leaves_no_folder(cloud, tmp_path, number):
     assert process.returncode == 130, output
     assert "nothing was written" in output[1]
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "is_bridge"),
+    [
+        ((), False),
+        (("--class-scheme", "ahn"), True),
+        (("--class-scheme", "ahn", "--bridge-class", "17"), False),
+    ],
+)
+def test_prepare_points_class_scheme_selects_bridges(tmp_path, words, is_bridge):
+    east, north = np.meshgrid(np.arange(0, 40, 0.5), np.arange(0, 40, 0.5))
+    kind = np.where(abs(north - 20) < 4, 26, 2)
+    xyz = np.stack([east + WEST, north + SOUTH, np.where(kind == 26, 6.0, 0.0)], axis=-1).reshape(-1, 3)
+    path = write_cloud(tmp_path / "ahn.las", xyz, kind.ravel(), "EPSG:28992")
+    said = flexroad("prepare", "points", path, "-o", tmp_path / "out", "--workers", 1, *words)
+    assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
+    assert ("--class-scheme ahn does so" in said) == (not is_bridge)

@@ -379,3 +379,18 @@ def test_date_is_only_assumed_if_one_file_has_none(tmp_path):
     result, _ = prepare(files, tmp_path / "out")
     (tile,) = Catalog.read(result.catalog).tiles
     assert (f"{tile.datetime:%Y-%m-%d}", tile.datetime_assumed) == ("2021-06-07", True)
+
+
+@pytest.mark.parametrize(
+    ("classes", "is_bridge"), [(None, False), ((26,), True), ((17, 26), True), ((17,), False)]
+)
+def test_structures_of_ahn_are_bridges_only_if_told(tmp_path, classes, is_bridge):
+    """A deck of class 26, 6 m above the ground."""
+    xyz, kind, _ = world()
+    path = write_cloud(tmp_path / "a.las", xyz, np.where(kind == 17, 26, kind), "EPSG:25832")
+    options = Options() if classes is None else Options(bridge_classes=classes)
+    result, _ = prepare([path], tmp_path / "out", options=options)
+    assert (tmp_path / "out" / "bridges.tif").is_file() == is_bridge
+    noted = [note for note in result.notes if "--class-scheme ahn" in note]
+    assert len(noted) == (not is_bridge)
+    assert all(f"{(kind == 17).sum():,} points of class 26" in note for note in noted)
