@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all fuzz lint bench clean
+.PHONY: help setup reproduce run rerun test test-all fuzz lint bench container clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -96,6 +96,15 @@ lint: $(STAMP) ## Check style and types
 
 bench: $(STAMP) ## Print the benchmarks' tables
 	@for bench in tests/bench/bench_*.py; do echo "== $$bench"; PYTHONPATH=. $(BIN)/python $$bench || exit 1; done
+
+# The extras of pyproject.toml in the image, and where PyTorch's build for CPUs comes from.
+BUILDER ?= podman
+IMAGE ?= flexroad
+EXTRAS ?= s3
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+
+container: ## Build a container image: make container [BUILDER=docker] [IMAGE=flexroad] [EXTRAS=s3,train]
+	$(BUILDER) build --build-arg EXTRAS=$(EXTRAS) --build-arg TORCH_INDEX=$(TORCH_INDEX) --tag $(IMAGE) --file Containerfile .
 
 clean: ## Remove the environment, caches and runs
 	rm -rf $(VENV) runs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
