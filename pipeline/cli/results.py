@@ -28,11 +28,14 @@ def report(
 
     The file is RUN/report.md, .csv or .html.
     """
+    from rich.console import Console
+
     from flexroad.catalog.storage.paths import read
+    from flexroad.pipeline.monitor.progress import StepProgress
     from flexroad.pipeline.report import write_report
     from flexroad.pipeline.run.record import Run
 
-    written = write_report(Run.open(path, allow or ()), form)
+    written = write_report(Run.open(path, allow or ()), form, StepProgress(Console(stderr=True)))
     if form != "html":
         echo_document(read(written).decode())
     echo(f"written to {written}", err=True)

@@ -131,9 +131,11 @@ def run(
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         chosen = load_config(config, settings or ())
-        whole, selected = read_catalog(chosen)
+        with _named(f"reading {catalog}"):
+            whole, selected = read_catalog(chosen)
         with _locked(path, create=True):
-            opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
+            with _named(f"preparing {out}"):
+                opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
             make_executor = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
@@ -186,12 +188,25 @@ def rerun(
         # The control points of a border are part of the fit.
         force |= {BORDER} if "fit" in force else frozenset()
         with _locked(location):
-            opened = Run.open(location, allow or ())
-            check_allowed(opened.catalog, layers_read(opened.config))
+            with _named(f"reading {path}"):
+                opened = Run.open(location, allow or ())
+                check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
             make_executor = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
             _run_tiles(opened, make_executor, only, force, verify, outcome)
     _exit(outcome)
+
+
+@contextlib.contextmanager
+def _named(work: str) -> Iterator[None]:
+    """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
+    from flexroad.pipeline.monitor.progress import FIRST_S, said_repeatedly
+
+    def line(spent_s: float) -> str:
+        return f"{work}, {spent_s:.0f} s spent"
+
+    with said_repeatedly(line, lambda text: echo(text, err=True), FIRST_S):
+        yield
 
 
 @contextlib.contextmanager

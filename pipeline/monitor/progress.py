@@ -1,10 +1,14 @@
-"""Progress of a run: a live display on a terminal, plain lines elsewhere."""
+"""Progress of commands: a live display on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
+from typing import TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -16,14 +20,86 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
+    track,
 )
 from rich.text import Text
 
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.worker.tile import TileResult
 
+FIRST_S = 1.0
+"""Time after which work that has not ended yet is named (s)."""
 PLAIN_EVERY_S = 10.0
-"""Interval of plain progress lines (s)."""
+"""Shortest interval of plain progress lines (s)."""
+SILENT_EVERY_S = 60.0
+"""Interval of plain progress lines while there is no new result (s)."""
+T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def said_repeatedly(
+    line: Callable[[float], str], say: Callable[[str], None], wait_s: float
+) -> Iterator[None]:
+    """Say a line if the block takes longer than ``wait_s``, and then every `PLAIN_EVERY_S`.
+
+    Parameters
+    ----------
+    line : callable
+        Takes the time since the start of the block (s); an empty line is not said.
+    """
+    ended, start = threading.Event(), time.monotonic()
+
+    def speak() -> None:
+        wait = wait_s
+        while not ended.wait(wait):
+            wait = PLAIN_EVERY_S
+            if text := line(time.monotonic() - start):
+                say(text)
+
+    speaker = threading.Thread(target=speak, daemon=True)
+    speaker.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        speaker.join()
+
+
+class StepProgress:
+    """Shows how many items of a step are done: a bar on a terminal, else plain lines if it takes long."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+
+    def __call__(self, items: Iterable[T], step: str, total: int) -> Iterator[T]:
+        """Yield the items of a step.
+
+        Parameters
+        ----------
+        items : iterable
+        step : str
+            What is done with the items: ``checking tiles``.
+        total : int
+            Number of items.
+        """
+        if self.console.is_terminal:
+            yield from track(items, step, total, console=self.console, transient=True)
+            return
+        done = 0
+
+        def line(spent_s: float) -> str:
+            return f"{step}: {done} of {total}, {spent_s:.0f} s spent"
+
+        with said_repeatedly(line, lambda text: print_line(self.console, text), FIRST_S):
+            for item in items:
+                yield item
+                done += 1
+
+
+def print_line(console: Console, text: str) -> None:
+    """Print one line; characters that cannot be printed are escaped."""
+    # File names may contain markup characters, and paths must not be wrapped.
+    console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
 
 class ProgressDisplay:
@@ -36,6 +112,10 @@ class ProgressDisplay:
         self.stages: Counter[str] = Counter()
         self.without_roads = 0
         self.start = self.last_line = time.monotonic()
+        self.told = -1
+        """Number of results in the last plain line; -1 before the first one."""
+        self.lock = threading.Lock()
+        """Held while counts are changed or read: plain lines are printed by a thread of their own."""
         self.progress = Progress(
             SpinnerColumn(),
             BarColumn(24),
@@ -50,6 +130,7 @@ class ProgressDisplay:
         self.bar = self.progress.add_task("tiles", total=total)
         # The counts have their own line: beside the bar there is too little space.
         self.counts_line = Text("  starting", overflow="ellipsis", no_wrap=True)
+        self.stack = contextlib.ExitStack()
         self.live = (
             Live(Group(self.progress, self.counts_line), console=console) if console.is_terminal else None
         )
@@ -60,26 +141,26 @@ class ProgressDisplay:
         else:
             # In a log, or a pipe, the first results may take minutes.
             self.say(f"starting: {count(self.total, 'tile')}")
+            self.stack.enter_context(said_repeatedly(self._due_line, self.say, PLAIN_EVERY_S))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.stack.close()
         if self.live:
             self.live.stop()
 
     def __call__(self, result: TileResult) -> None:
         """Add a tile's result."""
-        self.status[result.status] += 1
-        self.stages.update(result.computed)
-        self.without_roads += result.entry.without_roads
+        with self.lock:
+            self.status[result.status] += 1
+            self.stages.update(result.computed)
+            self.without_roads += result.entry.without_roads
         for failure in result.failures:
             self.say(f"failed {failure.notice}")
         self.progress.update(self.bar, advance=1)
         self.counts_line.plain = f"  {self.counts()}"
-        if not self.live and time.monotonic() - self.last_line > PLAIN_EVERY_S:
-            self.last_line = time.monotonic()
-            self.say(self.line())
 
     def counts(self) -> str:
         """Return the counts of tiles by status and of computed results by stage."""
@@ -93,11 +174,21 @@ class ProgressDisplay:
         """Return the progress as one plain line."""
         tried = sum(self.status.values())
         spent = time.monotonic() - self.start
-        left = spent / tried * (self.total - tried) if tried else float("nan")
         tiles = count(self.total, "tile")
+        if not tried:
+            return f"0/{tiles}, no result yet, {spent:.0f} s spent"
+        left = spent / tried * (self.total - tried)
         return f"{tried}/{tiles}, {self.counts()}, {spent:.0f} s spent, about {left:.0f} s left"
+
+    def _due_line(self, _: float) -> str:
+        """Return the plain line if there are new results or it is time for one, else an empty text."""
+        with self.lock:
+            tried, now = sum(self.status.values()), time.monotonic()
+            if tried == self.told and now - self.last_line < SILENT_EVERY_S:
+                return ""
+            self.told, self.last_line = tried, now
+            return self.line()
 
     def say(self, text: str) -> None:
         """Print one line; characters that cannot be printed are escaped."""
-        # File names may contain markup characters, and paths must not be wrapped.
-        self.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+        print_line(self.console, text)

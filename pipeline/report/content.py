@@ -12,7 +12,7 @@ from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import summary
+from flexroad.pipeline.run.status import Track, summary, untracked
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.tables import read_metrics
 
@@ -74,7 +74,7 @@ class Content:
     """Ids of the finished tiles, in the order of the catalog."""
 
 
-def gather(run: Run) -> Content:
+def gather(run: Run, track: Track = untracked) -> Content:
     """Collect the tables of a run.
 
     Raises
@@ -84,7 +84,7 @@ def gather(run: Run) -> Content:
     """
     rows = read_metrics(run.path)
     done = rows[rows.status == "done"]
-    counts = summary(run)
+    counts = summary(run, track)
     variants = [name for name in run.config.chains if name in set(done.variant)]
     exported = run.config.export.variants[0]
     failures = pd.DataFrame(
@@ -103,7 +103,7 @@ def gather(run: Run) -> Content:
         quality=over_tiles(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
         meshes=mesh_checks(rows, run.config.chains),
-        steps=edge_steps(run),
+        steps=edge_steps(run, track=track),
         failures=failures,
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),

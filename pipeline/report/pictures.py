@@ -8,7 +8,7 @@ from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
 from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
@@ -19,14 +19,15 @@ MOST = 24
 NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 
 
-def tile_pictures(run: Run, content: Content) -> list[TilePictures]:
+def tile_pictures(run: Run, content: Content, track: Track = untracked) -> list[TilePictures]:
     """Draw the exported variant of every tile, or of the worst tiles of a large run."""
     variant = run.config.export.variants[0]
     tile_ids = _shown(content)
     maps: dict[str, TilePictures] = {}
     meshes: dict[str, Mesh] = {}
     tiles = {tile.id: tile for tile in run.catalog.tiles}
-    for status in peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids]):
+    statuses = peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids])
+    for status in track(statuses, "drawing tiles", len(tile_ids)):
         graph = status.graph
         evaluate = Evaluator(graph, ArtefactStore(run.store))
         try:

@@ -7,7 +7,7 @@ Other fits know nothing of the neighbours.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +18,7 @@ from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.graph.graph import Node, TileGraph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import peek_statuses
+from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
@@ -46,7 +46,7 @@ class EdgeSteps:
     """Which tiles were compared; empty if all."""
 
 
-def edge_steps(run: Run, most: int = MOST) -> EdgeSteps:
+def edge_steps(run: Run, most: int = MOST, track: Track = untracked) -> EdgeSteps:
     """Return the steps per exported variant and pair of neighbours.
 
     Parameters
@@ -55,6 +55,8 @@ def edge_steps(run: Run, most: int = MOST) -> EdgeSteps:
         The run; pairs whose surfaces are not in its store are left out.
     most : int
         Largest number of tiles compared with their neighbours.
+    track : callable
+        Shows the progress.
     """
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)
@@ -65,7 +67,11 @@ def edge_steps(run: Run, most: int = MOST) -> EdgeSteps:
         for status in peek_statuses(run, wanted.values())
         if status.done
     }
-    rows = [row for variant in run.config.export.variants for row in _rows(run, pairs, done, variant)]
+    rows = [
+        row
+        for variant in run.config.export.variants
+        for row in _rows(run, track(pairs, "comparing neighbours", len(pairs)), done, variant)
+    ]
     table = pd.DataFrame(rows, columns=COLUMNS)
     check = [_checked(run, str(variant), part) for variant, part in table.groupby("variant", sort=False)]
     apart = table[(table[LARGEST] != 0) | (table[ANGLE] != 0)]
@@ -105,7 +111,7 @@ def _nodes(graph: TileGraph) -> dict[str, Nodes]:
 
 
 def _rows(
-    run: Run, pairs: Sequence[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
+    run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float, float]]:
     store = ArtefactStore(run.store)
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property, partial
 from itertools import repeat
+from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import FileStat, Location, is_remote, listing, read
@@ -35,6 +36,13 @@ from flexroad.pipeline.store.records import (
 )
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+Track = Callable[[Iterable[Any], str, int], Iterable[Any]]
+"""Returns the items of a step, whose name and number it takes; it may show how many are done."""
+
+
+def untracked(items: Iterable[Any], step: str, total: int) -> Iterable[Any]:
+    """Return the items; a `Track` that shows nothing."""
+    return items
 
 
 @dataclass(frozen=True)
@@ -194,10 +202,10 @@ def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, 
         yield status.graph.tile.id, state, status.last_record
 
 
-def summary(run: Run) -> Summary:
+def summary(run: Run, track: Track = untracked) -> Summary:
     """Return the current summary of a run; checks every tile, its sources and its products."""
     with open_database(run) as database:
-        current = _checked(run, database)[0]
+        current = _checked(run, database, track=track)[0]
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(current, **{name: last[name] for name in names if name in last})
@@ -215,10 +223,13 @@ def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summa
     return current, listed.finished
 
 
-def _checked(run: Run, database: RunDatabase, since: str | None = None) -> tuple[Summary, int]:
+def _checked(
+    run: Run, database: RunDatabase, since: str | None = None, track: Track = untracked
+) -> tuple[Summary, int]:
     """Return what `recorded_summary` returns, from the tiles' folders and source files."""
     counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
-    for status, state in tile_states(run, database, since):
+    states = tile_states(run, database, since)
+    for status, state in track(states, "checking tiles", len(run.catalog.tiles)):
         counts[state] += 1
         record = status.last_record
         finished += record is not None and record.finished >= (since or "")

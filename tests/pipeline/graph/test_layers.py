@@ -69,6 +69,6 @@ def test_run_without_any_road_source_exits_before_the_first_tile(words, survey, 
     tiles = Catalog.read(survey).tiles
     Catalog(tuple(without(tile, "road_mask", "roads") for tile in tiles)).write(survey)
     command = ("run", "--catalog", survey, "--out", tmp_path / "run", "--executor", "serial")
-    (line,) = flexroad(*command, *words).expected(2).err.splitlines()
+    (line,) = flexroad(*command, *words).expected(2).errors
     assert line.startswith("error: production: no tile of the catalog has a road mask")
     assert not (tmp_path / "run" / "tiles").exists()
