@@ -20,7 +20,7 @@ Kind = Literal[
     "file missing",
     "product missing",
     "source changed",
-    "options changed",
+    "settings or version changed",
 ]
 
 
@@ -56,10 +56,10 @@ def reason(run: Run, status: TileStatus) -> Reason:
     if record.fingerprint == graph.fingerprint:
         return Reason("product missing")
     if _compared_otherwise(record, graph):
-        return Reason("options changed", "--checksum")
+        return Reason("settings or version changed", "--checksum")
     if changed := _changed_sources(record, graph):
         return Reason("source changed", changed)
-    return Reason("options changed", _changed_stage(run, graph))
+    return Reason("settings or version changed", _changed_stage(run, graph))
 
 
 def _first(names: Sequence[str], what: str) -> str:

@@ -72,13 +72,13 @@ def test_reasons_name_changed_files_and_failures(run, reasons, survey, tmp_path)
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (("--set", "fit.iterations=4"), "options changed: fit"),
-        (("--set", "ecsrc.theta_z_m=0.4"), "options changed: ecsrc"),
-        (("--set", "load.min_valid=0.1"), "options changed: load"),
+        (("--set", "fit.iterations=4"), "settings or version changed: fit"),
+        (("--set", "ecsrc.theta_z_m=0.4"), "settings or version changed: ecsrc"),
+        (("--set", "load.min_valid=0.1"), "settings or version changed: load"),
         (("--set", "segment=vector"), "source changed: now reads roads"),
-        (("--set", "export.formats=[glb]"), "options changed: export"),
-        (("--set", "variants.other={fit: plane}"), "options changed: variant other"),
-        (("--checksum",), "options changed: --checksum"),
+        (("--set", "export.formats=[glb]"), "settings or version changed: export"),
+        (("--set", "variants.other={fit: plane}"), "settings or version changed: variant other"),
+        (("--checksum",), "settings or version changed: --checksum"),
     ],
 )
 def test_reasons_name_the_first_stage_that_changed(made_survey, flexroad, tmp_path, words, line, light):
