@@ -103,7 +103,7 @@ def train(
     from flexroad.catalog.storage.outputs import output_file
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
-    from flexroad.pipeline.report.training import summary, write_model
+    from flexroad.pipeline.report.training import summary, verdict, write_model
     from flexroad.pipeline.store.artefacts import check_writable
     from flexroad.pipeline.training.train import TrainOptions, train
     from flexroad.tasks.errors import TaskError
@@ -128,7 +128,10 @@ def train(
         echo(f"note: {note}", err=True)
     echo(f"{model}: {summary(outcome)}")
     echo(f"report: {page}")
-    echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
+    if warning := verdict(outcome):
+        echo(f"warning: {warning}", err=True)
+    else:
+        echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
 
 
 def _settings(assignments: list[str]) -> dict[str, Any]:

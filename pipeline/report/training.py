@@ -25,6 +25,9 @@ from flexroad.tasks.roads.mask_metrics import Quality
 
 SHOWN = 3
 """Number of best and of worst tiles in the report."""
+POOR_IOU = 0.5
+"""IoU below which a model is called poor: with precision equal to recall, a third of the cells that it marks
+are no road at 0.5, half of them at 0.33. Centre lines with one width for all roads reach 0.65 to 0.75."""
 COLUMNS = {
     "iou": "IoU",
     "precision": "precision",
@@ -68,6 +71,23 @@ def summary(outcome: Outcome) -> str:
     )
 
 
+def verdict(outcome: Outcome) -> str:
+    """Return why the model should not be used as it is, and what to do; empty if it can be used."""
+    iou = outcome.quality.iou
+    if math.isnan(iou):
+        return (
+            "the validation tiles have no road, by their labels and by the model, so that its quality is "
+            "unknown; label tiles with roads, or choose others with --seed"
+        )
+    if iou >= POOR_IOU:
+        return ""
+    return (
+        f"an IoU of {iou:.2f} is poor (below {POOR_IOU:g}): much of what the model marks is no road, or it "
+        "misses much of the road; label more tiles and other kinds of ground, compare labels and pictures in "
+        "the report, or take roads from vectors (segment: vector)"
+    )
+
+
 def _figures(quality: Quality) -> dict[str, float]:
     return {name: getattr(quality, name) for name in COLUMNS}
 
@@ -103,7 +123,9 @@ def _page(outcome: Outcome, name: str) -> str:
 
 def _lines(outcome: Outcome) -> list[str]:
     options, split = outcome.options, outcome.split
+    warning = verdict(outcome)
     return [
+        *([f"Warning: {warning}."] if warning else []),
         f"Method {options.method}, labels: {options.labels}. Trained on {count(len(split.train), 'tile')}, "
         f"validated on {len(split.validate)} in one separate block. Not used for training: cells nearer to "
         f"the block than {options.gap_m:g} m, and cells nearer to an edge of the labels than "
@@ -126,13 +148,14 @@ def _curves(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
     overall = outcome.quality
     _, precision, recall = overall.curve()
     valid = np.isfinite(precision) & np.isfinite(recall)
-    if valid.any():
+    # One point is no curve.
+    if valid.sum() > 1:
         mark = None if math.isnan(overall.precision) else (overall.recall, overall.precision, "the mask")
         line = {"thresholds from 0 to 1": (recall[valid], precision[valid])}
         limits = ((0.0, 1.02), (0.0, 1.02))
         yield "Precision and recall by threshold", curves(line, ("recall", "precision"), limits, mark)
     history = outcome.trained.history
-    if history:
+    if len(history) > 1:
         rounds = np.arange(1.0, len(history) + 1)
         losses = {
             "training": (rounds, np.array([entry.train_loss for entry in history])),

@@ -1,10 +1,12 @@
 """`flexroad train` on synthetic tiles; its report is compared with their known truth."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from scipy import ndimage
 
@@ -19,6 +21,7 @@ from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.segment.pixels import segment
+from tests.command_line import call
 from tests.pipeline.cli.test_main import flexroad
 
 QUICK = ("--set", "rounds=15", "--set", "cells=2000")
@@ -75,6 +78,38 @@ def test_train_report_equals_segmenter_on_validation_tiles(land, trained):
     losses = [entry["train_loss"] for entry in report["history"]]
     assert 1 < len(losses) <= 15
     assert losses[-1] < losses[0]
+
+
+def test_train_with_poor_result_says_so_and_does_not_recommend_it(land, tmp_path):
+    survey = shutil.copytree(land.parent, tmp_path / "land")
+    blobs = np.random.default_rng(0)
+    for path in (survey / "reference_road").glob("*.tif"):
+        with rasterio.open(path, "r+") as file:
+            # Labels that nothing in the rasters tells: squares of 8 m at random places.
+            squares = np.kron(blobs.random((10, 10)) < 0.15, np.ones((8, 8)))
+            file.write(squares.astype(file.dtypes[0]), 1)
+    model = tmp_path / "poor.skops"
+    words = ("--method", "pixels", "--labels", "mask", "--gap-m", 20, "--set", "cells=2000")
+    said = call("train", survey / land.name, *words, "-o", model, "--set", "rounds=1").expected(0)
+    report = json.loads(model.with_name("poor.skops.json").read_text())
+    iou = report["all"]["iou"]
+    assert iou < 0.4
+    assert f"warning: an IoU of {iou:.2f} is poor (below 0.5)" in said.err
+    assert "next:" not in said.out
+    assert "segment: {" not in said.out
+    page = model.with_name("poor.skops.html").read_text()
+    assert f"Warning: an IoU of {iou:.2f} is poor" in page
+    assert len(report["history"]) == 1
+    assert "Loss by round" not in page
+
+
+def test_train_with_good_result_says_how_to_use_it(land, tmp_path):
+    model = tmp_path / "good.skops"
+    words = ("--method", "pixels", "--labels", "mask", "--gap-m", 20, *QUICK)
+    said = call("train", land, *words, "-o", model).expected(0)
+    assert f"next: in a configuration, segment: {{method: pixels, model: {model}}}" in said.out
+    assert "warning" not in said.err
+    assert "Loss by round" in model.with_name("good.skops.html").read_text()
 
 
 def test_train_page_is_self_contained_and_shows_tiles(trained):
