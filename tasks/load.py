@@ -134,8 +134,8 @@ def load(tile: Tile, options: Options) -> TileData:
         reference=_reference(mosaics),
         reference_road=_road(tile, "reference_road", mosaics),
         notes=tuple(note for mosaic in mosaics.values() for note in mosaic.notes),
-        dop=_source(tile, "dop"),
-        roads=_source(tile, "roads"),
+        dop=layer_source(tile, "dop"),
+        roads=layer_source(tile, "roads"),
     )
 
 
@@ -174,13 +174,16 @@ def load_border(ground: Tile, core: Grid) -> TileData:
         dsm=mosaics["dsm"].values if "dsm" in mosaics else unknown,
         dtm=mosaics["dtm"].values if "dtm" in mosaics else unknown,
         road_mask=_road(ground, "road_mask", mosaics),
-        dop=_optional(_source(ground, "dop")),
-        roads=_optional(_source(ground, "roads")),
+        dop=_optional(layer_source(ground, "dop")),
+        roads=_optional(layer_source(ground, "roads")),
     )
 
 
-def _source(tile: Tile, name: str) -> Source | None:
-    """Return a layer that another stage reads, without missing files that do not reach the tile."""
+def layer_source(tile: Tile, name: str) -> Source | None:
+    """Return a layer that another stage reads, or None if the tile has none.
+
+    Missing files that do not reach the tile are left out.
+    """
     layer = tile.layer(name)
     if layer is None:
         return None

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.export import glb
 from flexroad.tasks.io.orthophoto import read_photo
-from flexroad.tasks.types import Source
+from flexroad.tasks.load import layer_source
 
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 
@@ -40,15 +40,15 @@ def tile_texture(graph: TileGraph) -> TileTexture:
     if not graph.product_sources:
         return TileTexture(note=NO_PHOTO)
     (layer,) = graph.product_sources
-    files = tile.paths(layer)
-    source = Source(layer.name, files, layer.crs, allowed=tile.allowed)
+    source = layer_source(replace(tile, layers=(layer,)), layer.name)
+    assert source is not None
     west, south, east, north = tile.grid.bounds
     try:
         photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / export.texture_px)
     except LayerMissing:
         return TileTexture(note=NO_PHOTO)
     finally:
-        check_unchanged(graph, files)
+        check_unchanged(graph, source.paths)
     unknown = 1 - photo.known.mean()
     if unknown == 1:
         return TileTexture(note=NO_PHOTO)

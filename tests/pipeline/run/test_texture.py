@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import rasterio
 import trimesh
+from rasterio.enums import Resampling
+from rasterio.vrt import WarpedVRT
 from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Catalog, Layer
@@ -87,6 +89,26 @@ def test_run_photo_lies_where_the_mesh_does_and_changes_nothing_else(photographe
     item = json.loads((textured.folder(bare).path / "item.json").read_text())
     assert item["properties"]["flexroad:notes"] == [NO_PHOTO]
     assert not any("notes" in event for event in events(plain))
+
+
+def test_run_photo_in_another_crs_is_warped_if_its_layer_allows_it(photographed, tmp_path):
+    tile, path = photographed.tiles[0], photo_of(photographed, 0)
+    with (
+        rasterio.open(path) as file,
+        WarpedVRT(file, crs="EPSG:25833", resampling=Resampling.bilinear) as vrt,
+    ):
+        profile = {"driver": "GTiff", "dtype": "uint8", "count": 3, "crs": vrt.crs, "nodata": 0}
+        profile |= {"width": vrt.width, "height": vrt.height, "transform": vrt.transform}
+        values = vrt.read()
+    with rasterio.open(path, "w", **profile) as file:
+        file.write(values)
+    photo = replace(tile.layer("dop"), reproject=True)
+    tile = replace(tile, layers=(*tile.layers[:-1], photo))
+    run = Run.create(tmp_path / "run", TEXTURED, Catalog((tile,)))
+    assert run_tiles(run, SerialExecutor()).done == 1
+    for part in mesh_of(run, tile).geometry.values():
+        errors = told_place(part.visual) - part.vertices[:, [0, 2]] * (1, -1)
+        assert np.abs(errors.mean(axis=0)).max() < 0.3 * CELL
 
 
 def events(run):
