@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 TOLERANCE_M = 0.01
 """Largest distance by which an outline is simplified (m)."""
+GAP_M = 0.02
+"""Gaps between roads up to this width (m) are closed: drawn neighbours often miss each other."""
 MARGIN_M = 1.0
 """Distance beyond a grid up to which its roads are kept (m)."""
 
@@ -45,7 +47,7 @@ class RoadOutline:
 
 
 def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
-    """Return the union of roads on a grid as WKB, None if no road reaches the grid.
+    """Return the union of roads on a grid as WKB, None if no road reaches the grid; gaps are closed.
 
     Parameters
     ----------
@@ -60,7 +62,8 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
     valid = _polygons(np.where(shapely.is_valid(near), near, shapely.make_valid(near)))
     valid = valid[shapely.intersects(valid, within)]
     cut = shapely.transform(shapely.intersection(valid, within), lambda points: points - core.origin)
-    polygons = _polygons(shapely.union_all(shapely.set_precision(_polygons(cut), GRID_M), grid_size=GRID_M))
+    united = shapely.union_all(shapely.set_precision(_polygons(cut), GRID_M), grid_size=GRID_M)
+    polygons = _polygons(shapely.union(united, _closed(united), grid_size=GRID_M))
     if not len(polygons):
         return None
     return np.frombuffer(shapely.to_wkb(shapely.multipolygons(polygons)), np.uint8)
@@ -104,12 +107,20 @@ def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
     return np.unique(np.round(distances / GRID_M) * GRID_M)
 
 
+def _closed(areas: shapely.Geometry) -> shapely.Geometry:
+    """Return areas with their gaps closed, but possibly without their tips."""
+    import shapely
+
+    wider = shapely.buffer(areas, GAP_M / 2, join_style="mitre")
+    return shapely.buffer(wider, -GAP_M / 2, join_style="mitre")
+
+
 def _polygons(geometries: Any) -> NDArray[np.object_]:
     """Return the polygons in geometries of any kind."""
     import shapely
 
     parts = shapely.get_parts(shapely.get_parts(geometries))
-    return np.asarray(parts[shapely.get_type_id(parts) == 3])
+    return np.asarray(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)])
 
 
 def _lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:
