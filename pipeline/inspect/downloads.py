@@ -62,6 +62,8 @@ class Download:
     """Of rasters and clouds: the short name of their CRS, None if the file has none."""
     question: str = ""
     """What the user must decide; empty if nothing."""
+    metric: bool = True
+    """False for a raster whose CRS is in feet or degrees."""
 
 
 def look(folder: Path) -> tuple[list[Download], bool]:
@@ -138,13 +140,10 @@ def _raster(path: Path, folder: Path) -> Download:
         question = "it is named like an orthophoto, but has one band"
     elif kind == "road_mask":
         question = _of_mask(values[1])
+    metric = crs is None or plan_unit(crs)[1] == 1.0
     if crs is None:
         question = question or NO_CRS
-    elif plan_unit(crs)[1] != 1.0:
-        question = (
-            question or f"its CRS is in {plan_unit(crs)[0]}: use --reproject --to-crs with one in metres"
-        )
-    return Download(path, kind, about, short(crs) if crs else None, question)
+    return Download(path, kind, about, short(crs) if crs else None, question, metric)
 
 
 def _of_mask(values: str) -> str:

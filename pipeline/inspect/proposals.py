@@ -81,13 +81,19 @@ def _sources(
 
 
 def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iterator[Proposal]:
-    """Yield a command for the rasters of each CRS; downloads of Geobasis NRW have a command of their own."""
+    """Yield a command for the rasters of each CRS, or one for all if the surface models have the same.
+
+    Downloads of Geobasis NRW have a command of their own.
+    """
     from flexroad.catalog.sources import nrw
 
     rasters = [download for layer in LAYERS for download in by_kind[layer]]
-    systems = dict.fromkeys(download.crs for download in by_kind["dsm"] or by_kind["dtm"])
-    for number, crs in enumerate(systems):
-        chosen = _for_system(rasters, crs)
+    systems = dict.fromkeys(download.crs for download in rasters if download.kind in ("dsm", "dtm"))
+    surfaces = dict.fromkeys(download.crs for download in by_kind["dsm"])
+    # A layer in another CRS is warped onto the only one of the surface models.
+    mixed = len(surfaces) == 1 and any(d.crs not in (None, *surfaces) for d in rasters)
+    for number, crs in enumerate(surfaces if mixed else systems):
+        chosen = [d for d in rasters if d.crs == crs or (mixed and d.crs is not None)]
         output = Path(f"{_title(folder)}{number + 1 if number else ''}.parquet")
         layers = {download.kind for download in chosen}
         lacking = [f"--{layer} FILES" for layer in ("dsm", "dtm") if layer not in layers]
@@ -101,9 +107,11 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
                 words += [f"--{layer.replace('_', '-')}", pattern]
             else:
                 lacking.append(f"--{layer.replace('_', '-')} FILES: no one pattern has just these files")
+        in_metres = all(download.metric for download in chosen if download.kind == "dsm")
+        words += ["--reproject"] if mixed or not in_metres else []
+        lacking += [] if in_metres else ["--to-crs with a CRS in metres"]
         roads = [] if "road_mask" in layers else _roads(by_kind)
         words += roads
-        words += ["--reproject"] if any(download.crs != crs for download in chosen) else []
         has = "road_mask" if "road_mask" in layers else "roads" if roads else ""
         if roads and by_kind["roads"][0].question:
             lacking.append(LAYER)
@@ -114,14 +122,6 @@ def _of_rasters(folder: Path, by_kind: Mapping[str, Sequence[Download]]) -> Iter
         if crs is None:
             lacking.append("--crs")
         yield Proposal(shlex.join([*words, "-o", str(output)]), output, has, _listed(lacking))
-
-
-def _for_system(rasters: Sequence[Download], crs: str | None) -> list[Download]:
-    """Return the rasters in a CRS, and in others those of layers that it lacks: they can be reprojected."""
-    own = [download for download in rasters if download.crs == crs]
-    layers = {download.kind for download in own}
-    others = [download for download in rasters if download.kind not in layers and download.crs and crs]
-    return own + others
 
 
 def _listed(lacking: Sequence[str]) -> str:

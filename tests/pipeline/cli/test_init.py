@@ -4,6 +4,7 @@ import shlex
 
 import numpy as np
 import pytest
+from rasterio.warp import transform
 from shapely import LineString, box
 
 from tests.make_rasters import write
@@ -67,6 +68,35 @@ def test_init_names_unclear_files_with_their_question(downloads, flexroad):
         assert question in said
     assert "  add --road-value with the values of the mask that are road" in said.splitlines()
     assert "houses.gpkg -o" not in said
+
+
+def test_init_folder_of_mixed_crs_gives_one_command_that_reprojects(downloads, flexroad):
+    """The terrain is in the next zone, the mask in degrees."""
+    (x,), (y,) = transform("EPSG:25832", "EPSG:25833", [WEST + 60], [NORTH - 30])
+    for name in ("a_1.tif", "a_2.tif"):
+        (downloads / "DGM" / name).unlink()
+    ground = np.full((300, 300), 99, np.float32)
+    write(downloads / "DGM" / "b.tif", ground, x - 150, y + 150, crs="EPSG:25833")
+    (x,), (y,) = transform("EPSG:25832", "EPSG:4258", [WEST], [NORTH])
+    road = np.full((60, 200), 1, np.uint8)
+    write(downloads / "mask.tif", road, x - 1e-4, y + 1e-4, cell=1e-5, crs="EPSG:4258")
+    said = flexroad("init", downloads).expected(0).out
+    (catalog, check, _) = (
+        shlex.split(line)[1:] for line in said.splitlines() if line.startswith("flexroad ")
+    )
+    assert "--reproject" in catalog
+    noted = flexroad(*catalog, "--tile-size", 60).expected(0).err
+    assert "dtm is in EPSG:25833, not EPSG:25832" in noted
+    assert "road_mask is in EPSG:4258, not EPSG:25832" in noted
+    assert "fail" not in flexroad(*check).out
+
+
+def test_init_dsm_in_feet_asks_for_the_crs_of_the_tiles(downloads, flexroad):
+    for name in ("DOM/a_1.tif", "DOM/a_2.tif", "DGM/a_1.tif", "DGM/a_2.tif"):
+        write(downloads / name, np.full((60, 60), 9, np.float32), 985_000, 200_000, cell=3, crs="EPSG:2263")
+    said = flexroad("init", downloads).expected(0).out
+    assert " --reproject " in said
+    assert "  add --to-crs with a CRS in metres" in said.splitlines()
 
 
 def test_init_empty_folder_is_one_line(tmp_path, flexroad):

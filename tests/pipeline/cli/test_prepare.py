@@ -13,6 +13,7 @@ from tests.command_line import PROCESS, call
 from tests.make_clouds import write_cloud
 
 WEST, SOUTH = 356_000.0, 5_699_000.0
+AHN = ("--class-scheme", "ahn")
 
 
 def flexroad(*words, expect=0) -> str:
