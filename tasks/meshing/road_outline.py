@@ -111,6 +111,8 @@ def _closed(areas: shapely.Geometry) -> shapely.Geometry:
     """Return areas with their gaps closed, but possibly without their tips."""
     import shapely
 
+    # GEOS buffers areas of a fixed precision on their grid, and so fills large holes.
+    areas = shapely.set_precision(areas, 0)
     wider = shapely.buffer(areas, GAP_M / 2, join_style="mitre")
     return shapely.buffer(wider, -GAP_M / 2, join_style="mitre")
 
