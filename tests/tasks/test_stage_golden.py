@@ -9,11 +9,14 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+import shapely
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
+from flexroad.tasks.meshing.road_outline import encoded
 from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 90, 80)
@@ -75,6 +78,18 @@ def test_sample_output_is_pinned_to_version(tile, clusters, method, golden):
     # Heights depend on the last digit of the platform's sine; plan coordinates do not.
     shape = digest(mesh.vertices[:, :2], mesh.faces, mesh.road)
     assert (sample.VERSION, len(mesh.faces), mesh.origin, shape) == golden
+
+
+def test_sample_output_with_lines_is_pinned_to_version(clusters):
+    """The survey ends on a slant, and the road is a polygon."""
+    x, y = np.meshgrid(GRID.eastings - GRID.west, GRID.northings - GRID.south)
+    street = shapely.buffer(shapely.linestrings([(-5, 10.2), (95, 61.7)]), 4.2)
+    streets = np.array([shapely.transform(street, lambda points: points + np.array([GRID.west, GRID.south]))])
+    mask, outside = cells(streets, GRID), y > 60 - 0.3 * x
+    made = RoadMask(GRID, GRID, mask, outside, areas=encoded(streets, GRID))
+    mesh = sample.sample(Hills(), made, clusters, sample.Options())
+    shape = digest(np.round(mesh.vertices[:, :2] * 1e4), mesh.faces, mesh.road)
+    assert (sample.VERSION, len(mesh.faces), shape) == (2, 1328, "e4f52d534b2d6d1c")
 
 
 def test_evaluate_output_is_pinned_to_version(tile, clusters):
