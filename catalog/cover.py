@@ -76,14 +76,14 @@ def _add(known: NDArray[Any], grid: Grid, raster: Any, crs: str | None) -> bool:
     affine = raster.transform
     if georeference_fault(raster) or heights_fault(raster) or affine.b or affine.d:
         return False
-    x, y = np.meshgrid(grid.eastings, grid.northings)
+    x, y = np.meshgrid(grid.eastings, grid.northings, sparse=True)
     if crs and not same(crs, grid.crs):
-        x, y = transformer(grid.crs, crs).transform(x, y)
+        x, y = transformer(grid.crs, crs).transform(*np.meshgrid(grid.eastings, grid.northings))
     columns, rows = np.floor((x - affine.c) / affine.a), np.floor((y - affine.f) / affine.e)
     inside = (columns >= 0) & (columns < raster.width) & (rows >= 0) & (rows < raster.height)
     if not inside.any():
         return True
-    columns, rows = columns[inside].astype(int), rows[inside].astype(int)
+    columns, rows = (np.broadcast_to(part, grid.shape)[inside].astype(np.int32) for part in (columns, rows))
     left, top = columns.min(), rows.min()
     window = Window(left, top, columns.max() - left + 1, rows.max() - top + 1)
     if window.width * window.height > MAX_CELLS:
