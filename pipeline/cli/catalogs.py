@@ -61,14 +61,14 @@ Date = Annotated[
     ),
 ]
 TileSize = Annotated[
-    float, typer.Option(metavar="M", help="Size of a tile in m.", rich_help_panel=options.TILES)
+    float, typer.Option(metavar="METRES", help="Size of a tile in m.", rich_help_panel=options.TILES)
 ]
 MinCover = Annotated[
     float,
     typer.Option(
         min=0,
         max=1,
-        metavar="X",
+        metavar="SHARE",
         help=MIN_COVER_HELP,
         rich_help_panel=options.TILES,
     ),
@@ -219,7 +219,7 @@ def _write_catalog(result: TilingResult, output: Path, config: str | None = None
 
 @catalogs.command("synthetic", cls=Command)
 def catalog_synthetic(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write.")],
     preset: Annotated[
         Literal["gerod", "dsc3d"] | None,
         typer.Option(
@@ -232,7 +232,7 @@ def catalog_synthetic(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the scenes.")] = 0,
     tile_size: Annotated[
-        int | None, typer.Option(min=10, metavar="M", help="Size of a tile in m; default: 250.")
+        int | None, typer.Option(min=10, metavar="METRES", help="Size of a tile in m; default: 250.")
     ] = None,
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:

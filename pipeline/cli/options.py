@@ -32,7 +32,7 @@ CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of
 Allow = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="DIR|URL",
+        metavar="FOLDER|URL",
         help="Allow source files in this folder, too; repeatable.",
         rich_help_panel=INPUTS,
     ),

@@ -133,7 +133,7 @@ def prepare_points(
         float | None,
         typer.Option(
             min=0.1,
-            metavar="M",
+            metavar="METRES",
             rich_help_panel=options.GROUND,
             help="Drop single points that are this much above all around (m).",
         ),

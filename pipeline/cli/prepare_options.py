@@ -20,7 +20,11 @@ COMMON: dict[str, Any] = {
     "cell_m": Annotated[
         float,
         typer.Option(
-            "--cell", min=0.01, metavar="M", rich_help_panel=options.RASTERS, help="Cell of the heights in m."
+            "--cell",
+            min=0.01,
+            metavar="METRES",
+            rich_help_panel=options.RASTERS,
+            help="Cell of the heights in m.",
         ),
     ],
     "dop_cell_m": Annotated[
@@ -28,7 +32,7 @@ COMMON: dict[str, Any] = {
         typer.Option(
             "--dop-cell",
             min=0.01,
-            metavar="M",
+            metavar="METRES",
             rich_help_panel=options.RASTERS,
             help="Pixel of the orthophoto in m.",
         ),
@@ -90,7 +94,7 @@ COMMON: dict[str, Any] = {
         float,
         typer.Option(
             "--tile-size",
-            metavar="M",
+            metavar="METRES",
             rich_help_panel=options.RASTERS,
             help="Side of a tile in m; a smaller area is one tile.",
         ),
@@ -101,7 +105,7 @@ COMMON: dict[str, Any] = {
             "--min-cover",
             min=0,
             max=1,
-            metavar="X",
+            metavar="SHARE",
             rich_help_panel=options.RASTERS,
             help=MIN_COVER_HELP,
         ),
@@ -126,13 +130,13 @@ COMMON: dict[str, Any] = {
 
 Out = Annotated[
     Path,
-    typer.Option("-o", "--output", metavar="DIR", rich_help_panel=options.OUTPUTS, help="Output folder."),
+    typer.Option("-o", "--output", metavar="FOLDER", rich_help_panel=options.OUTPUTS, help="Output folder."),
 ]
 Slope = Annotated[
     float | None,
     typer.Option(
         min=0,
-        metavar="X",
+        metavar="NUMBER",
         rich_help_panel=options.GROUND,
         help="Ground filter: steepest slope of the ground; 0.35 is 35 %.",
     ),
@@ -141,7 +145,7 @@ Radius = Annotated[
     float | None,
     typer.Option(
         min=1,
-        metavar="M",
+        metavar="METRES",
         rich_help_panel=options.GROUND,
         help="Ground filter: search radius in m, half the widest roof.",
     ),
@@ -150,7 +154,7 @@ Fill = Annotated[
     float | None,
     typer.Option(
         min=0,
-        metavar="M",
+        metavar="METRES",
         rich_help_panel=options.RASTERS,
         help="Fill voids of the DSM up to this width in m.",
     ),
@@ -159,7 +163,7 @@ Void = Annotated[
     float | None,
     typer.Option(
         min=0,
-        metavar="M",
+        metavar="METRES",
         rich_help_panel=options.RASTERS,
         help="Fill voids of the DTM up to this width in m.",
     ),
@@ -182,7 +186,7 @@ Density = Annotated[
     float,
     typer.Option(
         min=0.1,
-        metavar="X",
+        metavar="NUMBER",
         rich_help_panel=options.RASTERS,
         help="Sampled points per m2 of the mesh's surface.",
     ),

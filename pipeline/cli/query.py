@@ -38,12 +38,14 @@ def query(
     ] = None,
     step: Annotated[
         float,
-        typer.Option(min=0.001, metavar="M", help="Step along a line (m).", rich_help_panel=options.INPUTS),
+        typer.Option(
+            min=0.001, metavar="METRES", help="Step along a line (m).", rich_help_panel=options.INPUTS
+        ),
     ] = 1.0,
     crs: Annotated[
         str | None,
         typer.Option(
-            metavar="EPSG:N",
+            metavar="CRS",
             help="CRS of the points or the line, if it is another one; first east, then north.",
             rich_help_panel=options.INPUTS,
         ),

@@ -12,7 +12,9 @@ from flexroad.pipeline.cli.stdio import echo, echo_document
 
 Output = Annotated[
     Path,
-    typer.Option("-o", "--output", metavar="DIR", help="Folder to write.", rich_help_panel=options.OUTPUTS),
+    typer.Option(
+        "-o", "--output", metavar="FOLDER", help="Folder to write.", rich_help_panel=options.OUTPUTS
+    ),
 ]
 
 

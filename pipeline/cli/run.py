@@ -31,7 +31,7 @@ StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "as
 @ignore_write_errors()
 def run(
     catalog: Annotated[
-        Path, typer.Option(metavar="FILE", help="Catalog of tiles.", rich_help_panel=options.INPUTS)
+        Path, typer.Option(metavar="CATALOG", help="Catalog of tiles.", rich_help_panel=options.INPUTS)
     ],
     out: Annotated[
         Path,
@@ -62,7 +62,7 @@ def run(
     store: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
+            metavar="FOLDER",
             help="Folder of stage results that several runs share.",
             rich_help_panel=options.OUTPUTS,
         ),

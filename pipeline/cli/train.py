@@ -52,7 +52,7 @@ def train(
         typer.Option(
             min=0.05,
             max=0.9,
-            metavar="X",
+            metavar="SHARE",
             help="Fraction of the tiles for validation.",
             rich_help_panel=shared.VALIDATION,
         ),
@@ -62,7 +62,7 @@ def train(
         typer.Option(
             "--gap-m",
             min=0,
-            metavar="M",
+            metavar="METRES",
             help="Distance of training cells from validation tiles (m).",
             rich_help_panel=shared.VALIDATION,
         ),
@@ -72,7 +72,7 @@ def train(
         typer.Option(
             "--ignore-m",
             min=0,
-            metavar="M",
+            metavar="METRES",
             help="Distance of training cells from edges of labels (m).",
             rich_help_panel=shared.VALIDATION,
         ),
@@ -87,7 +87,7 @@ def train(
         list[str] | None,
         typer.Option(
             "--set",
-            metavar="NAME=VALUE",
+            metavar="KEY=VALUE",
             help="Option of the training (rounds=100) or the configuration (load.halo_m=0); repeatable.",
             rich_help_panel=shared.METHOD,
         ),
@@ -143,7 +143,7 @@ def _settings(assignments: list[str]) -> dict[str, Any]:
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not equals:
-            raise ConfigError(f"--set {shown(assignment)}: give NAME=VALUE, like --set rounds=100")
+            raise ConfigError(f"--set {shown(assignment)}: give KEY=VALUE, like --set rounds=100")
         parsed[name] = document.parse(
             value.encode(errors="surrogateescape"), f"--set {printable(name)}"
         ).value

@@ -2,7 +2,9 @@
 
 import re
 from collections.abc import Iterator
-from typing import Any
+from datetime import datetime
+from pathlib import Path
+from typing import Any, get_args, get_origin
 
 import pytest
 import typer
@@ -18,6 +20,37 @@ def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[st
 
 
 COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+PATHS = {"FILE", "FOLDER", "RUN", "CATALOG", "MODEL"}
+METAVARS = {
+    int: {"N", "METRES"},
+    float: {"METRES", "SHARE", "NUMBER"},
+    Path: PATHS,
+    str: {
+        "NAME", "NAME|FILE", "ID", "KEY=VALUE", "PATTERN", "CRS", "SQL", "ADDRESS", "CMD|URL",
+        "FOLDER|URL", "FILE", "FILE|'X Y, X Y'", "RUN",
+    },
+    datetime: {"YYYY-MM-DD"},
+    tuple: {"W S E N", "E N H"},
+}  # fmt: skip
+"""The words for values of options, by the type of the option."""
+ARGUMENTS = {"RUN", "CATALOG", "FOLDER", "ROOT", "FILE", "IMAGE", "MESH", "PROJECT", "NAME|FILE"}
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_has_the_same_words_for_values_in_all_commands(words):
+    for param in COMMANDS[words].params:
+        if param.param_type_name == "argument":
+            assert param.metavar in ARGUMENTS, param.name
+        elif param.metavar is not None:
+            kind = param.type_descriptor.annotation
+            if get_origin(kind) is list:
+                (kind,) = get_args(kind)
+            assert param.metavar in METAVARS[get_origin(kind) or kind], param.name
+        else:
+            # A flag has no value, and a choice lists its values.
+            assert param.is_flag or "|" in param.display_type_rich(None), param.name
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)

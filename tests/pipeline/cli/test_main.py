@@ -280,7 +280,7 @@ def test_train_setting_that_cannot_be_read_gives_one_line(flexroad):
     for setting, message in {
         f"rounds={'9' * 5000}": "--set rounds: not readable as YAML: line 1, column 1: a number of more than",
         "rounds=[": "--set rounds: not readable as YAML",
-        "rounds": "--set 'rounds': give NAME=VALUE, like --set rounds=100",
+        "rounds": "--set 'rounds': give KEY=VALUE, like --set rounds=100",
     }.items():
         (line,) = flexroad(*command, setting).expected(2).errors
         assert message in line
