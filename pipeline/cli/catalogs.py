@@ -56,7 +56,7 @@ Date = Annotated[
     datetime | None,
     typer.Option(
         metavar="YYYY-MM-DD",
-        help="Date of the survey.",
+        help="Date of the survey; default: that of the files.",
         rich_help_panel=options.INPUTS,
     ),
 ]
@@ -158,7 +158,7 @@ def catalog_nrw(
 ) -> None:
     """Cut downloads of Geobasis NRW into tiles.
 
-    Files keep their original names, as dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm.
+    Files keep their original names, such as dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm.
     """
     from flexroad.catalog.sources import nrw
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,10 +13,22 @@ from flexroad.pipeline.cli.lifecycle import notify_invalid_command
 from flexroad.pipeline.cli.options import HEADINGS
 
 OTHERS = "Options"
+RANGES = (
+    (re.compile(r"([\d.]+)<=x<=([\d.]+)"), r"\1 to \2"),
+    (re.compile(r"x>=([\d.]+)"), r"at least \1"),
+)
+"""How typer writes the ranges of numbers, and how a help page does."""
 MAX_NAME = 30
 """Longest name of an option, with its values, beside which a help page writes the meaning."""
 
 MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
+
+
+def _in_words(text: str) -> str:
+    """Return the meaning of an option with the range of its numbers in words."""
+    for written, words in RANGES:
+        text = written.sub(words, text)
+    return text
 
 
 class Command(TyperCommand):
@@ -44,7 +57,7 @@ class Command(TyperCommand):
         groups: dict[str, list[tuple[str, str]]] = {}
         for param in self.get_params(ctx):
             if record := param.get_help_record(ctx):
-                name, text = record
+                name, text = record[0], _in_words(record[1])
                 if param.param_type_name == "argument":
                     # Its type adds nothing to its name.
                     groups.setdefault("Arguments", []).append((name.partition(" <")[0], text))

@@ -113,7 +113,10 @@ COMMON: dict[str, Any] = {
     "date": Annotated[
         datetime | None,
         typer.Option(
-            "--date", metavar="YYYY-MM-DD", rich_help_panel=options.INPUTS, help="Acquisition date."
+            "--date",
+            metavar="YYYY-MM-DD",
+            rich_help_panel=options.INPUTS,
+            help="Date of the survey; default: that of the files.",
         ),
     ],
     "dataset": Annotated[

@@ -60,7 +60,11 @@ def query(
     ] = False,
     layer: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Layer of a GeoPackage.", rich_help_panel=options.INPUTS),
+        typer.Option(
+            metavar="NAME",
+            help="Layer of a vector file; needed if it has several.",
+            rich_help_panel=options.INPUTS,
+        ),
     ] = None,
     variant: Annotated[
         str | None,

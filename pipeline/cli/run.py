@@ -45,7 +45,7 @@ def run(
         str,
         typer.Option(
             metavar="NAME|FILE",
-            help="Configuration: a shipped name, as production, or a YAML file.",
+            help="Configuration: a shipped name, such as production, or a YAML file.",
             rich_help_panel=options.INPUTS,
         ),
     ] = "production",

@@ -53,7 +53,7 @@ def train(
             min=0.05,
             max=0.9,
             metavar="SHARE",
-            help="Fraction of the tiles for validation.",
+            help="Share of the tiles for validation.",
             rich_help_panel=shared.VALIDATION,
         ),
     ] = 0.3,

@@ -60,6 +60,8 @@ def test_help_says_what_each_option_takes(words, monkeypatch):
     page = command.get_help(command.make_context(words[-1], [], resilient_parsing=True))
     assert max(map(len, page.splitlines())) <= 80
     assert re.findall(r"<[a-z][\w \[\]]*>", page) == [], "a type of Python instead of a meaning"
+    assert "<=" not in page
+    assert ">=" not in page
 
 
 @pytest.mark.parametrize("words", [(), ("catalog",), ("prepare",), ("config",)], ids=" ".join)
