@@ -200,7 +200,7 @@ def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     lattice = patch.lattice
     rows, cols = patch.values.shape
     cell_x, cell_y = lattice.cell_of(grid)
-    place = {"crs": lattice.crs, "transform": lattice.transform, "width": cols, "height": rows}
+    place = {"transform": lattice.transform, "width": cols, "height": rows}
     with MemoryFile() as memory:
         with memory.open(driver="GTiff", count=1, dtype="float64", nodata=np.nan, **place) as target:
             target.write(patch.values, 1)
@@ -208,6 +208,8 @@ def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
             memory.open() as source,
             WarpedVRT(
                 source,
+                # GeoTIFF cannot store every CRS.
+                src_crs=lattice.crs,
                 crs=grid.crs,
                 transform=grid.transform,
                 width=grid.width,

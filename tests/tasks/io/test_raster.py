@@ -11,6 +11,7 @@ from pyproj import Transformer
 from rasterio.warp import Resampling, reproject
 
 from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.crs import short
 from flexroad.catalog.sources.rasters import index
 from flexroad.catalog.tiling import Conversion
 from flexroad.tasks import load
@@ -19,11 +20,14 @@ from flexroad.tasks.io.orthophoto import read_photo
 from tests.make_rasters import write
 
 FOOT = 1200 / 3937
+OWN = "+proj=laea +lat_0=52 +lon_0=1 +ellps=GRS80 +units=us-ft"
 PLACES = {
     # A place east of zone 32, which is in zone 33; New York in feet of the survey, and that zone in metres.
     "zones": ("EPSG:25832", "EPSG:25833", 900_000.0, 5_700_000.0, 1.0),
     "feet": ("EPSG:2263", "EPSG:32118", 985_000.0, 200_000.0, 3.0),
     "degrees": ("EPSG:4258", "EPSG:25833", 13.4, 52.5, 1e-5),
+    # A projection in feet without a code, turned by several degrees.
+    "own": (OWN, "EPSG:25833", 2_700_000.0, 300_000.0, 3.0),
 }
 OFF = load.Options(min_valid=0)
 
@@ -72,7 +76,8 @@ def test_surface_in_another_crs_is_read_within_the_error_of_interpolation(tmp_pa
         assert np.quantile(error, 0.9) < bound
         if inside.all():
             assert error.max() < bound
-        assert f"dsm reprojected: from {PLACES[place][0]} to {PLACES[place][1]}" in data.notes
+        source = short(PLACES[place][0])
+        assert f"dsm reprojected: from {source} to {PLACES[place][1]}" in data.notes
     assert full
 
 
