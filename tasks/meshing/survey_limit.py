@@ -55,6 +55,8 @@ def survey_limit(outside: Bools, corner: tuple[float, float], cell: float, withi
     """
     import shapely
 
+    if outside.all():
+        return SurveyLimit(shapely.MultiLineString(), shapely.MultiPolygon())
     west, south, east, north = within
     low = np.array([west - corner[0], corner[1] - north]) / cell
     high = np.array([east - corner[0], corner[1] - south]) / cell

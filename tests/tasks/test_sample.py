@@ -302,6 +302,13 @@ def test_dynamic_mesh_keeps_islands_and_joins_cells_at_corners():
     assert 1.0 < areas(mesh).sum() < 3.0
 
 
+def test_dynamic_mesh_beyond_survey_raises():
+    core = ground(20, 20)
+    nothing = np.ones(core.shape, bool)
+    with pytest.raises(TaskError, match="no height"):
+        sampled(core, diagonal_street(core), outside=nothing)
+
+
 @given(seed=st.integers(0, 2**31), halo=st.sampled_from([0, 2]), share=st.floats(0.05, 0.95))
 @settings(max_examples=60, deadline=None)
 def test_dynamic_mesh_of_any_survey_has_every_centre_with_data(seed, halo, share):
