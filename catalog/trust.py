@@ -22,6 +22,8 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
 
 ADDRESS = re.compile(r"(?!(?i:s3):)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
+LONGEST_SHOWN = 500
+"""Longest path that a message repeats."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class AllowedFolders:
         folders : sequence of str
             The folders to allow; by default that of the file.
         """
+        if len(name) > LONGEST_SHOWN:
+            return CatalogError(
+                f"{subject} names {name[:60]}..., a path of {len(name):,} characters outside the catalog's "
+                f"folder {self.home}; correct the catalog, or move the file to a shorter path"
+            )
         if ADDRESS.match(name):
             return CatalogError(
                 f"{subject} names {name}; only files on disk and in s3:// are read: fetch it first"
