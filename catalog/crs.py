@@ -125,6 +125,28 @@ def short(text: str) -> str:
     return name if name.startswith("EPSG:") else _parts(text)[0].name
 
 
+def code(text: str) -> str | None:
+    """Return the EPSG code of a CRS, of a compound one that of the whole: ``25832``; None if it has none."""
+    number = CRS.from_user_input(text).to_epsg()
+    return str(number) if number else None
+
+
+def name(text: str) -> str:
+    """Return the full name of a CRS: ``ETRS89 / UTM zone 32N``."""
+    return str(CRS.from_user_input(text).name)
+
+
+def datum(text: str) -> str:
+    """Return the name of the datum of a CRS that is not compound: ``Deutsches Haupthoehennetz 2016``."""
+    known = CRS.from_user_input(text).datum
+    return known.name if known else "unknown"
+
+
+def esri(text: str) -> str:
+    """Return a CRS as WKT in the dialect of ESRI's ``.prj`` files, in one line."""
+    return CRS.from_user_input(text).to_wkt("WKT1_ESRI")
+
+
 def utm_of(degrees: Bounds) -> str:
     """Return the code of the UTM zone (WGS 84) at the middle of bounds (degrees), of any if they are NaN."""
     east, north = (degrees[0] + degrees[2]) / 2, (degrees[1] + degrees[3]) / 2

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexroad.catalog.grid import Bounds
+from flexroad.tasks.meshing.parts import texture_coordinates
 from flexroad.tasks.types import Bools, Floats, Mesh, Orthophoto
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture 
 
     whole = trimesh.Trimesh(_y_up(mesh.vertices), mesh.faces, process=False)
     scene = trimesh.Scene(metadata=_georeference(mesh, run_origin))
-    uv = _uv(mesh, texture.bounds) if texture else None
+    uv = texture_coordinates(mesh, texture.bounds) if texture else None
     shift = _y_up(np.subtract(mesh.origin, run_origin))
     scene.graph.update(frame_to="tile", matrix=trimesh.transformations.translation_matrix(shift))
     for name, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
@@ -108,13 +109,6 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
         "run_origin": [float(v) for v in run_origin],
         "axes": "x east, y up, z south; origins are easting, northing, height; metres",
     }
-
-
-def _uv(mesh: Mesh, bounds: Bounds) -> Floats:
-    """Return the vertices' places in the image, ``(V, 2)``: 0 to 1 from west to east, south to north."""
-    west, south, east, north = bounds
-    place = mesh.vertices[:, :2] + mesh.origin[:2]
-    return (place - (west, south)) / (east - west, north - south)
 
 
 def _material(name: str, colour: tuple[int, ...], textured: bool) -> trimesh.visual.material.PBRMaterial:

@@ -1,0 +1,52 @@
+"""Parts of a mesh: some of its faces, with the vertices that these use."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Bools, Floats, Mesh
+
+Indices = NDArray[np.intp]
+
+
+def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
+    """Return the vertices that some faces use, and these faces in numbers of those vertices.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With ``F`` faces.
+    faces : ndarray of bool, (F,)
+        The faces of the part.
+
+    Returns
+    -------
+    used : ndarray of int, (n,)
+        Indices of vertices of the mesh, ascending.
+    corners : ndarray of int, (k, 3)
+        Indices into ``used``.
+    """
+    used, corners = np.unique(mesh.faces[faces], return_inverse=True)
+    return used.astype(np.intp), corners.reshape(-1, 3).astype(np.intp)
+
+
+def texture_coordinates(mesh: Mesh, bounds: Bounds) -> Floats:
+    """Return the places of a mesh's vertices in an image seen from above, ``(V, 2)``.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With ``V`` vertices.
+    bounds : tuple of float
+        West, south, east and north of the image's outer edges (m).
+
+    Returns
+    -------
+    ndarray, (V, 2)
+        0 to 1 from west to east, and from south to north.
+    """
+    west, south, east, north = bounds
+    place = mesh.vertices[:, :2] + mesh.origin[:2]
+    return np.asarray((place - (west, south)) / (east - west, north - south), np.float64)
