@@ -1,0 +1,81 @@
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from flexroad.tasks.export import obj
+from flexroad.tasks.types import Mesh
+
+ORIGIN = (295500.0, 5629250.0, 150.0)
+PHOTO = (295500.0, 5629248.0, 295512.0, 5629260.0)
+
+
+def hills(n: int = 9, road_east: float = 4.0) -> Mesh:
+    """Return a 10 m square of hills whose west is road."""
+    x, y = np.meshgrid(np.linspace(0, 10, n), np.linspace(0, 10, n))
+    z = 3.2 + np.sin(x / 3) + 0.1 * y
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    faces = np.concatenate([np.c_[a, b, c], np.c_[a, c, d]]).astype(np.int32)
+    vertices = np.c_[x.ravel(), y.ravel(), z.ravel()]
+    return Mesh("EPSG:25832", ORIGIN, vertices, faces, vertices[faces].mean(axis=1)[:, 0] < road_east)
+
+
+def loaded(folder, mesh: Mesh, textured: bool = False) -> dict[str, trimesh.Trimesh]:
+    """Return the meshes of both materials as trimesh reads them from the files."""
+    (folder / "tile.obj").write_bytes(obj.encode(mesh, "tile.mtl", photo=PHOTO if textured else None))
+    (folder / "tile.mtl").write_bytes(obj.encode_materials("tile.jpg" if textured else None))
+    if textured:
+        Image.new("RGB", (24, 24), (10, 200, 30)).save(folder / "tile.jpg")
+    scene = trimesh.load_scene(folder / "tile.obj", process=False)
+    return {part.visual.material.name: part for part in scene.geometry.values()}
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_encode_is_read_by_trimesh(tmp_path, textured):
+    mesh = hills()
+    parts = loaded(tmp_path, mesh, textured)
+    assert set(parts) == {"road", "terrain"}
+    for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
+        truth = mesh.vertices[mesh.faces[faces]]
+        np.testing.assert_allclose(parts[name].triangles, truth, rtol=0, atol=0.6e-4)
+        assert (parts[name].face_normals[:, 2] > 0).all()
+
+
+def test_encode_texture_coordinates_are_places_in_the_photo(tmp_path):
+    for part in loaded(tmp_path, hills(), textured=True).values():
+        x, y, _ = part.vertices.T
+        np.testing.assert_allclose(part.visual.uv, np.c_[x / 12, (y + 2) / 12], atol=1e-5)
+        assert part.visual.material.image.size == (24, 24)
+
+
+def test_materials_have_colours_or_the_texture():
+    plain = obj.encode_materials().decode()
+    assert plain.count("newmtl") == 2
+    assert "map_Kd" not in plain
+    assert obj.encode_materials("a.jpg").decode().count("map_Kd a.jpg\n") == 2
+
+
+def test_encode_comments_have_the_place():
+    lines = obj.encode(hills(), "tile.mtl", "EPSG:7837").decode("ascii").splitlines()
+    assert lines[:5] == [
+        "# origin 295500 5629250 150 (easting northing height, m)",
+        "# crs EPSG:25832",
+        "# vertical crs EPSG:7837",
+        "# axes x east, y north, z up; relative to origin; metres",
+        "mtllib tile.mtl",
+    ]
+    content = json.loads(obj.georeference(hills()).sidecar(obj.AXES))
+    assert (content["origin"], content["vertical_crs"]) == (list(ORIGIN), None)
+
+
+@pytest.mark.parametrize(("road_east", "group"), [(-1, "terrain"), (99, "road")])
+def test_encode_class_without_faces_has_no_group(road_east, group):
+    lines = obj.encode(hills(road_east=road_east), "tile.mtl").decode().splitlines()
+    assert [line for line in lines if line.startswith("g ")] == [f"g {group}"]
+
+
+def test_encode_equal_meshes_give_equal_bytes():
+    assert obj.encode(hills(), "a.mtl") == obj.encode(hills(), "a.mtl")
