@@ -1,0 +1,161 @@
+"""The meshes of a run as CityJSON text sequence (CityJSONSeq 2.0): a header line, then two lines per tile.
+
+A line is a feature with one city object, since a feature has one main object: ``Road``, a MultiSurface of
+triangles that are all traffic areas, or ``TINRelief``, a CompositeSurface. Vertices are whole millimetres
+from the origin in the header.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog import crs
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Mesh
+
+VERSION = 1
+NAME = ".city.jsonl"
+MEDIA_TYPE = "application/city+json-seq"
+
+SCALE_M = 0.001
+"""Unit of the vertices (m): a coordinate is exact to half of it."""
+LOD = "2"
+"""Level of detail: geometry without furniture and lanes."""
+AUTHORITY = "https://www.opengis.net/def/crs/EPSG/0/"
+
+Whole = NDArray[np.int64]
+
+
+def write(
+    file: IO[bytes],
+    tiles: Iterable[tuple[str, Mesh]],
+    system: str,
+    origin: tuple[float, float, float],
+    vertical: str | None = None,
+) -> int:
+    """Write the meshes of all tiles to one file; return the number of tiles.
+
+    Parameters
+    ----------
+    file : binary file object
+        Open for writing.
+    tiles : iterable of (str, Mesh)
+        Tile ids, which are unique, and meshes; one mesh is in memory at a time.
+    system : str
+        CRS of the meshes.
+    origin : tuple of float
+        Easting, northing and height that the vertices are relative to (m).
+    vertical : str, optional
+        CRS of the heights, if known.
+
+    Raises
+    ------
+    TaskError
+        If the CRS has no EPSG code, or if a mesh has another one.
+    """
+    file.write(header(system, origin, vertical))
+    count = 0
+    for tile_id, mesh in tiles:
+        if not crs.same(mesh.crs, system):
+            raise TaskError(f"{tile_id}: mesh in {crs.short(mesh.crs)}, the file is in {crs.short(system)}")
+        file.write(features(tile_id, mesh, origin, vertical))
+        count += 1
+    return count
+
+
+def header(system: str, origin: tuple[float, float, float], vertical: str | None = None) -> bytes:
+    """Return the first line: version, transform and CRS.
+
+    The CRS is the compound one if the EPSG register has it, else the horizontal one alone: CityJSON has no
+    place for two codes. The vertical CRS is then an attribute of the city objects.
+
+    Raises
+    ------
+    TaskError
+        If the CRS has no EPSG code.
+    """
+    plan = crs.code(system)
+    if plan is None:
+        raise TaskError(
+            f"CityJSON names a CRS by its EPSG code, and {crs.name(system)!r} has none; choose another format"
+        )
+    code = crs.code(crs.compound(system, vertical)) if vertical else None
+    return _line(
+        {
+            "type": "CityJSON",
+            "version": "2.0",
+            "transform": {"scale": [SCALE_M] * 3, "translate": [float(v) for v in origin]},
+            "metadata": {"referenceSystem": f"{AUTHORITY}{code or plan}"},
+            "CityObjects": {},
+            "vertices": [],
+        }
+    )
+
+
+def features(
+    tile_id: str, mesh: Mesh, origin: tuple[float, float, float], vertical: str | None = None
+) -> bytes:
+    """Return the lines of one tile: its road and its terrain, or one of them if the other has no face.
+
+    Vertices that round to the same millimetres are one vertex, and faces that two of them share are left out:
+    they have no area.
+
+    Parameters
+    ----------
+    tile_id : str
+        Id of the tile, from which the ids of the city objects are made.
+    mesh : Mesh
+        The mesh of the tile. Faces are counter-clockwise from above.
+    origin : tuple of float
+        That of the header (m).
+    vertical : str, optional
+        CRS of the heights, if known.
+    """
+    # The origins are whole metres and are subtracted first: large coordinates would lose digits.
+    points = mesh.vertices + np.subtract(mesh.origin, origin)
+    whole = np.rint(points / SCALE_M).astype(np.int64)
+    attributes = {"tile": tile_id} | ({"verticalCRS": vertical} if vertical else {})
+    lines = []
+    for kind, faces in (("Road", mesh.road), ("TINRelief", ~mesh.road)):
+        vertices, corners = _parts(whole, mesh.faces[faces])
+        if len(corners):
+            name = f"{tile_id}-{kind.lower()}"
+            item = {"type": kind, "attributes": attributes, "geometry": [_geometry(kind, corners)]}
+            lines.append(
+                _line(
+                    {
+                        "type": "CityJSONFeature",
+                        "id": name,
+                        "CityObjects": {name: item},
+                        "vertices": vertices.tolist(),
+                    }
+                )
+            )
+    return b"".join(lines)
+
+
+def _parts(whole: Whole, faces: NDArray[np.int32]) -> tuple[Whole, Whole]:
+    """Return the different vertices of faces with an area, and the faces in numbers of those vertices."""
+    _, number = np.unique(whole, axis=0, return_inverse=True)
+    a, b, c = number.reshape(-1)[faces].T
+    kept = faces[(a != b) & (b != c) & (c != a)]
+    vertices, corners = np.unique(whole[kept.ravel()], axis=0, return_inverse=True)
+    return vertices, corners.reshape(-1, 3)
+
+
+def _geometry(kind: str, corners: Whole) -> dict[str, Any]:
+    # A surface is a list of rings; a triangle has one.
+    surfaces = corners[:, None, :].tolist()
+    if kind == "TINRelief":
+        return {"type": "CompositeSurface", "lod": LOD, "boundaries": surfaces}
+    semantics = {"surfaces": [{"type": "TrafficArea"}], "values": [0] * len(corners)}
+    return {"type": "MultiSurface", "lod": LOD, "boundaries": surfaces, "semantics": semantics}
+
+
+def _line(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode() + b"\n"
