@@ -1,0 +1,132 @@
+"""The surface of a tile and its mesh as 3DM file, for Rhino and Grasshopper; needs the library rhino3dm.
+
+The file has three layers: ``surface``, the NURBS surface cut to the tile's core (`tasks.spline.cut`),
+``road`` and ``terrain``, the faces of the mesh. Coordinates are float64, in metres, relative to the mesh's
+whole-metre origin in plan; z is the height. Origin and CRS are in the document's user texts.
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.georeference import Georeference
+from flexroad.tasks.meshing.parts import part
+from flexroad.tasks.spline.cut import patch
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Bools, Mesh
+
+VERSION = 1
+NAME = ".3dm"
+MEDIA_TYPE = "model/vnd.3dm"
+
+AXES = "x east, y north, relative to origin; z height; metres"
+INSTALL = "pip install 'flexroad[export]'"
+COLOURS = {"surface": (90, 130, 180), "road": (58, 58, 64), "terrain": (196, 190, 174)}
+"""Red, green and blue of the layers, 0 to 255."""
+TOLERANCE_M = 1e-4
+"""Distance below which Rhino takes points for equal (m)."""
+
+
+def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: str | None = None) -> bytes:
+    """Return a surface and a mesh as 3DM.
+
+    Two files of equal inputs differ in their identifiers and times, which the library chooses.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh of the tile. A class without faces has a layer without an object.
+    surface : NurbsSurface or None
+        The surface of the tile; None if it is no NURBS. Its layer is then empty.
+    bounds : tuple of float
+        West, south, east and north of the part of the surface, as the tile's core (m).
+    vertical : str, optional
+        CRS of the heights, if known.
+
+    Raises
+    ------
+    TaskError
+        If rhino3dm is missing, or if the bounds and the surface's domain do not overlap.
+    """
+    rhino = _library()
+    model = rhino.File3dm()
+    model.Settings.ModelUnitSystem = rhino.UnitSystem.Meters
+    model.Settings.ModelAbsoluteTolerance = TOLERANCE_M
+    east, north, _ = mesh.origin
+    place = Georeference(mesh.crs, (east, north, 0.0), vertical)
+    for key, value in _texts(place).items():
+        model.Strings[key] = value
+    layers = {name: _layer(rhino, model, name, colour) for name, colour in COLOURS.items()}
+    if surface is not None:
+        model.Objects.AddSurface(_surface(rhino, surface, bounds, place), layers["surface"])
+    for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
+        if faces.any():
+            model.Objects.AddMesh(_mesh(rhino, mesh, faces), layers[name])
+    return base64.b64decode(model.Encode())
+
+
+def _library() -> Any:
+    try:
+        import rhino3dm
+    except ImportError as error:
+        raise TaskError(f"3DM files need rhino3dm: {INSTALL}") from error
+    return rhino3dm
+
+
+def _texts(place: Georeference) -> dict[str, str]:
+    return {
+        "crs": place.crs,
+        "vertical_crs": place.vertical or "unknown",
+        "origin": " ".join(f"{v:.15g}" for v in place.origin),
+        "axes": AXES,
+    }
+
+
+def _layer(rhino: Any, model: Any, name: str, colour: tuple[int, int, int]) -> Any:
+    """Add a layer; return the attributes of an object on it."""
+    layer = rhino.Layer()
+    layer.Name = name
+    layer.Color = (*colour, 255)
+    attributes = rhino.ObjectAttributes()
+    attributes.LayerIndex = model.Layers.Add(layer)
+    attributes.Name = name
+    return attributes
+
+
+def _surface(rhino: Any, surface: NurbsSurface, bounds: Bounds, place: Georeference) -> Any:
+    """Return the part of a surface as rhino3dm's surface."""
+    nurbs, rational = patch(surface, bounds)
+    shift = np.subtract(nurbs.origin, place.origin[:2])
+    rows, cols, _ = nurbs.points.shape
+    p, q = nurbs.degree
+    made = rhino.NurbsSurface.Create(3, rational, p + 1, q + 1, cols, rows)
+    # OpenNURBS leaves out the first and the last knot, on which no point of the surface depends.
+    for into, knots in ((made.KnotsU, nurbs.knots_u), (made.KnotsV, nurbs.knots_v)):
+        for k, knot in enumerate(knots[1:-1].tolist()):
+            into[k] = knot
+    points = nurbs.points.copy()
+    points[..., :2] += shift
+    points[..., :3] *= points[..., 3:]
+    for row in range(rows):
+        for col in range(cols):
+            made.Points[col, row] = rhino.Point4d(*points[row, col].tolist())
+    return made
+
+
+def _mesh(rhino: Any, mesh: Mesh, faces: Bools) -> Any:
+    """Return some faces as rhino3dm's mesh."""
+    used, corners = part(mesh, faces)
+    points = mesh.vertices[used] + (0.0, 0.0, mesh.origin[2])
+    made = rhino.Mesh()
+    made.Vertices.UseDoublePrecisionVertices = True
+    for point in points.tolist():
+        made.Vertices.AddPoint3d(*point)
+    for corner in corners.tolist():
+        made.Faces.AddFace(*corner)
+    made.Normals.ComputeNormals()
+    return made
