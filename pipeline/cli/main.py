@@ -13,6 +13,7 @@ from flexroad.pipeline.cli.catalogs import catalogs
 from flexroad.pipeline.cli.clean import clean
 from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.configs import configs
+from flexroad.pipeline.cli.export import export
 from flexroad.pipeline.cli.init import init
 from flexroad.pipeline.cli.prepare import prepare
 from flexroad.pipeline.cli.query import query
@@ -33,7 +34,7 @@ app = typer.Typer(
 app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
-for command in (init, run, rerun, status, clean, report, query, tables, figures, train):
+for command in (init, run, rerun, status, clean, report, query, export, tables, figures, train):
     app.command(cls=Command)(command)
 
 

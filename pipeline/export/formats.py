@@ -1,0 +1,91 @@
+"""The formats of `flexroad export`: how each is written from the finished tiles of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC
+
+from flexroad.catalog.storage.paths import Location, write
+from flexroad.catalog.storage.staging import atomic_file
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export import per_tile, tiles3d
+from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.pieces import Encode, write_pieces
+from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
+
+Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], None]
+"""Writes a format of the tiles into a folder."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of exports."""
+
+    title: str
+    write: Write
+    version: int
+    precision_m: float | None
+    """Largest distance of a point from the run's mesh or surface (m); None if each file says its own."""
+    needs_datum: bool = False
+    """Whether heights above the ellipsoid are needed."""
+
+
+def write_landxml(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> None:
+    """Write all meshes as one LandXML file."""
+    name = landxml.NAME_COMPRESSED if options.compress else landxml.NAME
+    latest = max(tile.datetime for tile in source.tiles)
+    project = landxml.Project(source.run.path.name, latest.astimezone(UTC), source.vertical)
+    with atomic_file(folder / f"{source.run.path.name}{name}") as local, local.open("wb") as file:
+        meshes = (tile.mesh for tile in tiles)
+        landxml.write(file, meshes, project, local.parent, options.compress)
+
+
+def write_cityjson(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> None:
+    """Write all meshes as one CityJSONSeq file."""
+    target = folder / f"{source.run.path.name}{cityjson.NAME}"
+    with atomic_file(target) as local, local.open("wb") as file:
+        meshes = ((tile.id, tile.mesh) for tile in tiles)
+        cityjson.write(file, meshes, source.crs, (*source.origin, 0.0), source.vertical)
+
+
+def write_obj(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> None:
+    """Write the mesh of each tile as OBJ; all share one file of materials."""
+    write(folder / per_tile.MATERIALS, obj.encode_materials())
+    _each(obj.VERSION, per_tile.obj_piece)(source, tiles, folder, options, executor)
+
+
+def _each(version: int, encode: Encode) -> Write:
+    """Return the writer of a format that has files of its own for each tile."""
+
+    def write_each(
+        source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+    ) -> None:
+        for _ in write_pieces(tiles, folder, version, encode, source.vertical, executor):
+            pass
+
+    return write_each
+
+
+FORMATS = {
+    "3dtiles": Format("3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True),
+    "landxml": Format("LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001),
+    "cityjson": Format("CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001),
+    "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001),
+    "heightfield": Format(
+        "16-bit height fields, for game engines",
+        _each(heightfield.VERSION, per_tile.heightfield_piece),
+        heightfield.VERSION,
+        None,
+    ),
+    "step": Format("STEP AP214, for CAD", _each(step.VERSION, per_tile.step_piece), step.VERSION, 1e-9),
+    "3dm": Format("3DM, for Rhino", _each(rhino.VERSION, per_tile.rhino_piece), rhino.VERSION, 1e-4),
+}
+"""By the name on the command line."""

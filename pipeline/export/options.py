@@ -1,0 +1,17 @@
+"""Options of an export, for all formats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexroad.catalog.ellipsoidal import Datum
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of an export."""
+
+    datum: Datum | None = None
+    """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
+    compress: bool = False
+    """Whether text formats of the whole run are compressed with gzip."""

@@ -1,0 +1,60 @@
+"""Formats with files of their own for each tile: OBJ, height fields, STEP and 3DM."""
+
+from __future__ import annotations
+
+from flexroad.catalog.ids import safe_name
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.export.pieces import Piece
+from flexroad.pipeline.export.source import FinishedTile
+from flexroad.tasks.export import heightfield, obj, rhino, step
+from flexroad.tasks.spline.surface import NurbsSurface
+
+MATERIALS = "materials.mtl"
+"""Name of the file of materials that all OBJ files share."""
+SPACING_M = 1.0
+"""Largest distance of the nodes of height fields (m)."""
+
+
+def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
+    mesh, name = tile.mesh, safe_name(tile.id)
+    place = obj.georeference(mesh, vertical)
+    files = {
+        f"{name}{obj.NAME}": obj.encode(mesh, MATERIALS, vertical),
+        f"{name}.json": place.sidecar(obj.AXES),
+        f"{name}.prj": place.prj(),
+    }
+    return Piece(files, {})
+
+
+def heightfield_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return the surface as height fields of 2^n + 1 nodes a side, with what engines must know as JSON."""
+    bounds = tile.graph.tile.grid.bounds
+    field = heightfield.sampled(tile.surface, bounds, heightfield.size_at_spacing(bounds, SPACING_M))
+    files = {
+        heightfield.NAME_PNG: heightfield.encode_png(field),
+        heightfield.NAME_R16: heightfield.encode_r16(field),
+        heightfield.NAME_MUJOCO: heightfield.encode_mujoco(field),
+        heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.graph.tile.grid.crs, vertical),
+    }
+    return Piece({f"{safe_name(tile.id)}{name}": data for name, data in files.items()}, {})
+
+
+def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return the surface as STEP, cut to the tile, and its place as JSON."""
+    surface, source, name = tile.surface, tile.graph.tile, safe_name(tile.id)
+    if not isinstance(surface, NurbsSurface):
+        raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
+    files = {
+        f"{name}{step.NAME}": step.encode(surface, source.grid.bounds, tile.id, source.datetime, vertical),
+        f"{name}{step.NAME_SIDECAR}": step.georeference(surface, vertical).sidecar(step.AXES),
+    }
+    return Piece(files, {})
+
+
+def rhino_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return surface and mesh as 3DM."""
+    surface = tile.surface
+    nurbs = surface if isinstance(surface, NurbsSurface) else None
+    data = rhino.encode(tile.mesh, nurbs, tile.graph.tile.grid.bounds, vertical)
+    return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, {})

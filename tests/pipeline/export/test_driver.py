@@ -1,0 +1,221 @@
+"""An export has the surface of the run in each format, goes on after interruptions, and says what it is."""
+
+import gzip
+import json
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import rhino3dm
+import trimesh
+from PIL import Image
+from pyproj import Transformer
+
+from flexroad.catalog import Catalog
+from flexroad.catalog.ellipsoidal import Datum
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.export import pieces
+from flexroad.pipeline.export.driver import check_formats, export
+from flexroad.pipeline.export.formats import FORMATS
+from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.source import select
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+
+OFFSET_M = 47.5
+OPTIONS = Options(Datum("offset", str(OFFSET_M)))
+NAMESPACE = "{http://www.landxml.org/schema/LandXML-1.2}"
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    """A run of two tiles of 60 m with one surface; a third tile is not computed."""
+    folder = tmp_path_factory.mktemp("export")
+    catalog = Catalog.read(write_scenes(folder / "survey", 3, seed=0, size_m=60))
+    run = Run.create(folder / "city", load_config("production"), catalog)
+    run_tiles(run, SerialExecutor(), only=lambda tile: tile != catalog.tiles[2])
+    return run.path
+
+
+@pytest.fixture(scope="module")
+def exported(city, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    export(select(city), out, list(FORMATS), OPTIONS, SerialExecutor())
+    return out
+
+
+def true_heights(city, places):
+    """The heights of the fitted surfaces at places, ``(n, 2)``."""
+    heights = np.full(len(places), np.nan)
+    for tile in select(city).finished():
+        west, south, east, north = tile.graph.tile.grid.bounds
+        x, y = places.T
+        inside = (west <= x) & (x <= east) & (south <= y) & (y <= north)
+        heights[inside] = tile.surface.height(x[inside], y[inside])
+    return heights
+
+
+def landxml(path):
+    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    root = ElementTree.fromstring(text)
+    rows = [[float(number) for number in point.text.split()] for point in root.iter(f"{NAMESPACE}P")]
+    north, east, height = np.array(rows).T
+    return np.column_stack([east, north, height])
+
+
+def cityjson(path):
+    head, *features = map(json.loads, path.read_text().splitlines())
+    scale, shift = (np.array(head["transform"][name]) for name in ("scale", "translate"))
+    return np.concatenate([np.array(feature["vertices"]) * scale + shift for feature in features])
+
+
+def obj(folder):
+    points = []
+    for file in sorted(folder.glob("*.obj")):
+        origin = json.loads(file.with_suffix(".json").read_text())["origin"]
+        lines = [line.split()[1:] for line in file.read_text().splitlines() if line.startswith("v ")]
+        points.append(np.array(lines, float) + origin)
+    return np.concatenate(points)
+
+
+def tiles3d(folder):
+    """The vertices of all tiles by the tilesets, back in the CRS of the run."""
+    back = Transformer.from_crs("EPSG:4978", "EPSG:25832+7837".partition("+")[0], always_xy=True)
+    geographic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    points = []
+    for block in json.loads((folder / "tileset.json").read_text())["root"]["children"]:
+        file = folder / block["content"]["uri"]
+        for leaf in json.loads(file.read_text())["root"]["children"]:
+            matrix = np.reshape(leaf["transform"], (4, 4)).T
+            scene = trimesh.load(file.parent / leaf["content"]["uri"])
+            east, up, south = scene.to_geometry().vertices.T
+            placed = np.column_stack([east, -south, up]) @ matrix[:3, :3].T + matrix[:3, 3]
+            x, y, _ = back.transform(*placed.T)
+            points.append(np.column_stack([x, y, geographic.transform(*placed.T)[2] - OFFSET_M]))
+    return np.concatenate(points)
+
+
+def heightfields(folder):
+    """The nodes of all fields, and the precision that the files say."""
+    points, precision = [], 0.0
+    for file in sorted(folder.glob("*_heightfield.json")):
+        place = json.loads(file.read_text())
+        west, south, east, north = place["bounds"]
+        columns, rows = place["size"]
+        values = np.asarray(Image.open(file.with_suffix(".png")), float)
+        x, y = np.meshgrid(np.linspace(west, east, columns), np.linspace(north, south, rows))
+        heights = place["low_m"] + values * place["step_m"]
+        points.append(np.column_stack([x.ravel(), y.ravel(), heights.ravel()]))
+        precision = max(precision, place["precision_m"])
+    return np.concatenate(points), precision
+
+
+def vertices(out):
+    return {
+        "3dtiles": tiles3d(out / "3dtiles"),
+        "landxml": landxml(next((out / "landxml").iterdir())),
+        "cityjson": cityjson(next((out / "cityjson").iterdir())),
+        "obj": obj(out / "obj"),
+    }
+
+
+def test_vertices_of_all_formats_lie_on_the_surface(city, exported):
+    for name, points in vertices(exported).items():
+        assert len(points) > 500
+        error = np.abs(points[:, 2] - true_heights(city, points[:, :2]))
+        # On a slope, the error in plan is also one in height; vertices on borders may be just outside.
+        assert np.nanmax(error) <= 2 * FORMATS[name].precision_m, name
+        assert np.isfinite(error).mean() > 0.95
+
+
+def test_nodes_of_height_fields_lie_on_the_surface(city, exported):
+    points, precision = heightfields(exported / "heightfield")
+    assert precision < 0.001
+    error = np.abs(points[:, 2] - true_heights(city, points[:, :2]))
+    assert error.max() <= precision * 1.01
+
+
+def test_step_and_3dm_have_a_file_per_tile(exported):
+    """Their content is tested with their modules."""
+    assert len(list((exported / "step").glob("*.stp"))) == 2
+    for file in (exported / "step").glob("*.stp"):
+        assert file.read_text().startswith("ISO-10303-21;")
+    for file in (exported / "3dm").glob("*.3dm"):
+        model = rhino3dm.File3dm.Read(str(file))
+        assert len(model.Objects) == 3
+    assert len(list((exported / "3dm").glob("*.3dm"))) == 2
+
+
+def test_manifest_says_what_was_written(city, exported):
+    manifest = json.loads((exported / "export.json").read_text())
+    assert manifest["tiles"] == 2
+    assert manifest["left_out"] == [Catalog.read(city / "catalog.parquet").tiles[2].id]
+    assert manifest["crs"] == "EPSG:25832"
+    assert manifest["datum"] == "heights plus 47.5 m are above the ellipsoid"
+    for name, written in manifest["formats"].items():
+        files = [
+            path for path in (exported / name).rglob("*") if path.is_file() and ".pieces" not in path.parts
+        ]
+        assert (written["files"], written["bytes"]) == (
+            len(files),
+            sum(path.stat().st_size for path in files),
+        )
+
+
+def test_export_again_writes_only_what_is_missing_or_of_other_options(city, tmp_path, monkeypatch):
+    written = []
+    write = pieces._write
+
+    def counted(job):
+        written.append(job.tile.id)
+        return write(job)
+
+    monkeypatch.setattr(pieces, "_write", counted)
+
+    def again(options=OPTIONS):
+        written.clear()
+        export(select(city), tmp_path, ["3dtiles"], options, SerialExecutor())
+        return len(written)
+
+    assert again() == 2
+    before = (tmp_path / "3dtiles" / "tileset.json").read_bytes()
+    assert again() == 0
+    next((tmp_path / "3dtiles" / "tiles").iterdir()).unlink()
+    assert again() == 1
+    next((tmp_path / "3dtiles" / ".pieces").iterdir()).write_text("{")
+    assert again() == 1
+    assert (tmp_path / "3dtiles" / "tileset.json").read_bytes() == before
+    assert again(replace(OPTIONS, datum=Datum("offset", "1"))) == 2
+
+
+def test_compressed_landxml_has_the_same_content(city, exported, tmp_path):
+    export(select(city), tmp_path, ["landxml"], Options(compress=True), SerialExecutor())
+    (file,) = (tmp_path / "landxml").iterdir()
+    assert file.name.endswith(".xml.gz")
+    (plain,) = (exported / "landxml").iterdir()
+    assert gzip.decompress(file.read_bytes()) == plain.read_bytes()
+
+
+def test_selection_by_id_and_box(city):
+    first, second, third = Catalog.read(city / "catalog.parquet").tiles
+    assert select(city, ids=[second.id]).tiles == (second,)
+    assert select(city, bbox=first.grid.bounds).tiles == (first,)
+    with pytest.raises(ConfigError, match="has no finished tile to export; see `flexroad status"):
+        select(city, ids=[third.id])
+    with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
+        select(city, variant="plane")
+
+
+def test_formats_that_cannot_be_written_are_refused_before_any_work():
+    with pytest.raises(ConfigError, match="--format names no format; known are 3dtiles"):
+        check_formats([], OPTIONS)
+    with pytest.raises(ConfigError, match="--format gltf is unknown; known are 3dtiles, landxml"):
+        check_formats(["landxml", "gltf"], OPTIONS)
+    with pytest.raises(
+        ConfigError, match="3dtiles needs heights above the ellipsoid .*--height-offset METRES"
+    ):
+        check_formats(["3dtiles"], Options())
