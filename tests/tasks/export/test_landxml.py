@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from pyproj import CRS
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import landxml
@@ -128,6 +129,15 @@ def test_write_unknown_heights_have_no_datum():
     assert root.find(f"{SPACE}Project").get("name") == '<a> & "b"\\n'
 
 
+def test_write_crs_without_code_is_wkt():
+    wkt = CRS.from_proj4("+proj=tmerc +lat_0=50 +lon_0=6 +k=1 +units=m").to_wkt(pretty=True)
+    mesh = tile()
+    local = Mesh(wkt, mesh.origin, mesh.vertices, mesh.faces, mesh.road)
+    system = ElementTree.fromstring(written([local])).find(f"{SPACE}CoordinateSystem")
+    assert system.get("epsgCode") is None
+    assert CRS(system.get("ogcWktCode")).equals(CRS(wkt))
+
+
 def test_write_compressed_has_the_same_text_and_equal_bytes():
     packed = written([tile()], compress=True)
     assert gzip.decompress(packed) == written([tile()])
@@ -140,8 +150,12 @@ def test_write_class_without_faces_has_no_surface():
 
 
 def test_write_without_meshes_names_the_remedy():
-    with pytest.raises(TaskError, match=r"no tile has a mesh with a face; choose an area"):
-        written([])
+    empty = Mesh(
+        "EPSG:25832", (0.0, 0.0, 0.0), np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, bool)
+    )
+    for meshes in ([], [empty]):
+        with pytest.raises(TaskError, match=r"no tile has a mesh with a face; choose an area"):
+            written(meshes)
 
 
 def test_write_two_crs_are_refused():
