@@ -13,6 +13,7 @@ from flexroad.pipeline.export import per_tile, tiles3d
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Encode, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.graph.borders import has_borders
 from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], None]
@@ -38,7 +39,8 @@ def write_landxml(
     """Write all meshes as one LandXML file."""
     name = landxml.NAME_COMPRESSED if options.compress else landxml.NAME
     latest = max(tile.datetime for tile in source.tiles)
-    project = landxml.Project(source.run.path.name, latest.astimezone(UTC), source.vertical)
+    joined = has_borders(source.run.config.chains[source.variant]["fit"])
+    project = landxml.Project(source.run.path.name, latest.astimezone(UTC), source.vertical, joined)
     with atomic_file(folder / f"{source.run.path.name}{name}") as local, local.open("wb") as file:
         meshes = (tile.mesh for tile in tiles)
         landxml.write(file, meshes, project, local.parent, options.compress)
