@@ -181,8 +181,9 @@ def _values(name: str, array: xr.DataArray) -> Floats:
     if raw.dtype.kind not in "buif":
         raise TaskError(f"{name} holds {raw.dtype}, not numbers; convert it with .astype(float)")
     values = raw.astype(np.float64)
-    nodata = array.rio.nodata
-    if nodata is not None and raw.dtype.kind != "b":
+    # A comparison keeps the attribute of its raster, and rioxarray cannot convert 255 to bool.
+    nodata = None if raw.dtype.kind == "b" else array.rio.nodata
+    if nodata is not None:
         # Compare in the array's dtype: -3.4e38 is not the same number in float32 and float64.
         values[values == np.float64(np.asarray(nodata).astype(raw.dtype))] = np.nan
     return values

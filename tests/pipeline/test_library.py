@@ -197,6 +197,16 @@ def test_fit_dask_arrays_with_nodata_equals_nan(scene, surface):
     assert lazy.height(*CENTRE) == missing.height(*CENTRE)
 
 
+def test_fit_mask_compared_with_a_class_keeps_its_rasters_nodata(scene, surface):
+    """``landcover == 1`` is a mask of bool with the nodata of the land cover, 255, as an attribute."""
+    cover = scene.road_mask.astype("uint8").rio.write_nodata(255)
+    with xr.set_options(keep_attrs=True):
+        mask = cover == 1
+    assert mask.dtype == bool
+    again = flexroad.fit(scene.dsm, scene.dtm, mask)
+    np.testing.assert_array_equal(again.fitted.A, surface.fitted.A)
+
+
 def test_fit_dtm_on_other_grid_is_resampled_with_warning(scene, surface):
     wider = flexroad.example(size_m=80)
     assert (
