@@ -7,6 +7,7 @@ vertical CRS unchanged and says nothing, unless ballpark transformations are exc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,7 +58,7 @@ class Ellipsoidal:
     datum: Datum
 
     def geographic(self, easting: Floats, northing: Floats, height: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return longitude and latitude (degrees) and height above the ellipsoid (m).
+        """Return longitude and latitude (degrees) and height above the ellipsoid (m), ``(n,)`` each.
 
         Raises
         ------
@@ -78,11 +79,6 @@ class Ellipsoidal:
             raise CatalogError(self._failure("the geoid does not cover the area"))
         return longitude, latitude, height + above
 
-    def geocentric(self, easting: Floats, northing: Floats, height: Floats) -> Floats:
-        """Return coordinates from the Earth's centre (m), ``(n, 3)``; see `geographic`."""
-        x, y, z = _exact(GEOGRAPHIC, GEOCENTRIC).transform(*self.geographic(easting, northing, height))
-        return np.stack([x, y, z], axis=-1)
-
     def _failure(self, reason: str) -> str:
         return (
             f"no exact conversion from {short(self.crs)} and {self.datum.text} to the ellipsoid of WGS 84: "
@@ -90,15 +86,23 @@ class Ellipsoidal:
         )
 
 
+def geocentric(longitude: Floats, latitude: Floats, height: Floats) -> Floats:
+    """Return coordinates from the Earth's centre (m), ``(n, 3)``, of results of `Ellipsoidal.geographic`."""
+    return np.stack(_transform(_exact(GEOGRAPHIC, GEOCENTRIC), longitude, latitude, height), axis=-1)
+
+
 def _transform(transformer: Any, *axes: Floats) -> tuple[Floats, Floats, Floats]:
     x, y, z = transformer.transform(*axes, errcheck=True)
     return x, y, z
 
 
+# A transformer takes longer to make than a tile to convert.
+@lru_cache(maxsize=16)
 def _exact(source: str, target: str) -> Any:
     return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
 
 
+@lru_cache(maxsize=16)
 def _geoid(file: str) -> Any:
     """Return the conversion of a height above a geoid to one above the ellipsoid."""
     return Transformer.from_pipeline(

@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from flexroad.catalog.ellipsoidal import Datum, Ellipsoidal
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, exists, parse_location, read, write
@@ -21,7 +19,7 @@ from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.tasks.export import glb, tiles3d
-from flexroad.tasks.types import Floats, Mesh
+from flexroad.tasks.types import Mesh
 
 VERSION = tiles3d.VERSION
 BLOCK_M = 4000.0
@@ -69,11 +67,6 @@ def write_tilesets(
 def piece(tile: FinishedTile, place: Place) -> Piece:
     """Return the GLB file of a tile, and its entry in the tileset of its block."""
     mesh, grid = tile.mesh, tile.graph.tile.grid
-    conversion = Ellipsoidal(place.crs, place.datum)
-
-    def geographic(*axes: Floats) -> Floats:
-        return np.stack(conversion.geographic(*axes), axis=-1)
-
     heights = mesh.vertices[:, 2] + mesh.origin[2]
     name = f"tiles/{safe_name(tile.id)}{glb.NAME}"
     placed = tiles3d.placed(
@@ -81,8 +74,7 @@ def piece(tile: FinishedTile, place: Place) -> Piece:
         grid.bounds,
         (float(heights.min()), float(heights.max())),
         place.origin,
-        conversion.geocentric,
-        geographic,
+        Ellipsoidal(place.crs, place.datum),
     )
     block = math.floor(grid.west / BLOCK_M), math.floor(grid.south / BLOCK_M)
     return Piece(

@@ -7,14 +7,14 @@ projection, 0.04% in the middle of a UTM zone: 79 mm at the corners of a tile of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from flexroad.catalog.ellipsoidal import Ellipsoidal, geocentric
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.types import Floats
 
 VERSION = 1
 NAME = ".json"
@@ -22,9 +22,6 @@ MEDIA_TYPE = "application/json"
 ASSET = {"version": "1.1", "generator": "FlexRoad"}
 MARGIN_M = 1.0
 """Height added below and above a tile's box (m): bounding volumes must contain all vertices."""
-
-Conversion = Callable[[Floats, Floats, Floats], Floats]
-"""From eastings, northings and heights (m), ``(n,)`` each, to another system, ``(n, 3)``."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +44,7 @@ def placed(
     bounds: Bounds,
     heights: tuple[float, float],
     origin: tuple[float, float],
-    geocentric: Conversion,
-    geographic: Conversion,
+    conversion: Ellipsoidal,
 ) -> Placed:
     """Return where a tile's mesh is on the Earth.
 
@@ -62,15 +58,15 @@ def placed(
         Lowest and highest height of the mesh (m).
     origin : tuple of float
         Easting and northing of the run's origin (m), which the coordinates of its GLB files are relative to.
-    geocentric, geographic : callable
-        Conversions to metres from the Earth's centre, and to longitude and latitude (degrees) and height
-        above the ellipsoid.
+    conversion : Ellipsoidal
+        From the CRS and the heights of the run to WGS 84.
     """
     west, south, east, north = bounds
     low, high = heights[0] - MARGIN_M, heights[1] + MARGIN_M
     axes = np.meshgrid(np.linspace(west, east, 5), np.linspace(south, north, 5), [low, high])
     points = np.stack([axis.ravel() for axis in axes], axis=1)
-    exact = geocentric(*points.T)
+    longitude, latitude, height = conversion.geographic(*points.T)
+    exact = geocentric(longitude, latitude, height)
     local = points - (*origin, 0.0)
     # Centred, so that the squares of large coordinates do not cost digits.
     middle, centre = local.mean(axis=0), exact.mean(axis=0)
@@ -79,7 +75,6 @@ def placed(
     residual = np.linalg.norm(local @ linear.T + shift - exact, axis=1).max()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, shift
-    longitude, latitude, height = geographic(*points.T).T
     region = (
         *np.radians([longitude.min(), latitude.min(), longitude.max(), latitude.max()]),
         height.min(),

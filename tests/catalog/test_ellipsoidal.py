@@ -6,7 +6,7 @@ import rasterio
 from pyproj import Transformer
 
 from flexroad.catalog.crs import CatalogError
-from flexroad.catalog.ellipsoidal import Datum, Ellipsoidal
+from flexroad.catalog.ellipsoidal import Datum, Ellipsoidal, geocentric
 
 PLACE = np.array([500_000.0]), np.array([5_600_000.0]), np.array([100.0])
 
@@ -61,7 +61,7 @@ def test_geocentric_agrees_with_the_equations_of_the_ellipsoid():
         (n + height) * np.cos(phi) * np.sin(lam),
         (n * (1 - e2) + height) * np.sin(phi),
     ]
-    np.testing.assert_allclose(conversion.geocentric(*PLACE)[0], np.ravel(expected), atol=1e-6)
+    np.testing.assert_allclose(geocentric(longitude, latitude, height)[0], np.ravel(expected), atol=1e-6)
 
 
 @pytest.mark.parametrize(("kind", "value"), [("geoid", "none.gtx"), ("offset", "nan")])
