@@ -58,16 +58,8 @@ def export(
             rich_help_panel=options.INPUTS,
         ),
     ] = None,
-    tile: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="Only these tiles: --tile ID ID ...", rich_help_panel=options.TILES),
-    ] = None,
-    bbox: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=options.TILES
-        ),
-    ] = None,
+    tile: options.TileIds = None,
+    bbox: options.Box = None,
     allow: options.Allow = None,
     executor: options.Executor = "serial",
     workers: options.Workers = None,

@@ -37,6 +37,14 @@ Allow = Annotated[
         rich_help_panel=INPUTS,
     ),
 ]
+TileIds = Annotated[
+    list[str] | None,
+    typer.Option("--tile", metavar="ID", help="Only these tiles: --tile ID ID ...", rich_help_panel=TILES),
+]
+Box = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option("--bbox", metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=TILES),
+]
 Workers = Annotated[
     int | None,
     typer.Option(min=1, metavar="N", help="Worker processes; default: one per core.", rich_help_panel=WORK),

@@ -68,16 +68,8 @@ def run(
         ),
     ] = None,
     verify: options.Verify = False,
-    tile: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="Only these tiles: --tile ID ID ...", rich_help_panel=options.TILES),
-    ] = None,
-    bbox: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=options.TILES
-        ),
-    ] = None,
+    tile: options.TileIds = None,
+    bbox: options.Box = None,
     executor: options.Executor = "dask",
     workers: options.Workers = None,
     scheduler: options.Scheduler = None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC
+from functools import partial
 
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.catalog.storage.staging import atomic_file
@@ -59,21 +60,27 @@ def write_cityjson(
 def write_obj(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> None:
-    """Write the mesh of each tile as OBJ; all share one file of materials."""
+    """Write the file of materials that all OBJ files share, then the mesh of each tile as OBJ."""
     write(folder / per_tile.MATERIALS, obj.encode_materials())
-    _each(obj.VERSION, per_tile.obj_piece)(source, tiles, folder, options, executor)
+    _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
 
 
-def _each(version: int, encode: Encode) -> Write:
-    """Return the writer of a format that has files of its own for each tile."""
+def _write_each(
+    version: int,
+    encode: Encode,
+    source: Source,
+    tiles: Iterable[FinishedTile],
+    folder: Location,
+    options: Options,
+    executor: Executor,
+) -> None:
+    """Write a format that has files of its own for each tile."""
+    for _ in write_pieces(tiles, folder, version, encode, source.vertical, executor):
+        pass
 
-    def write_each(
-        source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-    ) -> None:
-        for _ in write_pieces(tiles, folder, version, encode, source.vertical, executor):
-            pass
 
-    return write_each
+def _per_tile(title: str, version: int, encode: Encode, precision_m: float | None) -> Format:
+    return Format(title, partial(_write_each, version, encode), version, precision_m)
 
 
 FORMATS = {
@@ -81,13 +88,10 @@ FORMATS = {
     "landxml": Format("LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001),
     "cityjson": Format("CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001),
     "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001),
-    "heightfield": Format(
-        "16-bit height fields, for game engines",
-        _each(heightfield.VERSION, per_tile.heightfield_piece),
-        heightfield.VERSION,
-        None,
+    "heightfield": _per_tile(
+        "16-bit height fields, for game engines", heightfield.VERSION, per_tile.heightfield_piece, None
     ),
-    "step": Format("STEP AP214, for CAD", _each(step.VERSION, per_tile.step_piece), step.VERSION, 1e-9),
-    "3dm": Format("3DM, for Rhino", _each(rhino.VERSION, per_tile.rhino_piece), rhino.VERSION, 1e-4),
+    "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
+    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4),
 }
 """By the name on the command line."""

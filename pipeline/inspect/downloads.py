@@ -192,8 +192,8 @@ def _vectors(path: Path) -> Download:
         layers = layers_of(path)
     except (RuntimeError, ValueError, OSError) as error:
         return Download(path, "vector", question=f"it cannot be read as vectors: {error}")
-    question = "which layer are the roads (--roads-layer)?" if len(layers) > 1 else ""
     if not any(re.search(ROADS, name.lower()) for name in (path.stem, *layers)):
-        question = "are these roads? If so, give it with --roads"
-    kind = "vector" if "are these roads" in question else "roads"
-    return Download(path, kind, listed(layers), question=question)
+        unclear = "are these roads? If so, give it with --roads"
+        return Download(path, "vector", listed(layers), question=unclear)
+    question = "which layer are the roads (--roads-layer)?" if len(layers) > 1 else ""
+    return Download(path, "roads", listed(layers), question=question)
