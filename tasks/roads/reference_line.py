@@ -1,0 +1,254 @@
+"""Reference lines of roads: smooth curves with points at equal distances, for OpenCRG and OpenDRIVE.
+
+A route is smoothed within a given lateral distance and becomes a curve of cubic pieces (OpenDRIVE's
+paramPoly3). Points on it whose distances are all equal, straight from point to point, are OpenCRG's reference
+line. Both formats so have the same points. The last piece of a route that is shorter than this distance is
+left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from flexroad.tasks import options as base
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.roads.routes import Route
+from flexroad.tasks.types import Floats
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
+
+SAMPLE_M = 1.0
+"""Distance of the points that are smoothed (m)."""
+PINNED = 1e6
+"""Weight of a route's first and last point: routes that meet still meet when they are smooth."""
+ATTEMPTS = ((0.8, 1.0), (0.6, 0.5), (0.4, 0.25))
+"""Share of the allowed offset that smoothing uses, and length of the pieces as a share of ``piece_m``: long
+pieces cut the corners of the smoothed line, so that narrow bends need shorter ones."""
+ROUNDS = 40
+WIDENING_M = 10.0
+"""Length over which a step of the width is spread (m)."""
+FOLD = 0.9
+"""Largest distance on the inside of a bend as a share of its radius, where cross-sections meet."""
+CLOSED = 1e-10
+"""Relative error of the distances between points."""
+
+
+class Options(base.Options):
+    """Smoothing and spacing of reference lines."""
+
+    increment_m: float = Field(1.0, ge=0.1, le=10, description="distance of points, a multiple of 1 mm (m)")
+    max_offset_m: float = Field(0.25, gt=0, le=5, description="largest distance from the centre lines (m)")
+    smooth_m: float = Field(30.0, gt=0, le=500, description="shorter waves of a line are smoothed away (m)")
+    piece_m: float = Field(4.0, ge=1, le=50, description="length of a cubic piece (m)")
+    min_length_m: float = Field(10.0, ge=10, description="shortest road (m)")
+
+    @field_validator("increment_m")
+    @classmethod
+    def _whole_mm(cls, increment_m: float) -> float:
+        # OpenCRG's consistency check wants it.
+        if not math.isclose(increment_m * 1000, round(increment_m * 1000), rel_tol=1e-9):
+            raise ValueError(f"increment_m {increment_m:g} is not a multiple of 0.001")
+        return increment_m
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceLine:
+    """A smooth line with points at equal distances."""
+
+    x: Floats
+    """``(n,)``, m."""
+    y: Floats
+    heading: Floats
+    """Direction of the curve at each point, ``(n,)``, radians counter-clockwise from x, not wrapped."""
+    s: Floats
+    """Length of the curve from the first point to each point, ``(n,)``, m."""
+    increment: float
+    """Distance between neighbouring points, straight (m)."""
+    width: Floats
+    """Width of the carriageway at each point, ``(n,)``, m; the line is in its middle."""
+    parameter: Floats
+    """Parameter of the curve at each point, ``(n,)``."""
+    curve: PPoly
+    """The plan: cubic pieces in x and y, twice continuously differentiable."""
+    offset_m: float
+    """Largest distance of a point from the centre lines (m)."""
+    lanes: int | None = None
+    oneway: bool = False
+    name: str = ""
+
+    @property
+    def chord_headings(self) -> Floats:
+        """Directions from point to point, ``(n - 1,)``, radians from -pi to pi."""
+        return np.arctan2(np.diff(self.y), np.diff(self.x))
+
+    @property
+    def curvature(self) -> Floats:
+        """Curvature at each point, ``(n,)``, 1/m; positive to the left."""
+        (x1, y1), (x2, y2) = (self.curve(self.parameter, order).T for order in (1, 2))
+        return np.asarray((x1 * y2 - y1 * x2) / np.hypot(x1, y1) ** 3)
+
+    def reach(self, distance: float) -> tuple[float, float]:
+        """Return how far the line's cross-sections reach to the right and to the left (m) before they meet.
+
+        At most ``distance``. A bend to the left limits the left side.
+        """
+        bends = self.curvature
+        right, left = (FOLD / max(float((side * bends).max()), FOLD / distance) for side in (-1, 1))
+        return right, left
+
+    def beside(self, v: Floats) -> tuple[Floats, Floats]:
+        """Return x and y, ``(n, len(v))``, of points at distances ``v`` from the line, positive to the left.
+
+        They are where OpenCRG's readers have them: on the bisectors of the angles between chords, at the
+        distance ``v`` from both chords.
+        """
+        normal = np.stack([-np.diff(self.y), np.diff(self.x)], axis=1) / self.increment
+        before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
+        mitre = (before + after) / (1 + (before * after).sum(axis=1))[:, None]
+        return self.x[:, None] + v * mitre[:, :1], self.y[:, None] + v * mitre[:, 1:]
+
+    def part(self, first: int, last: int) -> ReferenceLine:
+        """Return the line from one point to another one, both included."""
+        here = slice(first, last + 1)
+        cut = {name: getattr(self, name)[here] for name in ("x", "y", "heading", "width", "parameter")}
+        return replace(self, s=self.s[here] - self.s[first], **cut)
+
+
+def reference_line(route: Route, options: Options) -> ReferenceLine | None:
+    """Return the reference line of a route, or None if the route is shorter than ``min_length_m``."""
+    points = route.points
+    if _along(points)[-1] < options.min_length_m:
+        return None
+    for share, shorter in ATTEMPTS:
+        curve = _curve(_smoothed(points, options, share * options.max_offset_m), shorter * options.piece_m)
+        parameter = _equally_spaced(curve, options.increment_m)
+        x, y = curve(parameter).T
+        offset_m = float(_away(points, x, y).max())
+        if offset_m <= options.max_offset_m:
+            break
+    if len(parameter) - 1 < options.min_length_m / options.increment_m:
+        return None
+    by_x, by_y = curve(parameter, 1).T
+    first = route.parts[0]
+    return ReferenceLine(
+        x=x,
+        y=y,
+        heading=np.unwrap(np.arctan2(by_y, by_x)),
+        s=_lengths(curve, parameter),
+        increment=options.increment_m,
+        width=_widths(route, x, y, options.increment_m),
+        parameter=parameter,
+        curve=curve,
+        offset_m=offset_m,
+        lanes=first.lanes,
+        oneway=first.oneway,
+        name=next((part.name for part in route.parts if part.name), ""),
+    )
+
+
+def usable(line: ReferenceLine, known: Floats, options: Options) -> list[ReferenceLine]:
+    """Return the parts of a line that can be a road, without those shorter than ``min_length_m``.
+
+    A road ends where the surface ends, and before a bend with a radius of less than half its width: there its
+    cross-sections would meet.
+
+    Parameters
+    ----------
+    line : ReferenceLine
+    known : ndarray, (n,)
+        Heights at its points, NaN beyond the surface.
+    options : Options
+    """
+    inside = np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+    spans = edges.reshape(-1, 2) - (0, 1)
+    least = options.min_length_m / options.increment_m
+    return [line.part(int(a), int(b)) for a, b in spans if b - a >= least]
+
+
+def _along(points: Floats) -> Floats:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def _away(points: Floats, x: Floats, y: Floats) -> Floats:
+    """Return the distances of points from a polyline."""
+    import shapely
+
+    return np.asarray(shapely.distance(shapely.LineString(points), shapely.points(x, y)))
+
+
+def _curve(smooth: Floats, piece_m: float) -> PPoly:
+    """Return a curve through a smooth polyline; its parameter is nearly its length."""
+    from scipy.interpolate import CubicSpline
+
+    along = _along(smooth)
+    knots = np.linspace(0.0, along[-1], max(2, round(along[-1] / piece_m)) + 1)
+    places = np.stack([np.interp(knots, along, smooth[:, axis]) for axis in (0, 1)], axis=1)
+    return CubicSpline(knots, places, bc_type="natural")
+
+
+def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
+    """Return a polyline, smooth within a distance, with several points a metre.
+
+    A smoothing spline passes waves much longer than ``smooth_m`` and stops shorter ones. Where it leaves the
+    allowed distance, the weights of the points grow until it does not.
+    """
+    from scipy.interpolate import make_smoothing_spline
+
+    along = _along(points)
+    at = np.linspace(0.0, along[-1], round(along[-1] / SAMPLE_M) + 1)
+    place = np.stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)], axis=1)
+    weights = np.ones(len(at))
+    weights[[0, -1]] = PINNED
+    strength = (options.smooth_m / (2 * math.pi)) ** 4 / at[1]
+    fine = np.linspace(0.0, at[-1], 8 * (len(at) - 1) + 1)
+    for _ in range(ROUNDS):
+        fits = [make_smoothing_spline(at, place[:, axis], weights, strength) for axis in (0, 1)]
+        smooth = np.stack([fit(fine) for fit in fits], axis=1)
+        over = np.flatnonzero(_away(points, *smooth.T) > within_m)
+        if not len(over):
+            break
+        near = np.unique(np.clip(np.round(over / 8).astype(int) + np.arange(-1, 2)[:, None], 0, len(at) - 1))
+        weights[near] = np.maximum(weights[near], np.minimum(2 * weights[near], PINNED))
+    return smooth
+
+
+def _equally_spaced(curve: PPoly, increment: float) -> Floats:
+    """Return parameters of points whose distances are all equal, from the start of a curve."""
+    end = float(curve.x[-1])
+    t = np.arange(0.0, end + increment / 2, increment)
+    for _ in range(ROUNDS):
+        distance = np.linalg.norm(np.diff(curve(t), axis=0), axis=1)
+        if np.abs(distance - increment).max() < CLOSED * increment:
+            break
+        t[1:] += np.cumsum(increment - distance)
+    else:
+        x, y = curve(0.0)
+        raise TaskError(f"the road at x {x:.1f}, y {y:.1f} bends too much for points every {increment:g} m")
+    return np.asarray(t[t <= end])
+
+
+def _lengths(curve: PPoly, parameter: Floats) -> Floats:
+    """Return the length of a curve from the first to each parameter."""
+    ends = np.union1d(parameter, curve.x[(curve.x > parameter[0]) & (curve.x < parameter[-1])])
+    node, weight = np.polynomial.legendre.leggauss(6)
+    half, middle = np.diff(ends) / 2, (ends[:-1] + ends[1:]) / 2
+    speed = np.linalg.norm(curve(middle[:, None] + half[:, None] * node, 1), axis=-1)
+    total = np.concatenate([[0.0], np.cumsum(half * (speed * weight).sum(axis=1))])
+    return np.asarray(total[np.searchsorted(ends, parameter)])
+
+
+def _widths(route: Route, x: Floats, y: Floats, increment: float) -> Floats:
+    """Return the width at points of a route; steps between its parts are spread over some metres."""
+    import shapely
+    from scipy.ndimage import uniform_filter1d
+
+    tree = shapely.STRtree([shapely.LineString(part.points) for part in route.parts])
+    width = np.array([part.width_m for part in route.parts])[tree.nearest(shapely.points(x, y))]
+    return np.asarray(uniform_filter1d(width, max(1, round(WIDENING_M / increment)), mode="nearest"))
