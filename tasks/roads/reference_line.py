@@ -35,6 +35,10 @@ WIDENING_M = 10.0
 """Length over which a step of the width is spread (m)."""
 FOLD = 0.9
 """Largest distance on the inside of a bend as a share of its radius, where cross-sections meet."""
+TINY_M = 1e-6
+"""Pieces shorter than this are left to their neighbours (m)."""
+EVEN_M, QUARTERS = 0.0005, np.arange(4) / 4
+"""Largest difference of length and parameter within a piece (m), and where it is measured."""
 CLOSED = 1e-10
 """Relative error of the distances between points."""
 
@@ -112,6 +116,26 @@ class ReferenceLine:
         before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
         mitre = (before + after) / (1 + (before * after).sum(axis=1))[:, None]
         return self.x[:, None] + v * mitre[:, :1], self.y[:, None] + v * mitre[:, 1:]
+
+    @property
+    def pieces(self) -> tuple[Floats, Floats]:
+        """Parameters at the ends of the cubic pieces from the first to the last point, and the length there.
+
+        Both ``(k + 1,)`` for ``k`` pieces. Within a piece the parameter grows as the length does, within half
+        a millimetre: OpenDRIVE's readers take it so. Pieces of the curve where it does not are divided.
+        """
+        first, last = self.parameter[0], self.parameter[-1]
+        inner = self.curve.x[(self.curve.x > first + TINY_M) & (self.curve.x < last - TINY_M)]
+        ends = np.concatenate([[first], inner, [last]])
+        for _ in range(ROUNDS):
+            fine = np.concatenate([(ends[:-1, None] + np.diff(ends)[:, None] * QUARTERS).ravel(), ends[-1:]])
+            lengths = _lengths(self.curve, fine)
+            whole = np.diff(lengths[::4])[:, None] * QUARTERS
+            uneven = np.abs(lengths[:-1].reshape(-1, 4) - lengths[:-1:4, None] - whole).max(axis=1) > EVEN_M
+            if not uneven.any():
+                break
+            ends = np.union1d(ends, fine[2::4][uneven])
+        return ends, _lengths(self.curve, ends)
 
     def part(self, first: int, last: int) -> ReferenceLine:
         """Return the line from one point to another one, both included."""

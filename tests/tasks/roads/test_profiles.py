@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from flexroad.tasks.roads.height_grid import HeightGrid, height_grid
+from flexroad.tasks.roads.height_grid import Options as GridOptions
+from flexroad.tasks.roads.profiles import Options, Profiles, profile_error, profiles
+from flexroad.tasks.roads.reference_line import Options as LineOptions
+from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
+from flexroad.tasks.roads.routes import CentreLine, Route
+
+
+def straight(length: float = 120.0) -> ReferenceLine:
+    """Return a straight road to the east, 6 m wide: s is x, and v is y."""
+    line = reference_line(Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions())
+    assert line is not None
+    return line
+
+
+def grid(heights_at, length: float = 120.0) -> HeightGrid:
+    return height_grid(straight(length), heights_at, GridOptions())
+
+
+def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a slope of cubics with a crossfall that changes along the road."""
+    return 80 + 0.05 * x - 2e-4 * x**2 + 1e-6 * x**3 + y * np.tan(0.02 + 2e-4 * x)
+
+
+def fitted(heights: HeightGrid) -> tuple[Profiles, float]:
+    result = profiles(heights, Options())
+    return result, profile_error(heights, result).max_m
+
+
+@pytest.mark.parametrize("length", [10.0, 11.0, 25.0, 120.0])
+def test_profiles_cubic_road_is_found(length):
+    result, worst = fitted(grid(hill, length))
+    s = np.linspace(0, length, 37)
+    np.testing.assert_allclose(result.elevation(s), hill(s, 0 * s), atol=1e-6)
+    np.testing.assert_allclose(result.superelevation(s), 0.02 + 2e-4 * s, atol=1e-6)
+    assert worst < 1e-6
+
+
+def test_profiles_left_side_higher_is_positive():
+    result, _ = fitted(grid(lambda x, y: 0.1 * y))
+    assert result.superelevation(50.0) == pytest.approx(np.arctan(0.1))
+
+
+def test_profiles_verge_does_not_count():
+    # A kerb of 0.3 m from 3 m on, where the carriageway ends; the grid reaches 4 m.
+    result, worst = fitted(grid(lambda x, y: hill(x, y) + 0.3 * (np.abs(y) > 3.01)))
+    assert worst < 1e-6
+    assert result.elevation(60.0) == pytest.approx(hill(60.0, 0.0), abs=1e-6)
+
+
+def test_profile_error_of_a_crown_is_what_a_straight_section_misses():
+    crowned = grid(lambda x, y: hill(x, y) - 0.01 * y**2)
+    result, worst = fitted(crowned)
+    # The best line is level at the mean of the squares; the edges miss it most.
+    v = np.arange(-3, 3.1, 0.25)
+    truth = np.abs(0.01 * (v**2 - (v**2).mean()))
+    assert worst == pytest.approx(truth.max(), abs=1e-6)
+    assert profile_error(crowned, result).mean_m == pytest.approx(truth.mean(), abs=1e-6)
+
+
+def test_profiles_unknown_cross_sections_are_bridged():
+    whole = grid(hill)
+    holed = whole.heights.copy()
+    holed[50:53] = np.nan
+    result, worst = fitted(HeightGrid(whole.line, whole.v, holed))
+    assert worst < 0.001
+    assert result.elevation(51.0) == pytest.approx(hill(51.0, 0.0), abs=0.005)
+
+
+def test_profile_error_without_heights_is_nan():
+    whole = grid(hill)
+    nothing = HeightGrid(whole.line, whole.v, whole.heights * np.nan)
+    assert np.isnan(profile_error(nothing, profiles(nothing, Options())).max_m)
+
+
+def test_profiles_are_smooth_at_their_knots():
+    result, _ = fitted(grid(lambda x, y: hill(x, y) + 0.05 * np.sin(x)))
+    for spline in (result.elevation, result.superelevation):
+        assert np.diff(spline.x).min() > 1
+        for order in range(3):
+            before, after = spline(spline.x[1:-1] - 1e-9, order), spline(spline.x[1:-1] + 1e-9, order)
+            np.testing.assert_allclose(before, after, atol=1e-6)
