@@ -23,9 +23,10 @@ from flexroad.tasks.types import Floats
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-SAMPLE_M = 1.0
+SAMPLE_M = 0.25
 """Distance of the points that are smoothed (m)."""
-PINNED = 1e6
+DIAGONAL = np.array([[0.0], [0.0], [1.0]])
+PINNED = 1e9
 """Weight of a route's first and last point: routes that meet still meet when they are smooth."""
 ATTEMPTS = ((0.8, 1.0), (0.6, 0.5), (0.4, 0.25))
 """Share of the allowed offset that smoothing uses, and length of the pieces as a share of ``piece_m``: long
@@ -208,39 +209,45 @@ def _away(points: Floats, x: Floats, y: Floats) -> Floats:
 
 
 def _curve(smooth: Floats, piece_m: float) -> PPoly:
-    """Return a curve through a smooth polyline; its parameter is nearly its length."""
+    """Return a curve through some points of a smooth polyline; its parameter is nearly its length."""
     from scipy.interpolate import CubicSpline
 
     along = _along(smooth)
-    knots = np.linspace(0.0, along[-1], max(2, round(along[-1] / piece_m)) + 1)
-    places = np.stack([np.interp(knots, along, smooth[:, axis]) for axis in (0, 1)], axis=1)
-    return CubicSpline(knots, places, bc_type="natural")
+    pieces = max(2, round(along[-1] / piece_m))
+    chosen = np.round(np.linspace(0, len(smooth) - 1, pieces + 1)).astype(int)
+    return CubicSpline(along[chosen], smooth[chosen], bc_type="natural")
 
 
 def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
     """Return a polyline, smooth within a distance, with several points a metre.
 
-    A smoothing spline passes waves much longer than ``smooth_m`` and stops shorter ones. Where it leaves the
-    allowed distance, the weights of the points grow until it does not.
+    The sum of squared distances and of squared second differences is least, so that waves much longer than
+    ``smooth_m`` pass and shorter ones do not. Where the result leaves the allowed distance, weights of the
+    points grow until it does not.
     """
-    from scipy.interpolate import make_smoothing_spline
+    from scipy.linalg import solveh_banded
 
     along = _along(points)
     at = np.linspace(0.0, along[-1], round(along[-1] / SAMPLE_M) + 1)
     place = np.stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)], axis=1)
+    penalty = (options.smooth_m / (2 * math.pi * at[1])) ** 4 * _second_differences(len(at))
     weights = np.ones(len(at))
     weights[[0, -1]] = PINNED
-    strength = (options.smooth_m / (2 * math.pi)) ** 4 / at[1]
-    fine = np.linspace(0.0, at[-1], 8 * (len(at) - 1) + 1)
     for _ in range(ROUNDS):
-        fits = [make_smoothing_spline(at, place[:, axis], weights, strength) for axis in (0, 1)]
-        smooth = np.stack([fit(fine) for fit in fits], axis=1)
-        over = np.flatnonzero(_away(points, *smooth.T) > within_m)
-        if not len(over):
+        smooth = solveh_banded(penalty + weights * DIAGONAL, weights[:, None] * place)
+        over = np.linalg.norm(smooth - place, axis=1) > within_m
+        if not over.any():
             break
-        near = np.unique(np.clip(np.round(over / 8).astype(int) + np.arange(-1, 2)[:, None], 0, len(at) - 1))
-        weights[near] = np.maximum(weights[near], np.minimum(2 * weights[near], PINNED))
-    return smooth
+        weights[over] = np.minimum(2 * weights[over], PINNED)
+    return np.asarray(smooth)
+
+
+def _second_differences(count: int) -> Floats:
+    """Return the upper bands of the matrix whose quadratic form is the sum of squared second differences."""
+    bands = np.ones((3, count)) * [[1.0], [-4.0], [6.0]]
+    bands[1, [1, -1]] = -2
+    bands[2, [0, -1]], bands[2, [1, -2]] = 1, 5
+    return bands
 
 
 def _equally_spaced(curve: PPoly, increment: float) -> Floats:
