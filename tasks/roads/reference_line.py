@@ -47,7 +47,7 @@ CLOSED = 1e-10
 class Options(base.Options):
     """Smoothing and spacing of reference lines."""
 
-    increment_m: float = Field(1.0, ge=0.1, le=10, description="distance of points, a multiple of 1 mm (m)")
+    increment_m: float = Field(0.5, ge=0.1, le=10, description="distance of points, a multiple of 1 mm (m)")
     max_offset_m: float = Field(0.25, gt=0, le=5, description="largest distance from the centre lines (m)")
     smooth_m: float = Field(30.0, gt=0, le=500, description="shorter waves of a line are smoothed away (m)")
     piece_m: float = Field(4.0, ge=1, le=50, description="length of a cubic piece (m)")

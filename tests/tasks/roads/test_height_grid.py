@@ -8,7 +8,7 @@ from flexroad.tasks.roads.routes import CentreLine, Route
 
 
 def road(points: np.ndarray, width_m: float = 6.0) -> ReferenceLine:
-    line = reference_line(Route((CentreLine(points, width_m),)), LineOptions())
+    line = reference_line(Route((CentreLine(points, width_m),)), LineOptions(increment_m=1.0))
     assert line is not None
     return line
 

@@ -11,7 +11,9 @@ from flexroad.tasks.roads.routes import CentreLine, Route
 
 def straight(length: float = 120.0) -> ReferenceLine:
     """Return a straight road to the east, 6 m wide: s is x, and v is y."""
-    line = reference_line(Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions())
+    line = reference_line(
+        Route((CentreLine(np.array([[0.0, 0.0], [length, 0.0]]), 6.0),)), LineOptions(increment_m=1.0)
+    )
     assert line is not None
     return line
 

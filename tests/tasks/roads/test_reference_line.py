@@ -15,7 +15,7 @@ def arc(radius: float, degrees: float) -> np.ndarray:
 
 
 def smooth(points: np.ndarray, **options: float) -> ReferenceLine:
-    line = reference_line(Route((CentreLine(points, 6.0),)), Options(**options))
+    line = reference_line(Route((CentreLine(points, 6.0),)), Options(**{"increment_m": 1.0} | options))
     assert line is not None
     return line
 
@@ -62,8 +62,9 @@ def test_reference_line_route_below_the_shortest_length_has_none():
 
 
 def test_reference_line_width_steps_are_spread():
+    narrow = CentreLine(np.array([[0.0, 0.0], [50.0, 0.0]]), 6.0)
     wide = CentreLine(np.array([[50.0, 0.0], [100.0, 0.0]]), 8.0)
-    line = reference_line(Route((CentreLine(np.array([[0.0, 0.0], [50.0, 0.0]]), 6.0), wide)), Options())
+    line = reference_line(Route((narrow, wide)), Options(increment_m=1.0))
     assert line is not None
     assert (line.width[0], line.width[-1]) == (6.0, 8.0)
     steps = np.diff(line.width)
@@ -98,7 +99,7 @@ def test_usable_gap_in_the_heights_cuts_the_line():
     known = np.zeros(len(line.x))
     known[40:45] = np.nan
     known[-5] = np.nan  # what follows is shorter than the shortest road
-    parts = usable(line, known, Options())
+    parts = usable(line, known, Options(increment_m=1.0))
     assert [len(part.x) for part in parts] == [40, len(line.x) - 50]
 
 
@@ -106,7 +107,7 @@ def test_usable_bend_narrower_than_the_road_cuts_the_line():
     turned = np.array([[0.0, 0.0], [60.0, 0.0], [100.0, 40.0]])
     line = smooth(turned, max_offset_m=0.1)
     assert np.abs(line.curvature).max() > 1 / 3
-    parts = usable(line, np.zeros(len(line.x)), Options())
+    parts = usable(line, np.zeros(len(line.x)), Options(increment_m=1.0))
     assert len(parts) == 2
     assert all((np.abs(part.curvature) * part.width / 2 < 1).all() for part in parts)
 
