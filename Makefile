@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all fuzz lint bench container clean
+.PHONY: help setup reproduce run rerun test test-all validators fuzz lint bench container clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -81,6 +81,19 @@ test: $(STAMP) ## Run the tests but for the slow ones: minutes
 test-all: $(STAMP) ## Run all tests
 	$(PYTEST)
 
+# Programs of others that check exports; FLEXROAD_VALIDATORS=.validators makes the tests use them.
+VALIDATORS := .validators
+VALIDATED_BY := $(addprefix tests/validators/,requirements.txt package.json package-lock.json)
+
+validators: $(VALIDATORS)/.installed ## Install the programs that check exports into .validators (2 GB, needs npm)
+
+$(VALIDATORS)/.installed: $(VALIDATED_BY)
+	$(PYTHON) -m venv $(VALIDATORS)
+	$(VALIDATORS)/bin/pip install --quiet --disable-pip-version-check -r tests/validators/requirements.txt
+	cp $(filter %.json,$^) $(VALIDATORS)
+	npm ci --prefix $(VALIDATORS) --ignore-scripts --no-audit --no-fund
+	touch $@
+
 # Two of the eight kinds at a time: half an hour.
 FUZZ_SECONDS ?= 450
 FUZZ_SEED ?= $(shell date +%s)
@@ -106,6 +119,6 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 container: ## Build a container image: make container [BUILDER=docker] [IMAGE=flexroad] [EXTRAS=s3,train]
 	$(BUILDER) build --build-arg EXTRAS=$(EXTRAS) --build-arg TORCH_INDEX=$(TORCH_INDEX) --tag $(IMAGE) --file Containerfile .
 
-clean: ## Remove the environment, caches and runs
-	rm -rf $(VENV) runs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+clean: ## Remove the environments, caches and runs
+	rm -rf $(VENV) $(VALIDATORS) runs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

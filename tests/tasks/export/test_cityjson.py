@@ -1,5 +1,6 @@
 import io
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson
 from flexroad.tasks.types import Mesh
+from tests import validators
 
 ORIGIN = (295000.0, 5629000.0, 100.0)
 
@@ -50,6 +52,22 @@ def test_write_reads_back_within_half_a_millimetre():
     for kind, road in (("Road", True), ("TINRelief", False)):
         truth = np.concatenate([(m.vertices + m.origin)[m.faces[m.road == road]] for m in meshes])
         np.testing.assert_allclose(read(lines, kind), truth, rtol=0, atol=0.5e-3 + 1e-8)
+
+
+@pytest.mark.slow
+def test_write_read_by_cjio_has_all_tiles_at_their_places(tmp_path):
+    meshes = [tile(0), tile(1)]
+    lines = "".join(json.dumps(line) + "\n" for line in written(meshes))
+    command = [validators.program("cjio"), "--suppress_msg", "stdin", "save", "city.json"]
+    subprocess.run(command, cwd=tmp_path, input=lines, text=True, check=True)
+    city = json.loads((tmp_path / "city.json").read_text())
+    kinds = [item["type"] for item in city["CityObjects"].values()]
+    assert (kinds.count("TINRelief"), kinds.count("Road")) == (1, 2)  # the second tile is all road
+    transform = city["transform"]
+    found = np.array(city["vertices"]) * transform["scale"] + transform["translate"]
+    truth = np.concatenate([mesh.vertices + mesh.origin for mesh in meshes])
+    for least in (np.min, np.max):
+        np.testing.assert_allclose(least(found, axis=0), least(truth, axis=0), rtol=0, atol=0.5e-3 + 1e-8)
 
 
 def test_header_has_version_transform_and_crs():
