@@ -82,9 +82,9 @@ def obj(folder):
     return np.concatenate(points)
 
 
-def tiles3d(folder):
+def tiles3d(folder, crs):
     """The vertices of all tiles by the tilesets, back in the CRS of the run."""
-    back = Transformer.from_crs("EPSG:4978", "EPSG:25832+7837".partition("+")[0], always_xy=True)
+    back = Transformer.from_crs("EPSG:4978", crs, always_xy=True)
     geographic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     points = []
     for block in json.loads((folder / "tileset.json").read_text())["root"]["children"]:
@@ -99,10 +99,10 @@ def tiles3d(folder):
     return np.concatenate(points)
 
 
-def heightfields(folder):
+def heightfields(folder, names="*"):
     """The nodes of all fields, and the precision that the files say."""
     points, precision = [], 0.0
-    for file in sorted(folder.glob("*_heightfield.json")):
+    for file in sorted(folder.glob(f"{names}_heightfield.json")):
         place = json.loads(file.read_text())
         west, south, east, north = place["bounds"]
         columns, rows = place["size"]
@@ -114,9 +114,9 @@ def heightfields(folder):
     return np.concatenate(points), precision
 
 
-def vertices(out):
+def vertices(out, crs="EPSG:25832"):
     return {
-        "3dtiles": tiles3d(out / "3dtiles"),
+        "3dtiles": tiles3d(out / "3dtiles", crs),
         "landxml": landxml(next((out / "landxml").iterdir())),
         "cityjson": cityjson(next((out / "cityjson").iterdir())),
         "obj": obj(out / "obj"),

@@ -2,9 +2,7 @@
 
 import json
 import re
-import subprocess
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from geomdl import NURBS, BSpline
 
 from flexroad.tasks.export import step
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
-from tests import validators
+from tests.validators.opencascade import read_step
 
 BOUNDS = (295450.0, 5629200.0, 295800.0, 5629550.0)
 CORE = (295500.0, 5629250.0, 295750.0, 5629500.0)
@@ -128,18 +126,9 @@ def test_encode_evaluated_by_geomdl_equals_surface(weights):
 @pytest.mark.parametrize("weights", [False, True])
 def test_encode_read_by_opencascade_is_valid_and_equals_surface(tmp_path, weights):
     (tmp_path / "tile.step").write_text(encoded(weights))
-    reader = str(Path(validators.__file__).parent / "read_step.py")
-    done = subprocess.run(
-        [validators.python(), reader, "tile.step", "9"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    # OpenCASCADE writes messages of its own before.
-    found = json.loads(done.stdout[done.stdout.index('{"valid"') :])
-    assert found["valid"]
-    x, y, z = np.array(found["points"]).T
+    valid, points = read_step(tmp_path / "tile.step", 9)
+    assert valid
+    x, y, z = points.T
     assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((0, 250, 0, 250), abs=1e-9)
     np.testing.assert_allclose(z, surface(weights).height(CORE[0] + x, CORE[1] + y), rtol=0, atol=2e-9)
 
