@@ -29,20 +29,20 @@ def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
 
 def heightfield_piece(tile: FinishedTile, vertical: str | None) -> Piece:
     """Return the surface as height fields of 2^n + 1 nodes a side, with what engines must know as JSON."""
-    bounds = tile.graph.tile.grid.bounds
+    bounds = tile.tile.grid.bounds
     field = heightfield.sampled(tile.surface, bounds, heightfield.size_at_spacing(bounds, SPACING_M))
     files = {
         heightfield.NAME_PNG: heightfield.encode_png(field),
         heightfield.NAME_R16: heightfield.encode_r16(field),
         heightfield.NAME_MUJOCO: heightfield.encode_mujoco(field),
-        heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.graph.tile.grid.crs, vertical),
+        heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.tile.grid.crs, vertical),
     }
     return Piece({f"{safe_name(tile.id)}{name}": data for name, data in files.items()}, {})
 
 
 def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:
     """Return the surface as STEP, cut to the tile, and its place as JSON."""
-    surface, source, name = tile.surface, tile.graph.tile, safe_name(tile.id)
+    surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
     files = {
@@ -56,5 +56,5 @@ def rhino_piece(tile: FinishedTile, vertical: str | None) -> Piece:
     """Return surface and mesh as 3DM."""
     surface = tile.surface
     nurbs = surface if isinstance(surface, NurbsSurface) else None
-    data = rhino.encode(tile.mesh, nurbs, tile.graph.tile.grid.bounds, vertical)
+    data = rhino.encode(tile.mesh, nurbs, tile.tile.grid.bounds, vertical)
     return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, {})

@@ -87,13 +87,15 @@ def _write(job: Job) -> tuple[Row, str]:
     folder = parse_location(job.folder)
     try:
         piece = job.encode(job.tile, job.options)
+        job.tile.check_unchanged()
         for name, data in piece.files.items():
             write(folder / name, data)
         sizes = {name: len(data) for name, data in piece.files.items()}
         marker = json.dumps({"key": job.key, "sizes": sizes, "row": piece.row})
         write(_marker(folder, job.tile.id), marker.encode())
     except (ConfigError, TaskError, CatalogError, OSError) as error:
-        return {}, f"tile {job.tile.id}: {error}"
+        name, reason = f"tile {job.tile.id}: ", str(error)
+        return {}, reason if reason.startswith(name) else name + reason
     return piece.row, ""
 
 

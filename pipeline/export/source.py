@@ -8,12 +8,18 @@ from functools import cached_property
 from typing import Any
 
 from flexroad.catalog import Bounds, Tile
-from flexroad.catalog.storage.paths import Location, parse_location
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.export.states import (
+    COMPUTED_AGAIN,
+    FileStates,
+    RunPlace,
+    TileState,
+    tile_states,
+)
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.types import Mesh, Surface
@@ -23,20 +29,20 @@ from flexroad.tasks.types import Mesh, Surface
 class FinishedTile:
     """One finished tile of a run; results are read from the store when they are used."""
 
-    graph: TileGraph
+    tile: Tile
     variant: str
-    store: str
-    """The run's store of stage results."""
+    state: TileState
+    place: RunPlace
 
     @property
     def id(self) -> str:
         """Id of the tile."""
-        return self.graph.tile.id
+        return self.tile.id
 
     @property
     def fingerprint(self) -> str:
         """Name of the mesh by what it was made of."""
-        return self.graph.variants[self.variant]["sample"]
+        return self.state.nodes["sample"]
 
     @property
     def mesh(self) -> Mesh:
@@ -51,12 +57,46 @@ class FinishedTile:
         return surface
 
     @cached_property
+    def graph(self) -> TileGraph:
+        """The graph of the tile, made again from the files that it had when it was finished.
+
+        Raises
+        ------
+        ConfigError
+            If the tile has another graph now.
+        """
+        return self.place.graph(self.tile, self.state)
+
+    def check_unchanged(self) -> None:
+        """Check that the run has not written the tile again since its state was checked.
+
+        Raises
+        ------
+        ConfigError
+            If it has.
+        """
+        if self.place.marker(self.id) != self.state.marker:
+            raise ConfigError(f"tile {self.id}: {COMPUTED_AGAIN}")
+
+    @cached_property
+    def _results(self) -> dict[str, Any]:
+        return {}
+
+    @cached_property
     def _evaluator(self) -> Evaluator:
-        return Evaluator(self.graph, ArtefactStore(parse_location(self.store)))
+        return Evaluator(self.graph, self.place.artefacts)
 
     def _result(self, stage: str) -> Any:
+        """Return the result of a stage: from the store, or computed if it is missing or damaged there."""
+        name = self.state.nodes[stage]
+        if stage not in self._results:
+            stored = self.place.artefacts.find(stage, name)
+            self._results[stage] = self._computed(name) if stored is None else stored[0]
+        return self._results[stage]
+
+    def _computed(self, name: str) -> Any:
         try:
-            return self._evaluator(self.graph.variants[self.variant][stage])
+            return self._evaluator(name)
         except StageError as error:
             raise ConfigError(f"tile {self.id}: {error}") from error
 
@@ -71,6 +111,8 @@ class Source:
     """In the order of the catalog."""
     left_out: tuple[str, ...]
     """Ids of selected tiles that are not finished."""
+    states: tuple[TileState, ...]
+    """The state of each tile when the tiles were selected."""
 
     @property
     def crs(self) -> str:
@@ -88,20 +130,31 @@ class Source:
         return self.run.origin
 
     def finished(self) -> Iterator[FinishedTile]:
-        """Yield the tiles one by one.
+        """Yield the tiles one by one, as they were when they were selected.
+
+        Only sizes and times of their files are compared, so that each format can have a pass of its own.
 
         Raises
         ------
         ConfigError
-            If a tile is no longer finished, as its sources have changed in the meantime.
+            If a tile is no longer finished, as its sources have changed in the meantime, or has a new result.
         """
-        for status in peek_statuses(self.run, self.tiles):
-            if not status.done:
-                raise ConfigError(
-                    f"{self.run.path}: tile {status.graph.tile.id} is no longer finished; "
-                    f"run `flexroad rerun {self.run.path}`, then export again"
-                )
-            yield FinishedTile(status.graph, self.variant, str(self.run.store))
+        files, place = FileStates(self.run), RunPlace.of(self.run)
+        for tile, state in zip(self.tiles, self.states, strict=True):
+            current = state if files(tile) == state.files else self._checked(tile, state)
+            yield FinishedTile(tile, self.variant, current, place)
+
+    def _checked(self, tile: Tile, before: TileState) -> TileState:
+        """Return the state of a tile of which a file has another size or time than before."""
+        ((_, state),) = tile_states(self.run, [tile], self.variant)
+        if state is None:
+            raise ConfigError(
+                f"{self.run.path}: tile {tile.id} is no longer finished; "
+                f"run `flexroad rerun {self.run.path}`, then export again"
+            )
+        if state.fingerprint != before.fingerprint:
+            raise ConfigError(f"tile {tile.id}: {COMPUTED_AGAIN}")
+        return state
 
 
 def select(
@@ -110,8 +163,16 @@ def select(
     bbox: Bounds | None = None,
     variant: str | None = None,
     allow: Sequence[str] = (),
+    track: Track = untracked,
 ) -> Source:
     """Return the finished tiles of a run, of all or of the selected tiles.
+
+    The state of each selected tile is checked here, once for all formats.
+
+    Parameters
+    ----------
+    track : callable
+        Shows the progress of that.
 
     Raises
     ------
@@ -127,11 +188,13 @@ def select(
     if variant not in variants:
         raise ConfigError(f"{location} exports no variant {variant!r}; it has {', '.join(variants)}")
     wanted = run.catalog.select(ids, bbox).tiles
-    done = {status.graph.tile.id for status in peek_statuses(run, wanted) if status.done}
+    checked = track(tile_states(run, wanted, variant), "checking tiles", len(wanted))
+    done = {tile.id: state for tile, state in checked if state}
     tiles = tuple(tile for tile in wanted if tile.id in done)
     if not tiles:
         raise ConfigError(f"{location} has no finished tile to export; see `flexroad status {location}`")
     systems = {tile.grid.crs for tile in tiles}
     if len(systems) > 1:
         raise ConfigError(f"{location} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
-    return Source(run, variant, tiles, tuple(tile.id for tile in wanted if tile.id not in done))
+    left_out = tuple(tile.id for tile in wanted if tile.id not in done)
+    return Source(run, variant, tiles, left_out, tuple(done[tile.id] for tile in tiles))

@@ -66,7 +66,7 @@ def write_tilesets(
 
 def piece(tile: FinishedTile, place: Place) -> Piece:
     """Return the GLB file of a tile, and its entry in the tileset of its block."""
-    mesh, grid = tile.mesh, tile.graph.tile.grid
+    mesh, grid = tile.mesh, tile.tile.grid
     heights = mesh.vertices[:, 2] + mesh.origin[2]
     name = f"tiles/{safe_name(tile.id)}{glb.NAME}"
     placed = tiles3d.placed(
