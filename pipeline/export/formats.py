@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 from flexroad.catalog.storage.paths import Location, write
-from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export import per_tile, tiles3d
+from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.pieces import Encode, write_pieces
+from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
 
-Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], None]
-"""Writes a format of the tiles into a folder."""
+Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
+"""Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
 
 
 @dataclass(frozen=True)
@@ -36,33 +38,43 @@ class Format:
 
 def write_landxml(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-) -> None:
+) -> dict[str, Any]:
     """Write all meshes as one LandXML file."""
     name = landxml.NAME_COMPRESSED if options.compress else landxml.NAME
     latest = max(tile.datetime for tile in source.tiles)
     joined = has_borders(source.run.config.chains[source.variant]["fit"])
     project = landxml.Project(source.run.path.name, latest.astimezone(UTC), source.vertical, joined)
-    with atomic_file(folder / f"{source.run.path.name}{name}") as local, local.open("wb") as file:
-        meshes = (tile.mesh for tile in tiles)
-        landxml.write(file, meshes, project, local.parent, options.compress)
+
+    def join(local: Path, parts: Iterator[bytes]) -> None:
+        with local.open("wb") as file:
+            decoded = (landxml.Part.decode(part) for part in parts)
+            landxml.join(file, decoded, project, local.parent, options.compress)
+
+    file = folder / f"{source.run.path.name}{name}"
+    return write_joined(source, tiles, file, landxml.VERSION, per_tile.landxml_part, project, executor, join)
 
 
 def write_cityjson(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-) -> None:
+) -> dict[str, Any]:
     """Write all meshes as one CityJSONSeq file."""
-    target = folder / f"{source.run.path.name}{cityjson.NAME}"
-    with atomic_file(target) as local, local.open("wb") as file:
-        meshes = ((tile.id, tile.mesh) for tile in tiles)
-        cityjson.write(file, meshes, source.crs, (*source.origin, 0.0), source.vertical)
+    place = per_tile.CityPlace(source.crs, (*source.origin, 0.0), source.vertical)
+
+    def join(local: Path, parts: Iterator[bytes]) -> None:
+        with local.open("wb") as file:
+            file.write(cityjson.header(source.crs, place.origin, source.vertical))
+            file.writelines(parts)
+
+    file = folder / f"{source.run.path.name}{cityjson.NAME}"
+    return write_joined(source, tiles, file, cityjson.VERSION, per_tile.cityjson_part, place, executor, join)
 
 
 def write_obj(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-) -> None:
+) -> dict[str, Any]:
     """Write the file of materials that all OBJ files share, then the mesh of each tile as OBJ."""
     write(folder / per_tile.MATERIALS, obj.encode_materials())
-    _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
+    return _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
 
 
 def _write_each(
@@ -73,10 +85,9 @@ def _write_each(
     folder: Location,
     options: Options,
     executor: Executor,
-) -> None:
+) -> dict[str, Any]:
     """Write a format that has files of its own for each tile."""
-    for _ in write_pieces(tiles, folder, version, encode, source.vertical, executor):
-        pass
+    return figures(write_pieces(tiles, folder, version, encode, source.vertical, executor))
 
 
 def _per_tile(title: str, version: int, encode: Encode, precision_m: float | None) -> Format:

@@ -1,18 +1,41 @@
-"""Formats with files of their own for each tile: OBJ, height fields, STEP and 3DM."""
+"""What workers make of a tile: files of its own, or its part of the one file of LandXML and CityJSON."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.export.joined import part_name
 from flexroad.pipeline.export.pieces import Piece
 from flexroad.pipeline.export.source import FinishedTile
-from flexroad.tasks.export import heightfield, obj, rhino, step
+from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
 SPACING_M = 1.0
 """Largest distance of the nodes of height fields (m)."""
+
+
+@dataclass(frozen=True)
+class CityPlace:
+    """What the header of a CityJSON file says, on which the parts of all tiles depend."""
+
+    crs: str
+    origin: tuple[float, float, float]
+    vertical: str | None
+
+
+def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
+    """Return the part of a LandXML file."""
+    return Piece({part_name(tile.id): landxml.part(tile.mesh, project.joined).encode()}, {})
+
+
+def cityjson_part(tile: FinishedTile, place: CityPlace) -> Piece:
+    """Return the lines of a CityJSON file."""
+    lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
+    return Piece({part_name(tile.id): lines}, {})
 
 
 def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:

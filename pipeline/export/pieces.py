@@ -1,12 +1,14 @@
 """Files of an export that belong to one tile each, written by workers.
 
 A file ``.pieces/ID.json`` names what a tile's files were made of, and is written last: an interrupted export
-goes on where it stopped, and writes only tiles that have changed.
+goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier export had
+and this one does not have are removed: a folder has one export, and its manifest counts what is there.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
@@ -14,12 +16,13 @@ from typing import Any
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.storage.paths import Location, parse_location, read, stat, write
+from flexroad.catalog.storage.paths import Location, listing, parse_location, read, remove, stat, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.tasks.errors import TaskError
 
+MARKERS = ".pieces"
 Row = dict[str, Any]
 """What the files of the whole run need of a tile, as JSON values."""
 
@@ -47,6 +50,8 @@ class Job:
     folder: str
     key: str
     """Fingerprint of the mesh, the format's version and its options."""
+    former: Mapping[str, int]
+    """Names and sizes of the tile's files of an earlier export."""
 
 
 def write_pieces(
@@ -65,21 +70,37 @@ def write_pieces(
         If a tile's results cannot be read, a file cannot be written, or a worker dies twice.
     """
     unchanged: list[Row] = []
+    kept: set[str] = set()
 
     def jobs() -> Iterator[Job]:
         for tile in tiles:
+            marker = _marker(folder, tile.id)
+            kept.add(marker.name)
+            written = _written(marker)
             key = sha256(f"{tile.fingerprint} {version} {options}".encode()).hexdigest()
-            row = _known(folder, tile.id, key)
-            if row is None:
-                yield Job(tile, encode, options, str(folder), key)
+            if written and written.key == key and written.whole(folder):
+                unchanged.append(written.row)
             else:
-                unchanged.append(row)
+                yield Job(tile, encode, options, str(folder), key, written.sizes if written else {})
 
     for row, failure in executor.map(_write, jobs(), _lost):
         if failure:
             raise ConfigError(failure)
         yield row
     yield from unchanged
+    for name in listing(folder / MARKERS):
+        if name not in kept and (other := _written(folder / MARKERS / name)):
+            _remove(folder, other.sizes)
+            remove(folder / MARKERS / name)
+
+
+def figures(rows: Iterable[Row]) -> dict[str, Any]:
+    """Return what the manifest says of all tiles: the largest ``error_m`` and how many have each ``note``."""
+    errors, notes = list[float](), Counter[str]()
+    for row in rows:
+        errors += [row["error_m"]] if "error_m" in row else []
+        notes += Counter([row["note"]] if row.get("note") else [])
+    return ({"error_m": max(errors)} if errors else {}) | ({"notes": dict(notes)} if notes else {})
 
 
 def _write(job: Job) -> tuple[Row, str]:
@@ -88,6 +109,8 @@ def _write(job: Job) -> tuple[Row, str]:
     try:
         piece = job.encode(job.tile, job.options)
         job.tile.check_unchanged()
+        # First, while the marker still names them.
+        _remove(folder, {name: size for name, size in job.former.items() if name not in piece.files})
         for name, data in piece.files.items():
             write(folder / name, data)
         sizes = {name: len(data) for name, data in piece.files.items()}
@@ -104,18 +127,36 @@ def _lost(job: Job, reason: str) -> tuple[Row, str]:
 
 
 def _marker(folder: Location, tile_id: str) -> Location:
-    return folder / ".pieces" / f"{safe_name(tile_id)}.json"
+    return folder / MARKERS / f"{safe_name(tile_id)}.json"
 
 
-def _known(folder: Location, tile_id: str, key: str) -> Row | None:
-    """Return the row of a tile whose files exist and are of the same mesh, version and options."""
+@dataclass(frozen=True)
+class _Written:
+    """The files of a tile that an export has written, by its marker."""
+
+    key: str
+    sizes: Mapping[str, int]
+    row: Row
+
+    def whole(self, folder: Location) -> bool:
+        """Return whether all files exist in their full size."""
+        return all((file := stat(folder / name)) and file.size == size for name, size in self.sizes.items())
+
+
+def _written(marker: Location) -> _Written | None:
+    """Return what a marker says, None if it does not exist or is damaged."""
     try:
-        marker = json.loads(read(_marker(folder, tile_id)))
-        whole = all(
-            (file := stat(folder / name)) is not None and file.size == size
-            for name, size in marker["sizes"].items()
-        )
-        row: Row = marker["row"]
-        return row if whole and marker["key"] == key else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        content = json.loads(read(marker))
+        written = _Written(content["key"], dict(content["sizes"]), content["row"])
+    except (OSError, ValueError, KeyError, TypeError):
         return None
+    inside = all(".." not in name.split("/") and not name.startswith("/") for name in written.sizes)
+    return written if inside and isinstance(written.row, dict) else None
+
+
+def _remove(folder: Location, sizes: Mapping[str, int]) -> None:
+    """Remove files that are as an earlier export has left them; others may be of the user."""
+    for name, size in sizes.items():
+        file = stat(folder / name)
+        if file and file.size == size:
+            remove(folder / name)

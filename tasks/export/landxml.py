@@ -1,17 +1,19 @@
 """The meshes of a run as LandXML 1.2: two TIN surfaces, road and ground, for civil engineering programs.
 
 A file has one surface per class over all tiles, as such programs expect: with a surface per tile, 10,000 of
-them would have to be joined by hand. The points of a surface stand before its faces, so that both are
-collected in temporary files while the tiles pass. The memory in use grows with the outline of the tiles
+them would have to be joined by hand. So the work has two steps: `part` makes what a single mesh gives, and
+`join` numbers the points of all parts. The points of a surface stand before its faces, so that both are
+collected in temporary files while the parts pass. The memory in use grows with the outline of the tiles
 written so far and not with their number: a vertex is remembered until the faces around it are complete.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
 import shutil
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -25,7 +27,8 @@ from numpy.typing import NDArray
 from flexroad.catalog import crs
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing.parts import Indices, part
+from flexroad.tasks.meshing import parts
+from flexroad.tasks.meshing.parts import Indices
 from flexroad.tasks.types import Bools, Floats, Mesh
 
 VERSION = 1
@@ -57,8 +60,10 @@ SURFACE = """\
 <Definition surfType="TIN" elevMin="{low:.4f}" elevMax="{high:.4f}">
 <Pnts>
 """
-POINT = '<P id="%d">%.4f %.4f %.4f</P>\n'
-FACE = "<F>%d %d %d</F>\n"
+POINT_START, POINT_END = b'<P id="%d">%b\n', "%.4f %.4f %.4f</P>\n"
+FACE = b"<F>%d %d %d</F>\n"
+CLASSES = (("road", "Road surface"), ("ground", "Ground beside the road"))
+"""Name and meaning of the surfaces."""
 
 Place = tuple[int, int, int]
 """Easting, northing and height in units of the last decimal."""
@@ -77,6 +82,85 @@ class Project:
     """Whether the meshes have common vertices at their borders, which the surfaces then share."""
 
 
+@dataclass(frozen=True, eq=False)
+class PartSurface:
+    """The faces of one class of one mesh."""
+
+    points: bytes
+    """The end of the line of each point, from its northing on; of n points."""
+    corners: NDArray[np.int32]
+    """Numbers of points, from 0, ``(k, 3)``."""
+    rim: NDArray[np.int32]
+    """Of each point at the rim of the mesh: its number here, and its row in the part's rim, ``(r, 2)``."""
+    limits: Floats
+    """Lowest and highest height (m), ``(2,)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What one mesh gives to a file."""
+
+    crs: str
+    places: NDArray[np.int64]
+    """Easting, northing and height of the vertices at its rim, in units of the last decimal, ``(R, 3)``."""
+    angles: Floats
+    """Sum of the angles in plan of the faces around each of them (radians), ``(R,)``."""
+    surfaces: tuple[PartSurface, PartSurface]
+    """Road and ground."""
+
+    def encode(self) -> bytes:
+        """Return the part as NumPy archive, for `decode`."""
+        arrays = {"crs": np.array(self.crs), "places": self.places, "angles": self.angles}
+        for number, surface in enumerate(self.surfaces):
+            arrays[f"points{number}"] = np.frombuffer(surface.points, np.uint8)
+            arrays |= {f"{name}{number}": getattr(surface, name) for name in ("corners", "rim", "limits")}
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its flags are named like no array
+        return buffer.getvalue()
+
+    @classmethod
+    def decode(cls, data: bytes) -> Part:
+        """Return the part that `encode` has written."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as npz:
+            road, ground = (
+                PartSurface(
+                    npz[f"points{k}"].tobytes(), npz[f"corners{k}"], npz[f"rim{k}"], npz[f"limits{k}"]
+                )
+                for k in range(2)
+            )
+            return cls(str(npz["crs"]), npz["places"], npz["angles"], (road, ground))
+
+
+def part(mesh: Mesh, joined: bool = True) -> Part:
+    """Return what a mesh gives to a file: all of it but the numbers of its points.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh of one tile.
+    joined : bool
+        Whether it shares the vertices at its border with its neighbours (`Project.joined`).
+    """
+    points = mesh.vertices + np.asarray(mesh.origin, np.float64)
+    rim = _rim(mesh) if joined else np.zeros(0, np.intp)
+    row = np.full(len(points), -1, np.int32)
+    row[rim] = np.arange(len(rim))
+    places = np.rint(points[rim] * 10**DECIMALS).astype(np.int64)
+    road, ground = (_part_surface(mesh, faces, points, row) for faces in (mesh.road, ~mesh.road))
+    return Part(mesh.crs, places, _angles(mesh)[rim], (road, ground))
+
+
+def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int32]) -> PartSurface:
+    used, corners = parts.part(mesh, faces)
+    east, north, height = points[used].T
+    columns = zip(north.tolist(), east.tolist(), height.tolist(), strict=True)
+    text = "".join(map(POINT_END.__mod__, columns)).encode()
+    at_rim = np.flatnonzero(row[used] >= 0).astype(np.int32)
+    rim = np.column_stack([at_rim, row[used][at_rim]])
+    limits = np.array([height.min(), height.max()] if len(used) else [np.inf, -np.inf])
+    return PartSurface(text, corners.astype(np.int32), rim, limits)
+
+
 def write(
     file: IO[bytes],
     meshes: Iterable[Mesh],
@@ -84,7 +168,24 @@ def write(
     folder: Path | None = None,
     compress: bool = False,
 ) -> None:
-    """Write the meshes of all tiles to one file.
+    """Write the meshes of all tiles to one file: `part` of each, then `join`.
+
+    Parameters
+    ----------
+    meshes : iterable of Mesh
+        In any order, all in one CRS; each is read once. Memory is least if neighbours follow each other.
+    """
+    join(file, (part(mesh, project.joined) for mesh in meshes), project, folder, compress)
+
+
+def join(
+    file: IO[bytes],
+    parts_of_meshes: Iterable[Part],
+    project: Project,
+    folder: Path | None = None,
+    compress: bool = False,
+) -> None:
+    """Write the parts of all meshes to one file.
 
     Points are "northing easting height", absolute, in metres, rounded to 0.05 mm. Faces are counter-clockwise
     from above. A class without faces has no surface. Equal inputs give equal bytes.
@@ -93,7 +194,7 @@ def write(
     ----------
     file : binary file object
         Open for writing.
-    meshes : iterable of Mesh
+    parts_of_meshes : iterable of Part
         In any order, all in one CRS; each is read once. Memory is least if neighbours follow each other.
     project : Project
         Name, time and vertical CRS.
@@ -111,9 +212,9 @@ def write(
     with ExitStack() as stack:
         road, ground = (
             _Surface(name, meaning, _temporary(stack, folder), _temporary(stack, folder))
-            for name, meaning in (("road", "Road surface"), ("ground", "Ground beside the road"))
+            for name, meaning in CLASSES
         )
-        system = _collect(meshes, (road, ground), project.joined)
+        system = _collect(parts_of_meshes, (road, ground))
         if compress:
             # Name and time of the archive are left out: equal inputs give equal bytes.
             packed = gzip.GzipFile(filename="", mode="wb", fileobj=file, compresslevel=6, mtime=0)
@@ -134,22 +235,21 @@ def _temporary(stack: ExitStack, folder: Path | None) -> IO[bytes]:
     return stack.enter_context(tempfile.TemporaryFile(dir=folder))
 
 
-def _collect(meshes: Iterable[Mesh], surfaces: tuple[_Surface, _Surface], joined: bool) -> str:
-    """Add the faces of all meshes to the surfaces of road and ground; return the meshes' CRS."""
+def _collect(parts_of_meshes: Iterable[Part], surfaces: tuple[_Surface, _Surface]) -> str:
+    """Add the faces of all parts to the surfaces of road and ground; return the meshes' CRS."""
     system = ""
     open_vertices: dict[Place, _OpenVertex] = {}
-    for mesh in meshes:
-        system = system or mesh.crs
-        if mesh.crs != system:
+    for one in parts_of_meshes:
+        system = system or one.crs
+        if one.crs != system:
             raise TaskError(
-                f"meshes in {crs.short(system)} and {crs.short(mesh.crs)} do not fit in one LandXML file;"
+                f"meshes in {crs.short(system)} and {crs.short(one.crs)} do not fit in one LandXML file;"
                 " export each CRS to a file of its own"
             )
-        at_rim = _at_rim(mesh, open_vertices) if joined else {}
-        points = mesh.vertices + np.asarray(mesh.origin, np.float64)
-        for number, (surface, faces) in enumerate(zip(surfaces, (mesh.road, ~mesh.road), strict=True)):
-            surface.add(mesh, points, faces, number, at_rim)
-        for vertex in at_rim.values():
+        at_rim = _at_rim(one, open_vertices)
+        for number, (surface, faces) in enumerate(zip(surfaces, one.surfaces, strict=True)):
+            surface.add(faces, number, at_rim)
+        for vertex in at_rim:
             if vertex.angle > FULL_TURN:
                 open_vertices.pop(vertex.place, None)
     if not any(surface.faces for surface in surfaces):
@@ -168,24 +268,24 @@ class _OpenVertex:
     """Its numbers in the surfaces of road and ground; 0 where it is not in them."""
 
 
-def _at_rim(mesh: Mesh, open_vertices: dict[Place, _OpenVertex]) -> dict[int, _OpenVertex]:
-    """Return the vertices at the rim of a mesh by their index; new ones are added to the open ones."""
-    rim = _rim(mesh.faces)
-    angles = _angles(mesh)
-    places = np.rint((mesh.vertices[rim] + np.asarray(mesh.origin)) * 10**DECIMALS).astype(np.int64)
-    found = {}
-    for index, (x, y, z) in zip(rim.tolist(), places.tolist(), strict=True):
+def _at_rim(one: Part, open_vertices: dict[Place, _OpenVertex]) -> list[_OpenVertex]:
+    """Return the vertices at the rim of a part, in its order; new ones are added to the open ones."""
+    found = []
+    for (x, y, z), angle in zip(one.places.tolist(), one.angles.tolist(), strict=True):
         vertex = open_vertices.setdefault((x, y, z), _OpenVertex((x, y, z)))
-        vertex.angle += float(angles[index])
-        found[index] = vertex
+        vertex.angle += angle
+        found.append(vertex)
     return found
 
 
-def _rim(faces: NDArray[np.int32]) -> Indices:
+def _rim(mesh: Mesh) -> Indices:
     """Return the vertices at edges with one face only."""
+    faces = mesh.faces.astype(np.int64)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, uses = np.unique(edges, axis=0, return_counts=True)
-    return np.unique(unique[uses == 1]).astype(np.intp)
+    # One number per edge: rows are sorted ten times slower.
+    unique, uses = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
+    single = unique[uses == 1]
+    return np.unique(np.divmod(single, len(mesh.vertices))).astype(np.intp)
 
 
 def _angles(mesh: Mesh) -> Floats:
@@ -213,28 +313,25 @@ class _Surface:
     low: float = np.inf
     high: float = -np.inf
 
-    def add(
-        self, mesh: Mesh, points: Floats, faces: Bools, number: int, at_rim: dict[int, _OpenVertex]
-    ) -> None:
-        """Write the faces of a mesh, and those of their points that no mesh before has written."""
-        used, corners = part(mesh, faces)
-        if not len(corners):
+    def add(self, part: PartSurface, number: int, at_rim: Sequence[_OpenVertex]) -> None:
+        """Write the faces of a part, and those of their points that no part before has written."""
+        if not len(part.corners):
             return
-        ids = np.zeros(len(used), np.int64)
-        rim = [(k, at_rim[index]) for k, index in enumerate(used.tolist()) if index in at_rim]
-        for k, vertex in rim:
-            ids[k] = vertex.numbers[number]
-        new = ids == 0
-        ids[new] = self.points + 1 + np.arange(np.count_nonzero(new))
-        for k, vertex in rim:
-            vertex.numbers[number] = int(ids[k])
-        east, north, height = points[used[new]].T
-        _write_rows(self.points_file, POINT, (ids[new], north, east, height))
-        _write_rows(self.faces_file, FACE, ids[corners].T)
-        self.points += int(np.count_nonzero(new))
-        self.faces += len(corners)
-        heights = points[used, 2]
-        self.low, self.high = min(self.low, heights.min()), max(self.high, heights.max())
+        lines = part.points.splitlines()
+        ids = np.zeros(len(lines), np.int64)
+        rim = [(point, at_rim[row]) for point, row in part.rim.tolist()]
+        for point, vertex in rim:
+            ids[point] = vertex.numbers[number]
+        new = np.flatnonzero(ids == 0)
+        ids[new] = self.points + 1 + np.arange(len(new))
+        for point, vertex in rim:
+            vertex.numbers[number] = int(ids[point])
+        _write_rows(self.points_file, POINT_START, [ids[new].tolist(), [lines[k] for k in new.tolist()]])
+        _write_rows(self.faces_file, FACE, ids[part.corners].T.tolist())
+        self.points += len(new)
+        self.faces += len(part.corners)
+        low, high = part.limits.tolist()
+        self.low, self.high = min(self.low, low), max(self.high, high)
 
     def copy_to(self, file: IO[bytes]) -> None:
         """Write the whole surface, if it has a face."""
@@ -250,10 +347,9 @@ class _Surface:
         file.write(b"</Faces>\n</Definition>\n</Surface>\n")
 
 
-def _write_rows(file: IO[bytes], row: str, columns: Iterable[NDArray[Any]]) -> None:
-    """Write columns of numbers, each of their rows in the same format."""
-    values = [column.tolist() for column in columns]
-    file.write("".join(map(row.__mod__, zip(*values, strict=True))).encode())
+def _write_rows(file: IO[bytes], row: bytes, columns: Sequence[Sequence[Any]]) -> None:
+    """Write columns of values, each of their rows in the same format."""
+    file.write(b"".join(map(row.__mod__, zip(*columns, strict=True))))
 
 
 def _copy(source: IO[bytes], target: IO[bytes]) -> None:
