@@ -9,8 +9,9 @@ import typer
 
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.lifecycle import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
-from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.errors import ClusterLost, ConfigError
 
 if TYPE_CHECKING:
     from flexroad.catalog.ellipsoidal import Datum
@@ -78,18 +79,32 @@ def export(
     from flexroad.pipeline.export.source import select
     from flexroad.pipeline.monitor.progress import StepProgress
 
-    chosen = Options(_datum(vertical, geoid, height_offset), compress)
+    chosen, folder = Options(_datum(vertical, geoid, height_offset), compress), parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
-    source = select(parse_location(path), tile or (), bbox, None, [str(place) for place in allow or ()])
-    if source.left_out:
-        echo(f"note: left out {count(len(source.left_out), 'tile')} that are not finished", err=True)
-    runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
     track = StepProgress(Console(stderr=True))
-    manifest = write(source, parse_location(output), names, chosen, runner, track)
-    for name, written in manifest["formats"].items():
+    runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
+    with signals_interrupt():
+        try:
+            allowed = [str(place) for place in allow or ()]
+            source = select(parse_location(path), tile or (), bbox, None, allowed, track)
+            if source.left_out:
+                _note(f"left out {count(len(source.left_out), 'tile')} that are not finished")
+            manifest = write(source, folder, names, chosen, runner, track, _note)
+        except KeyboardInterrupt:
+            echo("interrupted; the same command goes on from here", err=True)
+            raise typer.Exit(INTERRUPTED) from None
+        except ClusterLost as error:
+            echo(f"error: {error}; the same command goes on from here", err=True)
+            raise typer.Exit(1) from None
+    for name in names:
+        written = manifest["formats"][name]
         size = written["bytes"] / 1e6
-        echo(f"{name}: {count(written['files'], 'file')}, {size:.1f} MB in {output / name}")
+        echo(f"{name}: {count(written['files'], 'file')}, {size:.1f} MB in {folder / name}")
+
+
+def _note(line: str) -> None:
+    echo(f"note: {line}", err=True)
 
 
 def _datum(vertical: str | None, geoid: Path | None, offset: float | None) -> Datum | None:

@@ -70,7 +70,7 @@ def report_outcome(run: Location, on_failure: str | None, prometheus: Path | Non
 
     before = read_summary(run)
     outcome = Outcome()
-    with _signals_interrupt(), contextlib.ExitStack() as stack:
+    with signals_interrupt(), contextlib.ExitStack() as stack:
         # The stack is left in reverse order: the notification follows the Prometheus file.
         stack.callback(_notify, outcome, run, before, on_failure)
         try:
@@ -94,7 +94,7 @@ def notify_invalid_command(run: Path | None, target: str) -> None:
 
 
 @contextlib.contextmanager
-def _signals_interrupt() -> Iterator[None]:
+def signals_interrupt() -> Iterator[None]:
     """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP; ignore further ones."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     interrupted = False

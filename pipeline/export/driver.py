@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
+from difflib import get_close_matches
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.storage.paths import Location, listing, write
+from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
 from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.output import file_sizes, held, remove_unfinished
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.run.status import Track, untracked
+from flexroad.tasks.errors import TaskError
 
 MANIFEST = "export.json"
+SAME = ("variant", "crs", "tiles", "results")
+"""Entries of the manifest that two exports into one folder have in common if both are of the same results."""
 DATUM_REMEDY = (
     "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
     "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
@@ -30,6 +37,7 @@ def export(
     options: Options,
     executor: Executor,
     track: Track = untracked,
+    notify: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Write the formats, each into a folder of its name, and the manifest last; return the manifest.
 
@@ -37,30 +45,66 @@ def export(
     ----------
     track : callable
         Shows the progress: takes the tiles of a format, its name and their number.
+    notify : callable
+        Receives one line about what the user may not expect.
 
     Raises
     ------
     ConfigError
-        If a format is unknown or needs a datum, or a tile's results cannot be read.
+        If a format is unknown or needs a datum, a tile's results cannot be read, or the folder is in use.
+    ClusterLost
+        If the workers are gone; the same command goes on.
     OSError
         If a file cannot be written.
     """
     chosen = check_formats(formats, options)
-    written = {}
-    for name, kind in chosen.items():
-        if isinstance(out, Path):
-            (out / name).mkdir(parents=True, exist_ok=True)
-        tiles = track(source.finished(), f"writing {name}", len(source.tiles))
-        kind.write(source, tiles, out / name, options, executor)
-        files = {path: stat.size for path, stat in listing(out / name).items() if not path.startswith(".")}
-        written[name] = {
-            "title": kind.title,
-            "version": kind.version,
-            "precision_m": kind.precision_m,
-            "files": len(files),
-            "bytes": sum(files.values()),
-        }
-    manifest = {
+    with held(out, source.run, notify):
+        written = _earlier(out, source, options, chosen, notify)
+        for name, kind in chosen.items():
+            written[name] = _written(source, out / name, name, kind, options, executor, track, notify)
+        manifest = _head(source, options) | {"formats": written}
+        write(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
+    return manifest
+
+
+def _written(
+    source: Source,
+    folder: Location,
+    name: str,
+    kind: Format,
+    options: Options,
+    executor: Executor,
+    track: Track,
+    notify: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write one format; return its entry in the manifest."""
+    remove_unfinished(folder)
+    before = file_sizes(folder)
+    if isinstance(folder, Path):
+        folder.mkdir(parents=True, exist_ok=True)
+    tiles = track(source.finished(), f"writing {name}", len(source.tiles))
+    try:
+        more = kind.write(source, tiles, folder, options, executor) or {}
+    except TaskError as error:
+        raise ConfigError(f"{name}: {error}") from error
+    files = file_sizes(folder)
+    if removed := len(before.keys() - files.keys()):
+        notify(f"removed {count(removed, 'file')} of an earlier export from {folder}")
+    return {
+        "title": kind.title,
+        "version": kind.version,
+        "precision_m": kind.precision_m,
+        "files": len(files),
+        "bytes": sum(files.values()),
+        **({"datum": options.datum.text} if kind.needs_datum and options.datum else {}),
+        **more,
+    }
+
+
+def _head(source: Source, options: Options) -> dict[str, Any]:
+    """Return the entries of the manifest that all formats share."""
+    results = sha256("".join(f"{state.nodes['sample']}\n" for state in source.states).encode())
+    return {
         "flexroad": version("flexroad"),
         "run": str(source.run.path),
         "variant": source.variant,
@@ -69,10 +113,26 @@ def export(
         "datum": options.datum.text if options.datum else None,
         "tiles": len(source.tiles),
         "left_out": list(source.left_out),
-        "formats": written,
+        "results": results.hexdigest()[:32],
     }
-    write(out / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
-    return manifest
+
+
+def _earlier(
+    out: Location, source: Source, options: Options, chosen: Collection[str], notify: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return what the manifest says of other formats in the folder, if they are of the same results."""
+    try:
+        manifest = json.loads(read(out / MANIFEST))
+        others = {name: dict(entry) for name, entry in manifest["formats"].items() if name not in chosen}
+        present = {name: entry for name, entry in others.items() if file_sizes(out / name)}
+        head = _head(source, options)
+        if all(manifest[name] == head[name] for name in SAME):
+            return present
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    for name in present:
+        notify(f"{out / name} is of an earlier export with other results; write it again, or remove it")
+    return {}
 
 
 def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
@@ -87,7 +147,9 @@ def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
         raise ConfigError(f"--format names no format; known are {', '.join(FORMATS)}")
     unknown = [name for name in names if name not in FORMATS]
     if unknown:
-        raise ConfigError(f"--format {unknown[0]} is unknown; known are {', '.join(FORMATS)}")
+        near = get_close_matches(unknown[0].lower(), FORMATS, n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"--format {unknown[0]} is unknown{meant}; known are {', '.join(FORMATS)}")
     chosen = {name: FORMATS[name] for name in names}
     lacking = [name for name, kind in chosen.items() if kind.needs_datum]
     if lacking and options.datum is None:

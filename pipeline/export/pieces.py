@@ -116,7 +116,9 @@ def _write(job: Job) -> tuple[Row, str]:
         sizes = {name: len(data) for name, data in piece.files.items()}
         marker = json.dumps({"key": job.key, "sizes": sizes, "row": piece.row})
         write(_marker(folder, job.tile.id), marker.encode())
-    except (ConfigError, TaskError, CatalogError, OSError) as error:
+    except OSError as error:
+        return {}, f"tile {job.tile.id}: {error}; correct that, and the same command goes on"
+    except (ConfigError, TaskError, CatalogError) as error:
         name, reason = f"tile {job.tile.id}: ", str(error)
         return {}, reason if reason.startswith(name) else name + reason
     return piece.row, ""

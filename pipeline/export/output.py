@@ -1,0 +1,51 @@
+"""The folder of an export: one export at a time writes it, and it is not a part of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flexroad.catalog.storage.paths import Location, absolute, listing, remove
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.store.artefacts import check_writable
+
+
+@contextmanager
+def held(out: Location, run: Run, notify: Callable[[str], None]) -> Iterator[None]:
+    """Make the folder and hold its lock; a context manager.
+
+    Parameters
+    ----------
+    notify : callable
+        Receives one line when the lock of a dead process is taken over.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is the run, its store or inside one of them, or another process writes there.
+    OSError
+        If it cannot be written.
+    """
+    for folder in (run.path, run.store):
+        inside = [str(absolute(place)) for place in (out, *out.parents)]
+        if str(absolute(folder)) in inside:
+            raise ConfigError(f"--output {out} lies in the run ({folder}); choose a folder outside")
+    check_writable(out)
+    with run_lock(out, notify):
+        yield
+
+
+def remove_unfinished(folder: Location) -> None:
+    """Remove temporary files that an export which was killed has left; nothing in a bucket."""
+    if isinstance(folder, Path):
+        for name in listing(folder):
+            if name.rpartition("/")[2].startswith(".") and name.endswith(".tmp"):
+                remove(folder / name)
+
+
+def file_sizes(folder: Location) -> dict[str, int]:
+    """Return the size of each file of a format (bytes), without those that only an export reads."""
+    return {path: stat.size for path, stat in listing(folder).items() if not path.startswith(".")}
