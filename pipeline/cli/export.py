@@ -24,7 +24,8 @@ def export(
         typer.Option(
             "--format",
             metavar="NAME",
-            help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm.",
+            help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm, "
+            "mosaic.",
             rich_help_panel=options.OUTPUTS,
         ),
     ],
@@ -59,6 +60,15 @@ def export(
             rich_help_panel=options.INPUTS,
         ),
     ] = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01,
+            metavar="METRES",
+            help="Cell size of mosaic; default: that of the run.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ] = None,
     tile: options.TileIds = None,
     bbox: options.Box = None,
     allow: options.Allow = None,
@@ -79,7 +89,8 @@ def export(
     from flexroad.pipeline.export.source import select
     from flexroad.pipeline.monitor.progress import StepProgress
 
-    chosen, folder = Options(_datum(vertical, geoid, height_offset), compress), parse_location(output)
+    chosen = Options(_datum(vertical, geoid, height_offset), compress, resolution)
+    folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
     track = StepProgress(Console(stderr=True))

@@ -11,7 +11,7 @@ from typing import Any
 
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import per_tile, tiles3d
+from flexroad.pipeline.export import mosaic, per_tile, tiles3d
 from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
@@ -103,6 +103,7 @@ FORMATS = {
         "16-bit height fields, for game engines", heightfield.VERSION, per_tile.heightfield_piece, None
     ),
     "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
+    "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
     "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4),
 }
 """By the name on the command line."""

@@ -15,3 +15,5 @@ class Options:
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = False
     """Whether text formats of the whole run are compressed with gzip."""
+    resolution_m: float | None = None
+    """Cell size of rasters over the run (m); None: that of the run."""

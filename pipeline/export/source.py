@@ -22,7 +22,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.io.vertical import vertical_crs
-from flexroad.tasks.types import Mesh, Surface
+from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,24 @@ class FinishedTile:
         """The fitted surface."""
         surface: Surface = self._result("fit")
         return surface
+
+    @property
+    def road(self) -> RoadMask:
+        """The road mask before the filter, with the cells beyond the survey."""
+        road: RoadMask = self._result("segment")
+        return road
+
+    @property
+    def clusters(self) -> RoadClusters:
+        """The road after the filter."""
+        clusters: RoadClusters = self._result("ecsrc")
+        return clusters
+
+    @property
+    def quality(self) -> Quality:
+        """Figures and support of the surface."""
+        quality: Quality = self._result("assess")
+        return quality
 
     @cached_property
     def graph(self) -> TileGraph:

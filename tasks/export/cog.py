@@ -132,12 +132,17 @@ def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: A
     with MemoryFile() as file:
         with file.open(**profile, **options) as raster:
             raster.write(values, 1)
-            raster.set_band_description(1, band.name)
-            raster.set_band_unit(1, band.unit)
-            raster.update_tags(1, MEANING=band.meaning)
-            if band.classes:
-                raster.write_colormap(1, {c.value: (*c.colour, 255) for c in band.classes})
-                # GDAL keeps names of classes in a side-car file, which viewers write anew.
-                raster.update_tags(1, **{f"CLASS_{c.value}": f"{c.name}: {c.meaning}" for c in band.classes})
+            describe(raster, 1, band)
         encoded: bytes = file.read()
     return encoded
+
+
+def describe(raster: Any, number: int, band: Band) -> None:
+    """Write name, unit, meaning and classes of a band into an open raster; bands count from 1."""
+    raster.set_band_description(number, band.name)
+    raster.set_band_unit(number, band.unit)
+    raster.update_tags(number, MEANING=band.meaning)
+    if band.classes:
+        raster.write_colormap(number, {c.value: (*c.colour, 255) for c in band.classes})
+        # GDAL keeps names of classes in a side-car file, which viewers write anew.
+        raster.update_tags(number, **{f"CLASS_{c.value}": f"{c.name}: {c.meaning}" for c in band.classes})

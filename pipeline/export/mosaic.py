@@ -1,0 +1,261 @@
+"""Heights, normals, road and support of a run, each as one cloud-optimised GeoTIFF over all its tiles.
+
+Cells are sampled from the surface at their centres. The values are collected in a temporary raster without
+compression, of which only the blocks with tiles exist, and copied to the final files when all tiles are
+there: GDAL writes overviews before the data, so that a file cannot grow tile by tile.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.crs import compound
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.staging import atomic_file
+from flexroad.catalog.text import reason
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.run.mosaic import MOST_CELLS, common_grid
+from flexroad.tasks.export import cog
+from flexroad.tasks.types import Floats
+
+VERSION = 1
+NORMAL_STEPS = 32767
+"""Value of a component of length 1."""
+NO_NORMAL = -32768
+NO_ROAD = 255
+"""Value of the road mask where no tile is finished."""
+PART_CELLS = 2**20
+"""Largest number of cells that are sampled at a time."""
+CACHE_BYTES = 256 * 2**20
+"""Blocks that GDAL keeps in memory; its own default grows with the machine."""
+SAME_CELL = 1e-6
+"""Part of a cell by which positions may differ because of rounding."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One file of the mosaic."""
+
+    bands: tuple[cog.Band, ...]
+    overviews: str
+    """How cells of an overview follow from finer ones."""
+
+    @property
+    def name(self) -> str:
+        """Name of the file, without suffix."""
+        return self.bands[0].name.partition("_")[0]
+
+
+LAYERS = (
+    Layer((cog.HEIGHT,), "average"),
+    Layer(
+        tuple(
+            cog.Band(
+                f"normal_{axis}", f"Component of the upward unit normal to the {way}", "int16", "", NO_NORMAL
+            )
+            for axis, way in (("x", "east"), ("y", "north"), ("z", "zenith"))
+        ),
+        "average",
+    ),
+    Layer((replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
+    Layer((cog.SUPPORT,), "mode"),
+)
+
+
+def write_mosaics(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> None:
+    """Write one raster per quantity over all tiles.
+
+    Raises
+    ------
+    ConfigError
+        If the tiles have no common lattice, or the raster is too large.
+    OSError
+        If a file cannot be written.
+    """
+    grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
+    beside = folder if isinstance(folder, Path) else None
+    with TemporaryDirectory(prefix=".mosaic-", dir=beside) as name:
+        drafts = Path(name)
+        limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": name}
+        with _gdal(folder, **limits), ExitStack() as opened:
+            rasters = [opened.enter_context(_draft(drafts, layer, grid, source)) for layer in LAYERS]
+            for tile in tiles:
+                _add(rasters, grid, tile)
+        for layer in LAYERS:
+            target = folder / f"{layer.name}.tif"
+            with atomic_file(target) as local, _gdal(target, **limits):
+                _finish(drafts / layer.name, local, layer)
+
+
+@contextmanager
+def _gdal(target: Location, **limits: Any) -> Iterator[None]:
+    """Set GDAL's limits, and raise its errors as those of the system.
+
+    Raises
+    ------
+    OSError
+        If GDAL has an error; names the target.
+    """
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.Env(**limits):
+            yield
+    except (RasterioError, CPLE_BaseError) as error:
+        raise OSError(errno.EIO, reason(error.__cause__ or error), str(target)) from error
+
+
+def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
+    """Return the grid over all grids: on their own lattice, or on multiples of a cell size (m).
+
+    Raises
+    ------
+    ConfigError
+        If the grids have no common lattice, or the grid has too many cells.
+    """
+    if cell is None:
+        whole = common_grid(grids)
+        if whole is None:
+            raise ConfigError("the tiles have cells of several sizes or lattices; give --resolution METRES")
+        return whole
+    west, north = min(grid.west for grid in grids), max(grid.north for grid in grids)
+    east, south = max(grid.east for grid in grids), min(grid.south for grid in grids)
+    edges = math.floor(west / cell), math.floor(south / cell), math.ceil(east / cell), math.ceil(north / cell)
+    width, height = edges[2] - edges[0], edges[3] - edges[1]
+    if max(width, height) > MOST_CELLS:
+        raise ConfigError(f"--resolution {cell:g}: {width} x {height} cells are too many; give a larger one")
+    return Grid(grids[0].crs, edges[0] * cell, edges[3] * cell, cell, width, height)
+
+
+def _draft(folder: Path, layer: Layer, grid: Grid, source: Source) -> Any:
+    """Open a raster without compression for the values of a layer."""
+    import rasterio
+
+    heights = layer.bands[0] is cog.HEIGHT and source.vertical
+    raster = rasterio.open(
+        folder / layer.name,
+        "w+",
+        driver="GTiff",
+        dtype=layer.bands[0].dtype,
+        count=len(layer.bands),
+        width=grid.width,
+        height=grid.height,
+        crs=compound(grid.crs, source.vertical) if heights else grid.crs,
+        transform=grid.transform,
+        nodata=layer.bands[0].nodata,
+        tiled=True,
+        blockxsize=cog.BLOCK,
+        blockysize=cog.BLOCK,
+        # With "pixel" GDAL 3.10 fills missing blocks of the later bands with 0 when its memory is small.
+        interleave="band",
+        sparse_ok=True,
+        bigtiff="YES",
+    )
+    for number, band in enumerate(layer.bands, 1):
+        cog.describe(raster, number, band)
+    if layer.bands[0].nodata == NO_NORMAL:
+        raster.scales = [1 / NORMAL_STEPS] * len(layer.bands)
+    return raster
+
+
+def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
+    """Write the cells of a tile into the drafts."""
+    from rasterio.windows import Window
+
+    surface, road, core = tile.surface, tile.road, tile.graph.tile.grid
+    kept, support = tile.clusters.mask, tile.quality.support
+    for part, column, line in _parts(grid, core.bounds):
+        eastings, northings = part.eastings, part.northings
+        outside = road.outside[_cells(road.grid, eastings, northings)]
+        heights = surface.lattice(eastings, northings)
+        heights[outside] = np.nan
+        normals = encoded_normals(surface.normal(eastings[None, :], northings[:, None]))
+        normals[:, ~np.isfinite(heights)] = NO_NORMAL
+        values: tuple[NDArray[Any], ...] = (
+            heights.astype(np.float32)[None],
+            normals,
+            kept[_cells(road.grid, eastings, northings)].astype(np.uint8)[None],
+            support[_cells(core, eastings, northings)][None],
+        )
+        window = Window(column, line, part.width, part.height)
+        for raster, new in zip(rasters, values, strict=True):
+            # Where tiles overlap, a later one does not hide an earlier one by nodata.
+            nodata = np.isnan(new) if np.isnan(raster.nodata) else new == raster.nodata
+            raster.write(np.where(nodata, raster.read(window=window), new), window=window)
+
+
+def encoded_normals(normals: Floats) -> NDArray[np.int16]:
+    """Return unit normals, ``(H, W, 3)``, as whole numbers, ``(3, H, W)``; NaN becomes nodata."""
+    steps = np.rint(np.moveaxis(normals, -1, 0) * NORMAL_STEPS)
+    return np.nan_to_num(steps, nan=NO_NORMAL).astype(np.int16)
+
+
+def _parts(grid: Grid, bounds: Bounds) -> Iterator[tuple[Grid, int, int]]:
+    """Yield the cells of a grid with their centre in bounds, by bands of rows, with first column and row.
+
+    A centre on the western or northern edge belongs to the bounds, one on the other edges does not.
+    """
+    west, south, east, north = bounds
+    columns = _first(west - grid.west, grid.cell), _first(east - grid.west, grid.cell)
+    rows = _first(grid.north - north, grid.cell), _first(grid.north - south, grid.cell)
+    left, right = max(columns[0], 0), min(columns[1], grid.width)
+    top, bottom = max(rows[0], 0), min(rows[1], grid.height)
+    if left >= right:
+        return
+    step = max(PART_CELLS // (right - left), 1)
+    for line in range(top, bottom, step):
+        yield grid.part(slice(line, min(line + step, bottom)), slice(left, right)), left, line
+
+
+def _first(distance: float, cell: float) -> int:
+    """Return the first cell with its centre at a distance (m) from the edge, or beyond it."""
+    return math.ceil(distance / cell - 0.5 - SAME_CELL)
+
+
+def _cells(grid: Grid, eastings: Floats, northings: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of a grid under every pair of coordinates, as an open mesh."""
+    rows, _ = grid.cells(eastings[:1], northings)
+    _, columns = grid.cells(eastings, northings[:1])
+    return rows[:, None], columns[None, :]
+
+
+def _finish(draft: Path, path: Path, layer: Layer) -> None:
+    """Copy a draft to a cloud-optimised GeoTIFF with overviews, and read it once.
+
+    GDAL does not report blocks that it cannot write when it closes a file: only reading them shows it.
+    """
+    import rasterio
+    from rasterio.shutil import copy
+
+    copy(
+        draft,
+        path,
+        driver="COG",
+        compress="deflate",
+        predictor="yes",
+        blocksize=cog.BLOCK,
+        overview_resampling=layer.overviews,
+        sparse_ok="YES",
+        bigtiff="IF_SAFER",
+    )
+    with rasterio.open(path) as raster:
+        for _, window in raster.block_windows():
+            raster.read(window=window)

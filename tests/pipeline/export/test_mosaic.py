@@ -1,0 +1,161 @@
+"""The mosaic has the surface of the run at every cell, and nothing where no tile is finished."""
+
+import resource
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import CRS
+from rio_cogeo import cog_validate
+
+from flexroad.catalog import Grid
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.export import mosaic
+from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.formats import FORMATS
+from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.source import select
+
+NAMES = ("height", "normal", "road", "support")
+FINE_M = 0.1
+
+
+@pytest.fixture(scope="module")
+def written(town, tmp_path_factory):
+    out = tmp_path_factory.mktemp("mosaic")
+    export(select(town.path), out, ["mosaic"], Options(), SerialExecutor())
+    return out / "mosaic"
+
+
+@pytest.fixture(scope="module")
+def fine(town, tmp_path_factory):
+    """A mosaic with cells of 0.1 m, which has overviews."""
+    out = tmp_path_factory.mktemp("fine")
+    export(select(town.path), out, ["mosaic"], Options(resolution_m=FINE_M), SerialExecutor())
+    return out / "mosaic"
+
+
+def centres(raster):
+    """Eastings and northings of the cell centres."""
+    columns, rows = np.arange(raster.width) + 0.5, np.arange(raster.height) + 0.5
+    step = raster.transform
+    return np.meshgrid(step.c + columns * step.a, step.f + rows * step.e)
+
+
+def test_rasters_have_the_cells_of_the_tiles_of_the_run(town, written):
+    for name in ("height", "road", "support"):
+        with (
+            rasterio.open(written / f"{name}.tif") as whole,
+            rasterio.open(town.path / f"{name}.vrt") as tiles,
+        ):
+            assert whole.shape == (120, 120)
+            assert whole.transform.almost_equals(tiles.transform)
+            everywhere, expected = whole.read(1, masked=True), tiles.read(1)
+            np.testing.assert_array_equal(everywhere.compressed(), expected[~everywhere.mask])
+            # Only the tile that is not finished has no values.
+            assert everywhere.mask.sum() == 60 * 60
+    assert everywhere.mean() > 0
+
+
+@pytest.mark.parametrize("which", ["written", "fine"])
+def test_heights_and_normals_are_those_of_the_surface(town, which, request):
+    folder = request.getfixturevalue(which)
+    with rasterio.open(folder / "height.tif") as raster:
+        heights, (x, y) = raster.read(1), centres(raster)
+    with rasterio.open(folder / "normal.tif") as raster:
+        # GDAL programs apply the scale of the file.
+        stored = raster.read()
+        normals = np.moveaxis(stored * np.array(raster.scales)[:, None, None], 0, -1)
+        np.testing.assert_array_equal((stored == raster.nodata).all(axis=0), np.isnan(heights))
+    known = ~np.isnan(heights)
+    assert known.mean() == pytest.approx(0.75)
+    expected, directions = town.at(x[known], y[known])
+    assert np.abs(heights[known] - expected).max() <= FORMATS["mosaic"].precision_m
+    # Half a step per component, of three components.
+    assert np.linalg.norm(normals[known] - directions, axis=1).max() <= 1.8 * 0.5 / 32767
+    assert np.ptp(normals[known], axis=0).min() > 0.005
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rasters_are_cloud_optimised_and_say_what_they_are(town, written, fine, name):
+    for folder in (written, fine):
+        valid, errors, warnings = cog_validate(folder / f"{name}.tif", strict=True)
+        assert (valid, errors, warnings) == (True, [], [])
+    with rasterio.open(fine / f"{name}.tif") as raster:
+        assert raster.res == (FINE_M, FINE_M)
+        assert raster.crs.to_epsg() == 25832
+        assert raster.descriptions[0].startswith(name)
+        assert raster.tags(1)["MEANING"]
+        assert raster.profile["compress"] == "deflate"
+        assert raster.nodata is not None
+        assert raster.overviews(1) == [2, 4]
+
+
+def test_mosaic_does_not_depend_on_the_memory_of_gdal(town, written, tmp_path, monkeypatch):
+    """With no memory, blocks are written as soon as a tile has been added."""
+    monkeypatch.setattr(mosaic, "CACHE_BYTES", 256)
+    export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
+    for name in NAMES:
+        with (
+            rasterio.open(tmp_path / "mosaic" / f"{name}.tif") as a,
+            rasterio.open(written / f"{name}.tif") as b,
+        ):
+            np.testing.assert_array_equal(a.read(), b.read())
+
+
+def test_overviews_are_averages_of_heights_and_most_frequent_classes(fine):
+    with rasterio.open(fine / "height.tif") as raster:
+        whole = raster.read(1).astype(float)
+        half = raster.read(1, out_shape=(600, 600))
+    parts = whole.reshape(600, 2, 600, 2)
+    known = ~np.isnan(half)
+    np.testing.assert_allclose(half[known], parts.mean(axis=(1, 3))[known], atol=1e-4)
+    with rasterio.open(fine / "road.tif") as raster:
+        whole, half = raster.read(1), raster.read(1, out_shape=(600, 600))
+    assert set(np.unique(half)) == {0, 1, mosaic.NO_ROAD}
+    # A road cell of an overview has at least two road cells of four.
+    assert ((whole == 1).reshape(600, 2, 600, 2).sum(axis=(1, 3))[half == 1] >= 2).all()
+
+
+def test_heights_with_a_vertical_crs_have_a_compound_crs(town, tmp_path, monkeypatch):
+    source = select(town.path)
+    source.__dict__["vertical"] = "EPSG:7837"
+    export(source, tmp_path, ["mosaic"], Options(), SerialExecutor())
+    with rasterio.open(tmp_path / "mosaic" / "height.tif") as raster:
+        assert [part.to_epsg() for part in CRS(raster.crs.to_wkt()).sub_crs_list] == [25832, 7837]
+    with rasterio.open(tmp_path / "mosaic" / "road.tif") as raster:
+        assert raster.crs.to_epsg() == 25832
+
+
+def test_whole_grid_of_a_cell_size_has_multiples_of_it():
+    a = Grid("EPSG:25832", 500030.5, 5600100.0, 1.0, 50, 50)
+    b = replace(a, west=500200.0)
+    assert mosaic.whole_grid([a, b], 25.0) == Grid("EPSG:25832", 500025.0, 5600100.0, 25.0, 9, 2)
+    with pytest.raises(ConfigError, match="several sizes or lattices; give --resolution METRES"):
+        mosaic.whole_grid([a, b], None)
+    with pytest.raises(ConfigError, match="--resolution 1e-09: .* cells are too many"):
+        mosaic.whole_grid([a, b], 1e-9)
+
+
+@pytest.mark.parametrize("limit", [8_000, 30_000])
+def test_full_disk_leaves_no_file(town, tmp_path, monkeypatch, limit):
+    """Also if the disk is full only when GDAL closes the file, which it does not report."""
+    finish = mosaic._finish
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def full(*arguments):
+        ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, unlimited[1]))
+        try:
+            finish(*arguments)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+            signal.signal(signal.SIGXFSZ, ignored)
+
+    monkeypatch.setattr(mosaic, "_finish", full)
+    with pytest.raises(OSError, match="height.tif"):
+        export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
+    assert list((tmp_path / "mosaic").iterdir()) == []
