@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -60,6 +60,13 @@ def export(
             rich_help_panel=options.INPUTS,
         ),
     ] = None,
+    nodes: Annotated[
+        Literal["power", "unreal"],
+        typer.Option(
+            help="Sizes of heightfield. power: 2^n + 1 nodes a side; unreal: those of Unreal Engine.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ] = "power",
     resolution: Annotated[
         float | None,
         typer.Option(
@@ -89,7 +96,7 @@ def export(
     from flexroad.pipeline.export.source import select
     from flexroad.pipeline.monitor.progress import StepProgress
 
-    chosen = Options(_datum(vertical, geoid, height_offset), compress, resolution)
+    chosen = Options(_datum(vertical, geoid, height_offset), compress, resolution, nodes)
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)

@@ -11,13 +11,13 @@ from typing import Any
 
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import mosaic, per_tile, tiles3d
+from flexroad.pipeline.export import height_fields, mosaic, per_tile, tiles3d
 from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
+from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
 """Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
@@ -99,8 +99,8 @@ FORMATS = {
     "landxml": Format("LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001),
     "cityjson": Format("CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001),
     "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001),
-    "heightfield": _per_tile(
-        "16-bit height fields, for game engines", heightfield.VERSION, per_tile.heightfield_piece, None
+    "heightfield": Format(
+        "16-bit height fields, for game engines", height_fields.write_fields, height_fields.VERSION, None
     ),
     "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),

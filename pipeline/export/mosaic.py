@@ -180,7 +180,7 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
     """Write the cells of a tile into the drafts."""
     from rasterio.windows import Window
 
-    surface, road, core = tile.surface, tile.road, tile.graph.tile.grid
+    surface, road, core = tile.surface, tile.road, tile.tile.grid
     kept, support = tile.clusters.mask, tile.quality.support
     for part, column, line in _parts(grid, core.bounds):
         eastings, northings = part.eastings, part.northings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from flexroad.catalog.ellipsoidal import Datum
 
@@ -17,3 +18,5 @@ class Options:
     """Whether text formats of the whole run are compressed with gzip."""
     resolution_m: float | None = None
     """Cell size of rasters over the run (m); None: that of the run."""
+    nodes: Literal["power", "unreal"] = "power"
+    """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""

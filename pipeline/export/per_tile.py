@@ -9,13 +9,11 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.joined import part_name
 from flexroad.pipeline.export.pieces import Piece
 from flexroad.pipeline.export.source import FinishedTile
-from flexroad.tasks.export import cityjson, heightfield, landxml, obj, rhino, step
+from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
-SPACING_M = 1.0
-"""Largest distance of the nodes of height fields (m)."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +46,6 @@ def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
         f"{name}.prj": place.prj(),
     }
     return Piece(files, {})
-
-
-def heightfield_piece(tile: FinishedTile, vertical: str | None) -> Piece:
-    """Return the surface as height fields of 2^n + 1 nodes a side, with what engines must know as JSON."""
-    bounds = tile.tile.grid.bounds
-    field = heightfield.sampled(tile.surface, bounds, heightfield.size_at_spacing(bounds, SPACING_M))
-    files = {
-        heightfield.NAME_PNG: heightfield.encode_png(field),
-        heightfield.NAME_R16: heightfield.encode_r16(field),
-        heightfield.NAME_MUJOCO: heightfield.encode_mujoco(field),
-        heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.tile.grid.crs, vertical),
-    }
-    return Piece({f"{safe_name(tile.id)}{name}": data for name, data in files.items()}, {})
 
 
 def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:

@@ -4,7 +4,7 @@ The nodes of the field span its bounds: the first and the last column lie on the
 the first and the last row on the northern and southern one. Heights are those of the surface at the nodes.
 PNG and R16 have 65,536 values from the lowest to the highest height, so that a height is exact to half a
 step; MuJoCo's file has float32 numbers from 0 to 1. None of the formats has a value for nodes without a
-height: they have the lowest one, and the JSON file beside the field has their number.
+height: they have the lower limit, and the JSON file beside the field has their number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.types import Floats, Surface
 
-VERSION = 1
+VERSION = 2
 NAME_PNG = "_heightfield.png"
 NAME_R16 = "_heightfield.r16"
 NAME_MUJOCO = "_heightfield.bin"

@@ -68,7 +68,7 @@ def test_step_is_the_surface_of_each_tile(tiles, exported):
     for name, tile in tiles.items():
         valid, points = read_step(exported / "step" / f"{name}.stp", 30)
         assert valid
-        west, south, east, north = tile.graph.tile.grid.bounds
+        west, south, east, north = tile.tile.grid.bounds
         x, y = points[:, 0] + west, points[:, 1] + south
         assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((west, east, south, north), abs=1e-8)
         # A northing of 181,750 m has a rounding error of 3e-11 m; slopes here are below 10.

@@ -30,7 +30,7 @@ class Town:
         x, y = np.broadcast_arrays(x, y)
         heights, normals = np.full(x.shape, np.nan), np.full((*x.shape, 3), np.nan)
         for tile in select(self.path).finished():
-            west, south, east, north = tile.graph.tile.grid.bounds
+            west, south, east, north = tile.tile.grid.bounds
             inside = (west <= x) & (x <= east) & (south <= y) & (y <= north)
             heights[inside] = tile.surface.height(x[inside], y[inside])
             normals[inside] = tile.surface.normal(x[inside], y[inside])

@@ -52,7 +52,7 @@ def true_heights(city, places):
     """The heights of the fitted surfaces at places, ``(n, 2)``."""
     heights = np.full(len(places), np.nan)
     for tile in select(city).finished():
-        west, south, east, north = tile.graph.tile.grid.bounds
+        west, south, east, north = tile.tile.grid.bounds
         x, y = places.T
         inside = (west <= x) & (x <= east) & (south <= y) & (y <= north)
         heights[inside] = tile.surface.height(x[inside], y[inside])
