@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from flexroad.catalog import geoparquet, ids
+from flexroad.catalog.area import Area
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.geoparquet import Item, Unreadable
@@ -128,19 +130,24 @@ class Catalog:
         except OSError as error:
             raise CatalogError(f"cannot write catalog {path}: {error.strerror or error}") from error
 
-    def select(self, ids: Sequence[str] = (), bbox: Bounds | None = None) -> Catalog:
-        """Return the tiles with the given ids (all if ``ids`` is empty) that touch ``bbox``.
+    def select(
+        self, ids: Sequence[str] = (), bbox: Bounds | None = None, area: Area | None = None
+    ) -> Catalog:
+        """Return the tiles with the given ids (all if ``ids`` is empty) that touch ``bbox`` and ``area``.
 
         Parameters
         ----------
         ids : sequence of str
         bbox : Bounds, optional
             West, south, east, north (m, in the tiles' CRS).
+        area : Area, optional
+            Polygons in any CRS.
 
         Raises
         ------
         CatalogError
-            If an id is not in the catalog (the message suggests similar ids) or no tile touches ``bbox``.
+            If an id is not in the catalog (the message suggests similar ids) or no tile touches ``bbox`` or
+            ``area``.
         """
         all_ids = {tile.id for tile in self.tiles}
         for tile_id in ids:
@@ -152,6 +159,11 @@ class Catalog:
             tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]
             if not tiles:
                 raise CatalogError(f"no tile touches --bbox {' '.join(f'{v:g}' for v in bbox)}")
+        if area is not None:
+            usable = [tile for tile in tiles if not tile.fault]
+            tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
+            if not tiles:
+                raise area.none_touched()
         return Catalog(tuple(tiles))
 
 

@@ -78,6 +78,8 @@ def export(
     ] = None,
     tile: options.TileIds = None,
     bbox: options.Box = None,
+    area: options.Area = None,
+    area_layer: options.AreaLayer = None,
     allow: options.Allow = None,
     executor: options.Executor = "serial",
     workers: options.Workers = None,
@@ -104,8 +106,14 @@ def export(
     runner = SerialExecutor() if executor == "serial" else DaskExecutor(workers)
     with signals_interrupt():
         try:
-            allowed = [str(place) for place in allow or ()]
-            source = select(parse_location(path), tile or (), bbox, None, allowed, track)
+            source = select(
+                parse_location(path),
+                tile or (),
+                bbox,
+                allow=[str(place) for place in allow or ()],
+                area=options.read_area(area, area_layer),
+                track=track,
+            )
             if source.left_out:
                 _note(f"left out {count(len(source.left_out), 'tile')} that are not finished")
             manifest = write(source, folder, names, chosen, runner, track, _note)

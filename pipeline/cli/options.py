@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from flexroad.pipeline.cli.lifecycle import ON_FAILURE
+
+if TYPE_CHECKING:
+    from flexroad.catalog.area import Area as CatalogArea
 
 INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
 METHOD, VALIDATION = "Method", "Split into training and validation"
@@ -44,6 +47,19 @@ TileIds = Annotated[
 Box = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option("--bbox", metavar="W S E N", help="Only tiles in these bounds (m).", rich_help_panel=TILES),
+]
+Area = Annotated[
+    Path | None,
+    typer.Option(
+        "--area",
+        metavar="FILE",
+        help="Only tiles that touch the polygons of this file, in any CRS.",
+        rich_help_panel=TILES,
+    ),
+]
+AreaLayer = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Layer of --area, if it has several.", rich_help_panel=TILES),
 ]
 Workers = Annotated[
     int | None,
@@ -95,3 +111,16 @@ Settings = Annotated[
         rich_help_panel=INPUTS,
     ),
 ]
+
+
+def read_area(path: Path | None, layer: str | None) -> CatalogArea | None:
+    """Return the polygons of --area, None without it.
+
+    Raises
+    ------
+    CatalogError
+        If the file has no polygons that can be read.
+    """
+    from flexroad.catalog.area import Area
+
+    return Area.read(path, layer) if path else None

@@ -70,6 +70,8 @@ def run(
     verify: options.Verify = False,
     tile: options.TileIds = None,
     bbox: options.Box = None,
+    area: options.Area = None,
+    area_layer: options.AreaLayer = None,
     executor: options.Executor = "dask",
     workers: options.Workers = None,
     scheduler: options.Scheduler = None,
@@ -103,14 +105,14 @@ def run(
         """Return the whole catalog and its selected tiles."""
         whole = Catalog.read(catalog_path, allow or ())
         check_allowed(whole, layers_read(chosen))
-        selected = whole.select(tile or (), bbox)
+        selected = whole.select(tile or (), bbox, options.read_area(area, area_layer))
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
         return whole, selected
 
     def of_run(whole: Catalog, selected: Catalog) -> Catalog:
         """Return the tiles of the run, also those of earlier partial runs."""
-        return merged_catalog(path, whole, selected) if tile or bbox is not None else whole
+        return merged_catalog(path, whole, selected) if tile or bbox is not None or area else whole
 
     if dry_run:
         from flexroad.pipeline.cli.dry_run import plan

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from flexroad.catalog import Bounds, Tile
+from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.states import (
@@ -181,6 +182,7 @@ def select(
     bbox: Bounds | None = None,
     variant: str | None = None,
     allow: Sequence[str] = (),
+    area: Area | None = None,
     track: Track = untracked,
 ) -> Source:
     """Return the finished tiles of a run, of all or of the selected tiles.
@@ -198,14 +200,14 @@ def select(
         If the folder is no run, the variant has no meshes in the store, no selected tile is finished, or
         tiles have different CRSs.
     CatalogError
-        If an id is not in the run, or no tile touches the box.
+        If an id is not in the run, or no tile touches the box or the area.
     """
     run = Run.open(location, allow)
     variants = run.config.export.variants
     variant = variant or variants[0]
     if variant not in variants:
         raise ConfigError(f"{location} exports no variant {variant!r}; it has {', '.join(variants)}")
-    wanted = run.catalog.select(ids, bbox).tiles
+    wanted = run.catalog.select(ids, bbox, area).tiles
     checked = track(tile_states(run, wanted, variant), "checking tiles", len(wanted))
     done = {tile.id: state for tile, state in checked if state}
     tiles = tuple(tile for tile in wanted if tile.id in done)

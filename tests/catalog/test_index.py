@@ -4,12 +4,15 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 import geopandas
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pystac
 import pytest
+import shapely
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
+from flexroad.catalog.area import Area
 
 
 def tile(east: int, root, layers=("dsm", "dtm"), crs="EPSG:25832") -> Tile:
@@ -169,6 +172,20 @@ def test_select_by_id_and_bbox_returns_matching_tiles(tmp_path):
         catalog.select(ids=["295751_5629250"])
     with pytest.raises(CatalogError, match="no tile touches --bbox 0 0 1 1"):
         catalog.select(bbox=(0, 0, 1, 1))
+
+
+def test_select_by_area_returns_the_tiles_on_it(tmp_path):
+    lost = replace(tile(295750, tmp_path), fault="its position is lost")
+    catalog = Catalog((tile(295500, tmp_path), lost, tile(296000, tmp_path)))
+    area = Area("area.gpkg", "EPSG:25832", np.array([shapely.box(295700, 5629300, 296100, 5629400)]))
+    assert [t.id for t in catalog.select(area=area).tiles] == ["295500_5629250", "296000_5629250"]
+    assert [t.id for t in catalog.select(["296000_5629250"], area=area).tiles] == ["296000_5629250"]
+    with pytest.raises(
+        CatalogError, match="no tile touches --area area.gpkg; check its CRS, EPSG:25832, and its place"
+    ):
+        catalog.select(
+            bbox=(295500, 5629250, 295600, 5629260), area=replace(area, polygons=area.polygons[:0])
+        )
 
 
 def test_read_missing_or_broken_file_names_it(tmp_path):

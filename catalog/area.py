@@ -1,0 +1,106 @@
+"""Areas that select tiles: the polygons of a vector file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.headers.open_vector import ERRORS, vector_name
+from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.vectors import layers, listed
+from flexroad.catalog.text import count, reason
+
+TOUCH_M = 1e-3
+"""Overlap that counts (m): tiles beside an area that ends on their edge do not lie on it."""
+STEPS = 8
+"""Parts of a tile's side in the CRS of the area, where sides are curved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """Polygons that tiles may lie on."""
+
+    name: str
+    """The file, for messages."""
+    crs: str
+    polygons: Any
+    """Polygons of shapely in the CRS, ``(n,)``."""
+
+    @classmethod
+    def read(cls, path: Path, layer: str | None = None) -> Area:
+        """Read the polygons of a vector file.
+
+        Parameters
+        ----------
+        path : Path
+            GeoPackage, GeoJSON, FlatGeobuf or Shapefile.
+        layer : str, optional
+            Layer of a file with several.
+
+        Raises
+        ------
+        CatalogError
+            If the file cannot be read, has no CRS, no such layer or several, or no polygons.
+        """
+        import pyogrio
+        import shapely
+        from shapely.errors import ShapelyError
+
+        try:
+            name = vector_name(path)
+            found = layers(path)
+            if layer is None and len(found) > 1:
+                raise CatalogError(
+                    f"--area {path} has {count(len(found), 'layer')}: {listed(found)}; "
+                    "name one with --area-layer"
+                )
+            if layer is not None and layer not in found:
+                raise CatalogError(f"--area {path} has no layer {layer!r}; it has {listed(found) or 'none'}")
+            table = pyogrio.read_dataframe(name, layer=layer, columns=[]) if found else None
+        except Refused as error:
+            raise CatalogError(f"--area {path} {error}") from error
+        except ERRORS as error:
+            raise CatalogError(f"--area {path} cannot be read: {reason(error)}") from error
+        shapes = np.empty(0) if table is None else shapely.force_2d(np.asarray(table.geometry))
+        polygons = shapes[np.isin(shapely.get_type_id(shapes), (3, 6)) & ~shapely.is_empty(shapes)]
+        if table is None or not polygons.size:
+            raise CatalogError(f"--area {path} has no polygons; draw the area as polygons")
+        if table.crs is None:
+            raise CatalogError(f"--area {path} has no CRS; add it with ogr2ogr -a_srs EPSG:N NEW {path.name}")
+        try:
+            return cls(str(path), table.crs.to_wkt(), shapely.make_valid(polygons))
+        except ShapelyError as error:
+            raise CatalogError(f"--area {path} has polygons that cannot be used: {reason(error)}") from error
+
+    def touched(self, grids: Iterable[Grid]) -> list[bool]:
+        """Return for each grid whether its bounds and a polygon overlap.
+
+        Tiles are transformed to the CRS of the area, as its sides are straight there.
+        """
+        import shapely
+
+        tree = shapely.STRtree(self.polygons)
+        return [bool(tree.query(self._outline(grid), predicate="intersects").size) for grid in grids]
+
+    def none_touched(self) -> CatalogError:
+        """Return the error of an area without tiles."""
+        return CatalogError(
+            f"no tile touches --area {self.name}; check its CRS, {short(self.crs)}, and its place"
+        )
+
+    def _outline(self, grid: Grid) -> Any:
+        """Return the outline of a grid in the CRS of the area; empty if it cannot be transformed."""
+        import shapely
+
+        west, south, east, north = grid.bounds
+        box = shapely.box(west + TOUCH_M, south + TOUCH_M, east - TOUCH_M, north - TOUCH_M)
+        corners = shapely.get_coordinates(shapely.segmentize(box, max(east - west, north - south) / STEPS))
+        x, y = transformer(grid.crs, self.crs).transform(*corners.T)
+        return shapely.polygons(np.column_stack([x, y])) if np.isfinite([x, y]).all() else shapely.Polygon()
