@@ -76,6 +76,14 @@ def export(
             rich_help_panel=options.OUTPUTS,
         ),
     ] = None,
+    drape: Annotated[
+        bool,
+        typer.Option(
+            "--drape",
+            help="Put the orthophoto on the meshes of 3dtiles and obj.",
+            rich_help_panel=options.OUTPUTS,
+        ),
+    ] = False,
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
@@ -98,7 +106,8 @@ def export(
     from flexroad.pipeline.export.source import select
     from flexroad.pipeline.monitor.progress import StepProgress
 
-    chosen = Options(_datum(vertical, geoid, height_offset), compress, resolution, nodes)
+    datum = _datum(vertical, geoid, height_offset)
+    chosen = Options(datum, compress, resolution, nodes, drape)
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)
@@ -127,6 +136,8 @@ def export(
         written = manifest["formats"][name]
         size = written["bytes"] / 1e6
         echo(f"{name}: {count(written['files'], 'file')}, {size:.1f} MB in {folder / name}")
+        for note in written["notes"]:
+            _note(f"{name}: {note}")
 
 
 def _note(line: str) -> None:

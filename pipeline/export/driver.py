@@ -17,6 +17,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.output import file_sizes, held, remove_unfinished
+from flexroad.pipeline.export.photo import check_photos
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.errors import TaskError
@@ -51,13 +52,16 @@ def export(
     Raises
     ------
     ConfigError
-        If a format is unknown or needs a datum, a tile's results cannot be read, or the folder is in use.
+        If a format is unknown or needs a datum, no tile has the photo that is wanted, a tile's results cannot
+        be read, or the folder is in use.
     ClusterLost
         If the workers are gone; the same command goes on.
     OSError
         If a file cannot be written.
     """
     chosen = check_formats(formats, options)
+    if options.drape:
+        check_photos(source.tiles)
     with held(out, source.run, notify):
         written = _earlier(out, source, options, chosen, notify)
         for name, kind in chosen.items():
@@ -97,6 +101,7 @@ def _written(
         "files": len(files),
         "bytes": sum(files.values()),
         **({"datum": options.datum.text} if kind.needs_datum and options.datum else {}),
+        "notes": [],
         **more,
     }
 

@@ -20,3 +20,5 @@ class Options:
     """Cell size of rasters over the run (m); None: that of the run."""
     nodes: Literal["power", "unreal"] = "power"
     """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""
+    drape: bool = False
+    """Whether meshes of 3D Tiles and OBJ have the orthophoto, also if those of the run have none."""

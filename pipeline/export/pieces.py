@@ -1,4 +1,4 @@
-"""Files of an export that belong to one tile each, written by workers.
+"""Files of an export that belong to one tile, or one area, each, written by workers.
 
 A file ``.pieces/ID.json`` names what a tile's files were made of, and is written last: an interrupted export
 goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier export had
@@ -12,14 +12,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any
+from typing import Any, Protocol
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, listing, parse_location, read, remove, stat, write
+from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.source import FinishedTile
 from flexroad.tasks.errors import TaskError
 
 MARKERS = ".pieces"
@@ -36,33 +36,56 @@ class Piece:
     row: Row
 
 
-Encode = Callable[[FinishedTile, Any], Piece]
-"""Makes the files of a tile with the options of a format; runs in the worker processes."""
+class Item(Protocol):
+    """What files are made of: a finished tile, or an area."""
+
+    @property
+    def id(self) -> str:
+        """Id of the tile or area; unique within an export."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of the content by what it is made of."""
+        ...
+
+
+Encode = Callable[[Any, Any], Piece]
+"""Makes the files of an `Item` with the options of a format; runs in the worker processes."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One tile of an export; sent to a worker."""
+    """One item of an export; sent to a worker."""
 
-    tile: FinishedTile
+    tile: Item
     encode: Encode
     options: Any
     folder: str
     key: str
-    """Fingerprint of the mesh, the format's version and its options."""
+    """Fingerprint of the content, the format's version and its options."""
+    group: str
     former: Mapping[str, int]
-    """Names and sizes of the tile's files of an earlier export."""
+    """Names and sizes of the item's files of an earlier export."""
 
 
 def write_pieces(
-    tiles: Iterable[FinishedTile],
+    tiles: Iterable[Item],
     folder: Location,
     version: int,
     encode: Encode,
     options: Any,
     executor: Executor,
+    group: str = "",
 ) -> Iterator[Row]:
     """Write the files of each tile that does not have them, and yield the row of each, in any order.
+
+    Files of tiles of an earlier export that are not among the given ones are removed at the end.
+
+    Parameters
+    ----------
+    group : str
+        Name of what the tiles or areas have in common, if a format has several kinds of them.
 
     Raises
     ------
@@ -74,33 +97,35 @@ def write_pieces(
 
     def jobs() -> Iterator[Job]:
         for tile in tiles:
-            marker = _marker(folder, tile.id)
+            marker = _marker(folder, group, tile.id)
             kept.add(marker.name)
             written = _written(marker)
             key = sha256(f"{tile.fingerprint} {version} {options}".encode()).hexdigest()
             if written and written.key == key and written.whole(folder):
                 unchanged.append(written.row)
             else:
-                yield Job(tile, encode, options, str(folder), key, written.sizes if written else {})
+                yield Job(tile, encode, options, str(folder), key, group, written.sizes if written else {})
 
     for row, failure in executor.map(_write, jobs(), _lost):
         if failure:
             raise ConfigError(failure)
         yield row
     yield from unchanged
-    for name in listing(folder / MARKERS):
-        if name not in kept and (other := _written(folder / MARKERS / name)):
+    markers = _markers(folder, group)
+    for name in listing(markers):
+        if name not in kept and "/" not in name and (other := _written(markers / name)):
             _remove(folder, other.sizes)
-            remove(folder / MARKERS / name)
+            remove(markers / name)
 
 
 def figures(rows: Iterable[Row]) -> dict[str, Any]:
-    """Return what the manifest says of all tiles: the largest ``error_m`` and how many have each ``note``."""
+    """Return what the manifest says of all tiles: the largest ``error_m``, the number of each ``note``."""
     errors, notes = list[float](), Counter[str]()
     for row in rows:
         errors += [row["error_m"]] if "error_m" in row else []
-        notes += Counter([row["note"]] if row.get("note") else [])
-    return ({"error_m": max(errors)} if errors else {}) | ({"notes": dict(notes)} if notes else {})
+        notes.update([row["note"]] if row.get("note") else [])
+    said = [f"{count(number, 'tile')}: {note}" for note, number in sorted(notes.items())]
+    return ({"error_m": max(errors)} if errors else {}) | {"notes": said}
 
 
 def _write(job: Job) -> tuple[Row, str]:
@@ -108,14 +133,13 @@ def _write(job: Job) -> tuple[Row, str]:
     folder = parse_location(job.folder)
     try:
         piece = job.encode(job.tile, job.options)
-        job.tile.check_unchanged()
         # First, while the marker still names them.
         _remove(folder, {name: size for name, size in job.former.items() if name not in piece.files})
         for name, data in piece.files.items():
             write(folder / name, data)
         sizes = {name: len(data) for name, data in piece.files.items()}
         marker = json.dumps({"key": job.key, "sizes": sizes, "row": piece.row})
-        write(_marker(folder, job.tile.id), marker.encode())
+        write(_marker(folder, job.group, job.tile.id), marker.encode())
     except OSError as error:
         return {}, f"tile {job.tile.id}: {error}; correct that, and the same command goes on"
     except (ConfigError, TaskError, CatalogError) as error:
@@ -128,8 +152,12 @@ def _lost(job: Job, reason: str) -> tuple[Row, str]:
     return {}, f"tile {job.tile.id}: {reason}"
 
 
-def _marker(folder: Location, tile_id: str) -> Location:
-    return folder / MARKERS / f"{safe_name(tile_id)}.json"
+def _markers(folder: Location, group: str) -> Location:
+    return folder / MARKERS / group if group else folder / MARKERS
+
+
+def _marker(folder: Location, group: str, tile_id: str) -> Location:
+    return _markers(folder, group) / f"{safe_name(tile_id)}.json"
 
 
 @dataclass(frozen=True)

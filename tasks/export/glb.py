@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.meshing.parts import texture_coordinates
+from flexroad.tasks.meshing.relief import Sheet
 from flexroad.tasks.types import Bools, Floats, Mesh, Orthophoto
 
 if TYPE_CHECKING:
@@ -26,7 +28,9 @@ MEDIA_TYPE = "model/gltf-binary"
 
 ROAD_COLOUR = (11, 11, 13, 255)
 TERRAIN_COLOUR = (141, 131, 108, 255)
-"""Red, green, blue and alpha in linear light, as glTF requires (sRGB #3a3a40 and #c4beae)."""
+"""Red, green, blue and alpha in linear light, as glTF requires."""
+ROAD_SRGB, TERRAIN_SRGB = (58, 58, 64), (196, 190, 174)
+"""The same colours as in images: #3a3a40 and #c4beae."""
 
 SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 """Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border takes no colour of the opposite one."""
@@ -51,13 +55,18 @@ def texture(photo: Orthophoto, quality: int) -> Texture:
     quality : int
         Quality of the JPEG encoder, 1 to 95.
     """
-    from PIL import Image
-
     mean = photo.colour[:, photo.known].mean(axis=1).round().astype(np.uint8)
     colour = np.where(photo.known, photo.colour, mean[:, None, None])
+    return Texture(jpeg(np.moveaxis(colour, 0, -1), quality), photo.grid.bounds)
+
+
+def jpeg(colour: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an image, ``(h, w, 3)``, as JPEG."""
+    from PIL import Image
+
     encoded = io.BytesIO()
-    Image.fromarray(np.moveaxis(colour, 0, -1)).save(encoded, "JPEG", quality=quality)
-    return Texture(encoded.getvalue(), photo.grid.bounds)
+    Image.fromarray(colour).save(encoded, "JPEG", quality=quality)
+    return encoded.getvalue()
 
 
 def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture | None = None) -> bytes:
@@ -93,6 +102,44 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture 
             scene.add_geometry(part, node_name=name, geom_name=name, parent_node_name="tile")
     embed = _Embedded(texture.jpeg).options if texture else {}
     encoded: bytes = scene.export(file_type="glb", include_normals=True, **embed)
+    return encoded
+
+
+def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> bytes:
+    """Return a coarse copy of meshes with its image as GLB.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        Triangles and skirt.
+    local : ndarray, (V, 3)
+        Its points in a frame of their own: east, north and up (m).
+    bounds : tuple of float
+        West, south, east and north of the image's outer edges (m, in the CRS of the sheet).
+    image : bytes
+        The image seen from above, JPEG.
+
+    Returns
+    -------
+    bytes
+        One node, ``ground``. Axes: x east, y up, z south; metres. The skirt has the colours and normals of
+        the edge above it, so that it does not show.
+    """
+    import trimesh
+
+    top = trimesh.Trimesh(_y_up(local[: sheet.top.max() + 1]), sheet.faces[: sheet.count], process=False)
+    west, south, east, north = bounds
+    uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
+    ground = trimesh.Trimesh(
+        _y_up(local),
+        sheet.faces,
+        vertex_normals=top.vertex_normals[sheet.top],
+        visual=trimesh.visual.TextureVisuals(uv=uv, material=_material("ground", (), textured=True)),
+        process=False,
+    )
+    scene = trimesh.Scene()
+    scene.add_geometry(ground, node_name="ground", geom_name="ground")
+    encoded: bytes = scene.export(file_type="glb", include_normals=True, **_Embedded(image).options)
     return encoded
 
 

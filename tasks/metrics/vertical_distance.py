@@ -1,4 +1,4 @@
-"""Heights of a mesh at cell centres, from which vertical distances are computed."""
+"""Heights of a mesh at cell centres, from which vertical distances are computed, and at nodes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog.grid import Grid
+from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats, Mesh
 
@@ -25,6 +25,28 @@ def drape(mesh: Mesh, grid: Grid) -> Floats:
     south = (grid.north - mesh.origin[1] - grid.cell / 2) - mesh.vertices[:, 1]
     heights = np.full(grid.shape, np.nan)
     _drape(np.column_stack([east, south, mesh.vertices[:, 2]]), mesh.faces, grid.cell, heights)
+    return heights
+
+
+def at_nodes(points: Floats, faces: NDArray[np.int32], bounds: Bounds, shape: tuple[int, int]) -> Floats:
+    """Return the height of faces at the nodes of a lattice, ``shape``; NaN where no face is below or above.
+
+    Parameters
+    ----------
+    points : ndarray, (V, 3)
+        East, north and height of vertices (m).
+    faces : ndarray of int32, (F, 3)
+        Indices of points.
+    bounds : tuple of float
+        West, south, east and north of the outermost nodes (m); no two may be equal.
+    shape : tuple of int
+        Rows, from north to south, and columns of nodes; 2 of each at least.
+    """
+    west, south, east, north = bounds
+    columns = (points[:, 0] - west) / (east - west) * (shape[1] - 1)
+    rows = (north - points[:, 1]) / (north - south) * (shape[0] - 1)
+    heights = np.full(shape, np.nan)
+    _drape(np.column_stack([columns, rows, points[:, 2]]), faces, 1.0, heights)
     return heights
 
 

@@ -1,0 +1,65 @@
+"""Orthophotos on exported meshes, also of runs that wrote none."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from flexroad.catalog import Tile
+from flexroad.catalog.storage.paths import stat
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.export.source import FinishedTile
+from flexroad.pipeline.worker.evaluator import SourceChanged
+from flexroad.pipeline.worker.texture import TileTexture, tile_texture
+from flexroad.tasks.export.glb import Texture
+from flexroad.tasks.meshing.aerial import Aerial
+
+
+def check_photos(tiles: Iterable[Tile]) -> None:
+    """Check that one tile at least has an orthophoto.
+
+    Raises
+    ------
+    ConfigError
+        If none has.
+    """
+    if all(tile.layer("dop") is None for tile in tiles):
+        raise ConfigError(
+            "--drape needs an orthophoto (layer dop), and no exported tile has one; leave out --drape"
+        )
+
+
+def photo_state(tile: FinishedTile) -> str:
+    """Return the files of a tile's photo with their sizes and versions; empty if it has none."""
+    layer = tile.tile.layer("dop")
+    reaching = layer.reaching(tile.tile.grid.bounds) if layer else None
+    return str([(str(path), stat(path)) for path in tile.tile.paths(reaching)]) if reaching else ""
+
+
+def texture_of(tile: FinishedTile) -> TileTexture:
+    """Return the photo of a tile, also if the products of its run have none.
+
+    Raises
+    ------
+    ConfigError
+        If a file of the photo changes while it is read.
+    TaskError
+        If a file of the photo is missing, broken, or not one of a photo.
+    """
+    pattern = tile.place.pattern
+    with_photo = replace(pattern, export=pattern.export.model_copy(update={"texture": True}))
+    try:
+        return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))
+    except SourceChanged as error:
+        raise ConfigError(f"{error.file} {error}") from error
+
+
+def aerial_of(texture: Texture) -> Aerial:
+    """Return a texture as pixels."""
+    from PIL import Image
+
+    colour = np.asarray(Image.open(io.BytesIO(texture.jpeg)), np.float64)
+    return Aerial(texture.bounds, colour, np.ones(colour.shape[:2]))
