@@ -120,11 +120,11 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     reach = options.max_width_m / 2
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
-    columns = _columns(options)
+    names = columns(options)
     parts = [
         _from_table(
             read_near(
-                Query(path, options.layer or source.sublayer, options.where, columns, source.crs, grid.crs),
+                Query(path, options.layer or source.sublayer, options.where, names, source.crs, grid.crs),
                 bounds,
             ),
             options,
@@ -138,7 +138,8 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     )
 
 
-def _columns(options: Options) -> tuple[str, ...]:
+def columns(options: Options) -> tuple[str, ...]:
+    """Return the columns, or OSM tags, that a selection of roads and their widths need, in lower case."""
     of_width = (*options.width_columns, *options.lane_columns, *options.width_class_columns)
     names = (*of_width, *options.class_columns, *CLASS_TAGS, BRIDGE, AREA, *HIDDEN_TAGS)
     return tuple(dict.fromkeys(name.lower() for name in names))
@@ -146,15 +147,13 @@ def _columns(options: Options) -> tuple[str, ...]:
 
 def _from_table(table: Any, options: Options) -> Roads:
     """Return the roads of one table."""
-    classes = _classes(table, options.class_columns)
-    chosen = _is_road(table, classes, options)
-    table, classes = table[chosen], classes[chosen]
+    table, classes = selected(table, options)
     # A collection of multi-part features needs two steps to be split into simple parts.
     members, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     parts, member = shapely.get_parts(members, return_index=True)
     row = row[member]
-    bridge = _is_yes(table, BRIDGE)[row]
-    parts = _closed(parts, _is_yes(table, AREA)[row])
+    bridge = is_yes(table, BRIDGE)[row]
+    parts = _closed(parts, is_yes(table, AREA)[row])
     is_line = np.isin(shapely.get_type_id(parts), (1, 2))
     is_area = shapely.get_type_id(parts) == 3
     lines, of_line = parts[is_line], row[is_line]
@@ -168,6 +167,13 @@ def _from_table(table: Any, options: Options) -> Roads:
         np.concatenate([bridge[is_area], bridge[is_line], joint_bridge]),
         notes,
     )
+
+
+def selected(table: Any, options: Options) -> tuple[Any, NDArray[np.object_]]:
+    """Return the rows of a table that are roads, and the class of each, in lower case or empty."""
+    classes = _classes(table, options.class_columns)
+    chosen = _is_road(table, classes, options)
+    return table[chosen], classes[chosen]
 
 
 def _classes(table: Any, columns: tuple[str, ...]) -> NDArray[np.object_]:
@@ -186,11 +192,11 @@ def _is_road(table: Any, classes: NDArray[np.object_], options: Options) -> Bool
         road &= _classes(table, CLASS_TAGS) != ""
     if not options.tunnels:
         for tag in HIDDEN_TAGS:
-            road &= ~_is_yes(table, tag)
+            road &= ~is_yes(table, tag)
     return road
 
 
-def _is_yes(table: Any, column: str) -> Bools:
+def is_yes(table: Any, column: str) -> Bools:
     """Return the rows whose value in a column is not one of `NO`, ``(n,)``; none if the column is missing."""
     if column not in table:
         return np.zeros(len(table), bool)

@@ -18,7 +18,7 @@ from pydantic import Field, field_validator
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import Route
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
@@ -190,7 +190,11 @@ def usable(line: ReferenceLine, known: Floats, options: Options) -> list[Referen
         Heights at its points, NaN beyond the surface.
     options : Options
     """
-    inside = np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD)
+    return parts(line, np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD), options)
+
+
+def parts(line: ReferenceLine, inside: Bools, options: Options) -> list[ReferenceLine]:
+    """Return the parts of a line of which all points are ``inside``, without those that are too short."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     spans = edges.reshape(-1, 2) - (0, 1)
     least = options.min_length_m / options.increment_m

@@ -1,13 +1,15 @@
 """Routes: centre lines of roads, chained where a road continues and cut where a format could not follow it.
 
 At a node, where ends of lines meet, the two ends that form the straightest continuation belong to one route.
-No route turns sharply, crosses itself or changes its number of lanes. Lines join at their ends alone: a line
-that ends on the middle of another one ends there, and lines that cross without a common end, as on bridges,
-stay apart.
+No route turns sharply, crosses itself, changes its number of lanes or is longer than a limit. Lines join at
+their ends alone: a line that ends on the middle of another one ends there, and lines that cross without a
+common end, as on bridges, stay apart.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +33,7 @@ class Options(base.Options):
     """Where routes end."""
 
     max_turn_deg: float = Field(45.0, gt=0, lt=90, description="largest turn within a route (degrees)")
+    max_length_m: float = Field(5000.0, ge=100, description="longest route (m); longer ones are divided")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,11 @@ class CentreLine:
     oneway: bool = False
     """Whether traffic goes only from the first point to the last."""
     name: str = ""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the line."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     @property
     def reverse(self) -> CentreLine:
@@ -74,7 +82,12 @@ def routes(lines: Sequence[CentreLine], options: Options) -> list[Route]:
     The result does not depend on the direction in which lines of two-way roads were drawn, but for its own
     direction, which is that of the first line of a route.
     """
-    pieces = [piece for line in lines for piece in _pieces(line, options.max_turn_deg)]
+    pieces = [
+        part
+        for line in lines
+        for piece in _pieces(line, options.max_turn_deg)
+        for part in _divided(piece, options.max_length_m)
+    ]
     follows = _continuations(pieces, options.max_turn_deg)
     free = set(range(len(pieces)))
     found: list[Route] = []
@@ -83,7 +96,7 @@ def routes(lines: Sequence[CentreLine], options: Options) -> list[Route]:
             chain = list(_chain(first, follows))
             free.difference_update(index for index, _ in chain)
             directed = [pieces[index] if onward else pieces[index].reverse for index, onward in chain]
-            found += _simple(directed)
+            found += _simple(directed, options.max_length_m)
     return found
 
 
@@ -103,6 +116,20 @@ def _pieces(line: CentreLine, max_turn_deg: float) -> Iterator[CentreLine]:
         path = shapely.LineString(points[part])
         for simple in (path,) if path.is_simple else shapely.node(path).geoms:
             yield replace(line, points=shapely.get_coordinates(simple))
+
+
+def _divided(line: CentreLine, max_length_m: float) -> Iterator[CentreLine]:
+    """Divide a line into the least number of equal lengths that are short enough."""
+    from shapely import LineString, get_coordinates
+    from shapely.ops import substring
+
+    parts = math.ceil(line.length_m / max_length_m * (1 - 1e-9))
+    if parts < 2:
+        yield line
+        return
+    whole, ends = LineString(line.points), np.linspace(0, 1, parts + 1)
+    for begin, end in itertools.pairwise(ends):
+        yield replace(line, points=get_coordinates(substring(whole, begin, end, normalized=True)))
 
 
 def _turn(a: Floats, b: Floats) -> Floats:
@@ -162,14 +189,17 @@ def _chain(first: int, follows: dict[End, End]) -> Iterator[tuple[int, bool]]:
         index, last = following
 
 
-def _simple(chain: Sequence[CentreLine]) -> Iterator[Route]:
-    """Cut a chain before each line that would cross or touch the route so far."""
+def _simple(chain: Sequence[CentreLine], max_length_m: float) -> Iterator[Route]:
+    """Cut a chain before each line that would cross or touch the route so far, or make it too long."""
     import shapely
 
     parts: list[CentreLine] = []
+    length_m = 0.0
     for part in chain:
-        if parts and not shapely.LineString(Route((*parts, part)).points).is_simple:
+        length_m += part.length_m
+        crosses = parts and not shapely.LineString(Route((*parts, part)).points).is_simple
+        if parts and (crosses or length_m > max_length_m * (1 + 1e-9)):
             yield Route(tuple(parts))
-            parts = []
+            parts, length_m = [], part.length_m
         parts.append(part)
     yield Route(tuple(parts))

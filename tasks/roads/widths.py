@@ -135,7 +135,7 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
     width, unreadable = np.full(len(table), np.nan), []
     for column in map(str.lower, options.width_columns):
         if column in table:
-            values = [(i, str(text)) for i, text in enumerate(table[column]) if _has_value(text)]
+            values = [(i, str(text)) for i, text in enumerate(table[column]) if has_value(text)]
             for i, text in values:
                 value = metres(text, bare_m)
                 unreadable += [text] if np.isnan(value) else []
@@ -160,9 +160,13 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
     return np.clip(width, options.min_width_m, options.max_width_m), tuple(notes)
 
 
+def lanes(table: Any, options: Options) -> Floats:
+    """Return the number of lanes of every row, ``(n,)``; NaN where it is unknown."""
+    return _numbers(table, options.lane_columns, 1, MOST_LANES)
+
+
 def _by_lanes(table: Any, options: Options) -> Floats:
-    lanes = _numbers(table, options.lane_columns, 1, MOST_LANES)
-    return lanes * options.lane_width_m + 2 * options.shoulder_m
+    return lanes(table, options) * options.lane_width_m + 2 * options.shoulder_m
 
 
 def _by_width_class(table: Any, options: Options) -> Floats:
@@ -176,12 +180,13 @@ def _numbers(table: Any, columns: tuple[str, ...], lowest: float, highest: float
     numbers = np.full(len(table), np.nan)
     for column in map(str.lower, columns):
         for i, text in enumerate(table.get(column, ())):
-            if np.isnan(numbers[i]) and _has_value(text) and re.fullmatch(NUMBER, str(text).strip()):
+            if np.isnan(numbers[i]) and has_value(text) and re.fullmatch(NUMBER, str(text).strip()):
                 number = float(text)
                 numbers[i] = number if lowest <= number <= highest else np.nan
     return numbers
 
 
-def _has_value(value: Any) -> bool:
+def has_value(value: Any) -> bool:
+    """Return whether a table has a value there."""
     # pandas has several values for "missing".
     return value is not None and str(value).strip().lower() not in ("", "nan", "<na>", "none")

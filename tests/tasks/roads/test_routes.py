@@ -92,3 +92,14 @@ def test_routes_ring_of_lines_is_one_closed_route():
 def test_route_points_repeated_points_are_dropped():
     route = Route((line(A, B, B), line((100.0, 0.01), C)))
     assert route.points.tolist() == [list(A), list(B), list(C)]
+
+
+def test_routes_long_lines_and_chains_are_divided():
+    chain = [CentreLine(np.array([[x, 0.0], [x + 90.0, 0.0]]), 6.0) for x in (0.0, 90.0, 180.0, 270.0)]
+    whole = CentreLine(np.array([[0.0, 50.0], [500.0, 50.0]]), 6.0, name="long")
+    found = routes([*chain, whole], Options(max_length_m=200.0))
+    spans = [(float(route.points[0, 0]), float(route.points[-1, 0])) for route in found]
+    np.testing.assert_allclose(
+        spans, [(0, 180), (180, 360), (0, 500 / 3), (500 / 3, 1000 / 3), (1000 / 3, 500)]
+    )
+    assert found[-1].parts[0].name == "long"
