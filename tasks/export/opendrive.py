@@ -54,33 +54,34 @@ class Road:
     """Name of the OpenCRG file of the same line, relative to the OpenDRIVE file; None if it has none."""
 
 
-def write(
-    file: BinaryIO, roads: Iterable[Road], proj: str, bounds: Bounds, name: str = "", left_hand: bool = False
-) -> None:
+def encode(road: Road, left_hand: bool = False) -> bytes:
+    """Return one road as XML, for `write`; with ``left_hand`` traffic keeps left."""
+    element = _road(road, left_hand)
+    ET.indent(element, level=1)
+    return b"  " + ET.tostring(element, "utf-8") + b"\n"
+
+
+def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, name: str = "") -> None:
     """Write roads, one after the other, to a file.
 
     Parameters
     ----------
     file : binary file
-    roads : iterable of Road
-        With different ids.
+    roads : iterable of bytes
+        Roads with different ids, each of `encode`.
     proj : str
         The roads' coordinate system as a PROJ string (`tasks.roads.local_frame.LocalFrame.proj`).
     bounds : tuple of float
         West, south, east and north of the roads (m, in that system).
     name : str
         Name of the database.
-    left_hand : bool
-        Whether traffic keeps left.
     """
     west, south, east, north = map(float, bounds)
     quoted = quoteattr(printable(name))
     header = HEADER.format(name=quoted, proj=proj, west=west, south=south, east=east, north=north)
     file.write(header.encode())
     for road in roads:
-        element = _road(road, left_hand)
-        ET.indent(element, level=1)
-        file.write(b"  " + ET.tostring(element, "utf-8") + b"\n")
+        file.write(road)
     file.write(FOOTER.encode())
 
 

@@ -102,12 +102,11 @@ def assess(
         Figures over the road cells of the core; NaN where the tile or the surface has no such data.
     """
     window, cell = data.grid.window(data.core), data.core.cell
-    classes = support(data, road, clusters, options.agree_m)[window]
+    estimate, classes = cell_errors(data, road, clusters, surface, options)
     on_road = road.mask[window] & (classes != Support.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
     off_dsm, off_dtm = height - data.dsm[window], height - data.dtm[window]
-    estimate = error_estimate(off_dsm, off_dtm, data.dsm[window] - data.dtm[window], kept, classes, cell)
     residuals, to_dtm = _finite(off_dsm[kept]), _finite(off_dtm[on_road])
     figures = {
         "residual_median_m": _quantile(residuals, 50),
@@ -132,6 +131,22 @@ def assess(
     if not kept.any():
         flags = [NO_ROAD, *flags]
     return Quality(**figures, flags=tuple(flags), support=classes)
+
+
+def cell_errors(
+    data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the estimated error (m) and the `Support` of each cell of the core, ``(H, W)``; see `assess`.
+
+    The estimate is NaN beyond the survey.
+    """
+    window = data.grid.window(data.core)
+    classes = support(data, road, clusters, options.agree_m)[window]
+    dsm, dtm = data.dsm[window], data.dtm[window]
+    kept = road.mask[window] & clusters.mask[window] & np.isfinite(dsm) & (classes != Support.NONE)
+    height = surface.lattice(data.core.eastings, data.core.northings)
+    estimate = error_estimate(height - dsm, height - dtm, dsm - dtm, kept, classes, data.core.cell)
+    return np.where(classes == Support.NONE, np.nan, estimate), classes
 
 
 def error_estimate(

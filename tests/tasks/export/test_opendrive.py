@@ -46,9 +46,10 @@ def road(
     )
 
 
-def written(*roads: opendrive.Road, **options: object) -> bytes:
+def written(*roads: opendrive.Road, left_hand: bool = False, **options: object) -> bytes:
     file = io.BytesIO()
-    opendrive.write(file, roads, PROJ, (-100.0, -50.0, 300.0, 400.0), **options)
+    encoded = (opendrive.encode(road, left_hand) for road in roads)
+    opendrive.write(file, encoded, PROJ, (-100.0, -50.0, 300.0, 400.0), **options)
     return file.getvalue()
 
 
@@ -217,7 +218,8 @@ def test_write_roads_are_single_and_streamed():
 
     line = reference()
     file = File()
-    opendrive.write(file, (road(line, name=str(k)) for k in range(3)), PROJ, (0.0, 0.0, 1.0, 1.0))
+    roads = (opendrive.encode(road(line, name=str(k))) for k in range(3))
+    opendrive.write(file, roads, PROJ, (0.0, 0.0, 1.0, 1.0))
     assert max(asked) == 1
     roads = ET.fromstring(file.getvalue()).findall("road")
     assert [(each.attrib["id"], each.attrib["junction"], each.find("link")) for each in roads] == [
