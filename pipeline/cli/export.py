@@ -25,7 +25,7 @@ def export(
             "--format",
             metavar="NAME",
             help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm, "
-            "mosaic.",
+            "crg, xodr, lines, mosaic.",
             rich_help_panel=options.OUTPUTS,
         ),
     ],
@@ -84,6 +84,24 @@ def export(
             rich_help_panel=options.OUTPUTS,
         ),
     ] = False,
+    roads: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
+    roads_layer: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Layer of --roads, if it has several.", rich_help_panel=options.INPUTS
+        ),
+    ] = None,
+    left_hand: Annotated[
+        bool,
+        typer.Option("--left-hand", help="Traffic keeps left, for xodr.", rich_help_panel=options.INPUTS),
+    ] = False,
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
@@ -107,7 +125,10 @@ def export(
     from flexroad.pipeline.monitor.progress import StepProgress
 
     datum = _datum(vertical, geoid, height_offset)
-    chosen = Options(datum, compress, resolution, nodes, drape)
+    if roads_layer and not roads:
+        raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
+    lines = None if roads is None else str(roads)
+    chosen = Options(datum, compress, resolution, nodes, drape, lines, roads_layer, left_hand)
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)

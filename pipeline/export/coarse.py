@@ -83,6 +83,11 @@ class Branch:
     folder: str
 
     @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"coarse mesh {self.id}"
+
+    @property
     def fingerprint(self) -> str:
         """Name of the mesh by what it is made of."""
         made_of = [(row["record"], row["digest"], row["error_m"]) for row in self.parts]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from hashlib import sha256
 from importlib.metadata import version
@@ -52,16 +53,20 @@ def export(
     Raises
     ------
     ConfigError
-        If a format is unknown or needs a datum, no tile has the photo that is wanted, a tile's results cannot
-        be read, or the folder is in use.
+        If a format is unknown, needs a datum or centre lines, no tile has the photo that is wanted, a tile's
+        results cannot be read, or the folder is in use.
     ClusterLost
         If the workers are gone; the same command goes on.
     OSError
         If a file cannot be written.
     """
     chosen = check_formats(formats, options)
+    options = replace(options, formats=frozenset(chosen))
     if options.drape:
         check_photos(source.tiles)
+    for kind in chosen.values():
+        if kind.check:
+            kind.check(source, options)
     with held(out, source.run, notify):
         written = _earlier(out, source, options, chosen, notify)
         for name, kind in chosen.items():

@@ -11,13 +11,15 @@ from typing import Any
 
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import height_fields, mosaic, per_tile, tiles3d
+from flexroad.pipeline.export import along_roads, height_fields, mosaic, per_tile, road_lines, tiles3d
 from flexroad.pipeline.export.joined import write_joined
+from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
+from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
+from flexroad.tasks.export import road_lines as line_file
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
 """Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
@@ -31,9 +33,11 @@ class Format:
     write: Write
     version: int
     precision_m: float | None
-    """Largest distance of a point from the run's mesh or surface (m); None if each file says its own."""
+    """Largest distance of a point from the run's mesh or surface (m); None if its files or figures say it."""
     needs_datum: bool = False
     """Whether heights above the ellipsoid are needed."""
+    check: Callable[[Source, Options], object] | None = None
+    """Raises an error, before anything is written, if the format cannot be."""
 
 
 def write_landxml(
@@ -94,6 +98,10 @@ def _per_tile(title: str, version: int, encode: Encode, precision_m: float | Non
     return Format(title, partial(_write_each, version, encode), version, precision_m)
 
 
+def _along_roads(title: str, version: int, write: Write) -> Format:
+    return Format(title, write, version, None, check=network)
+
+
 FORMATS = {
     "3dtiles": Format("3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True),
     "landxml": Format("LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001),
@@ -105,5 +113,8 @@ FORMATS = {
     "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
     "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4),
+    "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
+    "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
+    "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),
 }
 """By the name on the command line."""

@@ -22,3 +22,11 @@ class Options:
     """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""
     drape: bool = False
     """Whether meshes of 3D Tiles and OBJ have the orthophoto, also if those of the run have none."""
+    roads: str | None = None
+    """File of centre lines for formats along roads; None for the roads of the run's catalog."""
+    roads_layer: str | None = None
+    """Layer of that file; needed if it has several."""
+    left_hand: bool = False
+    """Whether traffic keeps left."""
+    formats: frozenset[str] = frozenset()
+    """Names of the formats that are written together: some refer to files of others."""

@@ -1,8 +1,9 @@
-"""Files of an export that belong to one tile, or one area, each, written by workers.
+"""Files of an export that belong to one tile, area or road each, written by workers.
 
-A file ``.pieces/ID.json`` names what a tile's files were made of, and is written last: an interrupted export
-goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier export had
-and this one does not have are removed: a folder has one export, and its manifest counts what is there.
+A file ``.pieces/ID.json`` names what the files of a tile were made of, and is written last: an interrupted
+export goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier
+export had and this one does not have are removed: a folder has one export, and its manifest counts what is
+there.
 """
 
 from __future__ import annotations
@@ -12,17 +13,20 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from pathlib import Path
 from typing import Any, Protocol
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, listing, parse_location, read, remove, stat, write
+from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.tasks.errors import TaskError
 
 MARKERS = ".pieces"
+"""Folder of the markers."""
 Row = dict[str, Any]
 """What the files of the whole run need of a tile, as JSON values."""
 
@@ -37,11 +41,16 @@ class Piece:
 
 
 class Item(Protocol):
-    """What files are made of: a finished tile, or an area."""
+    """What files are made of: a finished tile, an area, or a road."""
 
     @property
     def id(self) -> str:
-        """Id of the tile or area; unique within an export."""
+        """Id of the tile, area or road; unique within an export."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
         ...
 
     @property
@@ -85,7 +94,7 @@ def write_pieces(
     Parameters
     ----------
     group : str
-        Name of what the tiles or areas have in common, if a format has several kinds of them.
+        Name of what the items have in common, if a format has several kinds of them.
 
     Raises
     ------
@@ -128,6 +137,33 @@ def figures(rows: Iterable[Row]) -> dict[str, Any]:
     return ({"error_m": max(errors)} if errors else {}) | {"notes": said}
 
 
+def write_whole(folder: Location, name: str, key: str, fill: Callable[[Path], None]) -> None:
+    """Write one file over all pieces, unless it exists and was made with the same key.
+
+    Parameters
+    ----------
+    key : str
+        Fingerprint of its content.
+    fill : callable
+        Writes the file to a local path.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    marker, file = folder / f".{name}.json", stat(folder / name)
+    try:
+        if file is not None and json.loads(read(marker)) == {"key": key, "size": file.size}:
+            return
+    except (OSError, ValueError):
+        pass
+    with atomic_file(folder / name) as local:
+        fill(local)
+        size = local.stat().st_size
+    write(marker, json.dumps({"key": key, "size": size}).encode())
+
+
 def _write(job: Job) -> tuple[Row, str]:
     """Write the files of a tile; return its row, or the reason why it has none."""
     folder = parse_location(job.folder)
@@ -141,15 +177,15 @@ def _write(job: Job) -> tuple[Row, str]:
         marker = json.dumps({"key": job.key, "sizes": sizes, "row": piece.row})
         write(_marker(folder, job.group, job.tile.id), marker.encode())
     except OSError as error:
-        return {}, f"tile {job.tile.id}: {error}; correct that, and the same command goes on"
+        return {}, f"{job.tile.label}: {error}; correct that, and the same command goes on"
     except (ConfigError, TaskError, CatalogError) as error:
-        name, reason = f"tile {job.tile.id}: ", str(error)
+        name, reason = f"{job.tile.label}: ", str(error)
         return {}, reason if reason.startswith(name) else name + reason
     return piece.row, ""
 
 
 def _lost(job: Job, reason: str) -> tuple[Row, str]:
-    return {}, f"tile {job.tile.id}: {reason}"
+    return {}, f"{job.tile.label}: {reason}"
 
 
 def _markers(folder: Location, group: str) -> Location:

@@ -41,6 +41,11 @@ class FinishedTile:
         return self.tile.id
 
     @property
+    def label(self) -> str:
+        """Name of the tile in messages."""
+        return f"tile {self.id}"
+
+    @property
     def fingerprint(self) -> str:
         """Name of the mesh by what it was made of."""
         return self.state.nodes["sample"]

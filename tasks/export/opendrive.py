@@ -58,7 +58,8 @@ def encode(road: Road, left_hand: bool = False) -> bytes:
     """Return one road as XML, for `write`; with ``left_hand`` traffic keeps left."""
     element = _road(road, left_hand)
     ET.indent(element, level=1)
-    return b"  " + ET.tostring(element, "utf-8") + b"\n"
+    text: bytes = ET.tostring(element, "utf-8")
+    return b"  " + text + b"\n"
 
 
 def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, name: str = "") -> None:

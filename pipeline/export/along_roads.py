@@ -1,0 +1,228 @@
+"""Roads of an export as OpenCRG and OpenDRIVE: one route after the other, by workers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexroad.catalog.storage.paths import Location, absolute, read
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export.ground import Ground, RunName, TileName
+from flexroad.pipeline.export.network import Network, network
+from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.pieces import (
+    MARKERS,
+    Encode,
+    Piece,
+    Row,
+    write_pieces,
+    write_whole,
+)
+from flexroad.pipeline.export.road_report import report, row, with_note
+from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.export import opencrg, opendrive
+from flexroad.tasks.roads import height_grid as grids
+from flexroad.tasks.roads import profiles as profiling
+from flexroad.tasks.roads import reference_line as lines
+from flexroad.tasks.roads.height_grid import HeightAt, HeightGrid
+from flexroad.tasks.roads.local_frame import LocalFrame
+from flexroad.tasks.roads.reference_line import ReferenceLine
+from flexroad.tasks.roads.routes import Route
+from flexroad.tasks.types import Floats
+
+VERSION = 1
+"""Of the roads themselves: their division, lines and grids."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all roads of an export have in common."""
+
+    run: RunName
+    frame: LocalFrame
+    vertical: str | None
+    left_hand: bool = False
+    crg: str | None = None
+    """Folder of the OpenCRG files, relative to the OpenDRIVE file; None if it refers to none."""
+
+    @classmethod
+    def of(cls, source: Source, roads: Network, **more: Any) -> Work:
+        """Return the work of an export."""
+        run = RunName(str(absolute(source.run.path)), source.variant, source.run.allowed)
+        return cls(run, roads.frame, source.vertical, **more)
+
+
+@dataclass(frozen=True, eq=False)
+class RouteUnit:
+    """One route of an export, with the tiles that it touches."""
+
+    number: int
+    """From 1."""
+    route: Route
+    tiles: tuple[TileName, ...]
+
+    @property
+    def id(self) -> str:
+        """Number of the route."""
+        return str(self.number)
+
+    @property
+    def label(self) -> str:
+        """Name of the route in messages."""
+        return f"road {self.number}"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Name of its lines and of the surfaces below."""
+        text = sha256(repr(self.tiles).encode())
+        for part in self.route.parts:
+            text.update(repr((part.width_m, part.lanes, part.oneway, part.name)).encode())
+            text.update(part.points.tobytes())
+        return text.hexdigest()
+
+    def height(self, work: Work) -> HeightAt:
+        """Return the surface in the local frame."""
+        ground = Ground(work.run, self.tiles)
+
+        def height(x: Floats, y: Floats) -> Floats:
+            return ground.height(*work.frame.to_run(x, y))
+
+        return height
+
+    def road_id(self, part: int) -> int:
+        """Return the number of a road: OpenDRIVE's readers want whole numbers."""
+        return self.number * 1000 + part
+
+
+def units(roads: Network, tiles: Iterable[FinishedTile]) -> Iterator[RouteUnit]:
+    """Yield each route as soon as its last tile has passed."""
+    waiting: defaultdict[int, list[int]] = defaultdict(list)
+    names: dict[int, TileName] = {}
+    for number, touched in enumerate(roads.tiles):
+        if len(touched):
+            waiting[int(touched[-1])].append(number)
+    for index, tile in enumerate(tiles):
+        names[index] = TileName.of(tile)
+        for number in waiting.pop(index, ()):
+            touching = tuple(names[int(k)] for k in roads.tiles[number])
+            yield RouteUnit(number + 1, roads.routes[number], touching)
+
+
+def write_crg(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write an OpenCRG file per road and the report; return the summary."""
+    roads = network(source, options)
+    rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
+    summary = report(folder, rows, roads)
+    error = summary["crg_max_mm"]
+    return with_note(summary, f"misses the surface by at most {error:.1f} mm" if error is not None else "")
+
+
+def write_xodr(
+    source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
+) -> dict[str, Any]:
+    """Write all roads as one OpenDRIVE file, which refers to the OpenCRG files if there are any."""
+    roads = network(source, options)
+    crg = "../crg/" if "crg" in options.formats else None
+    work = Work.of(source, roads, left_hand=options.left_hand, crg=crg)
+    rows, key = write_units(opendrive.VERSION, xodr_piece, work, roads, tiles, folder, executor)
+    summary = report(folder, rows, roads)
+    edges = np.array([road["bounds"] for row in rows for road in row["roads"]])
+    bounds = (*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0))
+
+    def fill(local: Path) -> None:
+        with local.open("wb") as file:
+            texts = (read(folder / _fragment(row["route"])) for row in rows if row["roads"])
+            opendrive.write(file, texts, roads.frame.proj, bounds, source.run.path.name)
+
+    write_whole(folder, f"{source.run.path.name}{opendrive.NAME}", key, fill)
+    mean, largest = summary["profiles_mean_mm"], summary["profiles_max_mm"]
+    missed = f"misses the surface by {mean:.0f} mm on average, at most {largest:.0f} mm, without OpenCRG"
+    return with_note(summary, missed if mean is not None else "")
+
+
+def write_units(
+    version: int,
+    encode: Encode,
+    work: Work,
+    roads: Network,
+    tiles: Iterable[FinishedTile],
+    folder: Location,
+    executor: Executor,
+) -> tuple[list[Row], str]:
+    """Write the files of each route; return their rows, in order, and a fingerprint of all of them."""
+    whole = sha256(f"{version} {VERSION} {work}".encode())
+
+    def counted() -> Iterator[RouteUnit]:
+        for unit in units(roads, tiles):
+            whole.update(f"{unit.id} {unit.fingerprint}".encode())
+            yield unit
+
+    versions = version * 1000 + VERSION
+    rows = write_pieces(counted(), folder, versions, encode, work, executor)
+    return sorted(rows, key=lambda row: int(row["route"])), whole.hexdigest()
+
+
+def crg_piece(unit: RouteUnit, work: Work) -> Piece:
+    """Return the OpenCRG files of a route."""
+    files, rows = dict[str, bytes](), list[Row]()
+    grids_of, problem = _grids(unit, work)
+    for part, (grid, height) in enumerate(grids_of):
+        road = unit.road_id(part)
+        heights = work.vertical or "as in the run"
+        comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
+        files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
+        rows.append(row(road, grid, height, profiling.profiles(grid, profiling.Options())))
+    return Piece(files, _route_row(unit, rows, problem))
+
+
+def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
+    """Return the roads of a route as XML of OpenDRIVE."""
+    texts, rows = list[bytes](), list[Row]()
+    grids_of, problem = _grids(unit, work)
+    for part, (grid, height) in enumerate(grids_of):
+        road = unit.road_id(part)
+        fitted = profiling.profiles(grid, profiling.Options())
+        crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
+        texts.append(opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg), work.left_hand))
+        rows.append(row(road, grid, height, fitted))
+    return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
+
+
+def _fragment(route: int) -> str:
+    return f"{MARKERS}/{route}.xml"
+
+
+def _grids(unit: RouteUnit, work: Work) -> tuple[list[tuple[HeightGrid, HeightAt]], str]:
+    """Return the grids of a route's roads, and why it has none."""
+    height = unit.height(work)
+    line, problem = reference_line(unit)
+    if line is None:
+        return [], problem
+    parts = lines.usable(line, height(line.x, line.y), lines.Options())
+    return [(grids.height_grid(part, height, grids.Options()), height) for part in parts], ""
+
+
+def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
+    """Return the line of a route, or why it has none."""
+    options = lines.Options()
+    try:
+        line = lines.reference_line(unit.route, options)
+    except TaskError as error:
+        return None, str(error)
+    return line, f"shorter than {options.min_length_m:g} m" if line is None else ""
+
+
+def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
+    if not rows and not problem:
+        problem = "no part of it has a surface for long enough"
+    return {"route": unit.number, "roads": rows, "problem": problem}

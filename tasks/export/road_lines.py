@@ -1,0 +1,120 @@
+"""Roads as lines in space, with grade and crossfall for each metre, as a GeoPackage for GIS programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.quality.support import Support
+from flexroad.tasks.types import Floats
+
+VERSION = 1
+NAME = "_roads.gpkg"
+MEDIA_TYPE = "application/geopackage+sqlite3"
+
+ROADS, SEGMENTS = "roads", "segments"
+"""Layers of the file."""
+BATCH = 50_000
+"""Number of segments that are written at once."""
+SUPPORT = {Support.MEASURED: "measured", Support.DTM: "dtm", Support.INFERRED: "inferred"}
+"""Values of the column ``support``."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoadLine:
+    """One road of ``n`` segments."""
+
+    road: Mapping[str, str | int | float | None]
+    """Its columns in the layer ``roads``; the first one is its id."""
+    points: Floats
+    """``(n + 1, 3)``: easting, northing, height (m)."""
+    segments: Mapping[str, Floats]
+    """Columns of the layer ``segments``, ``(n,)`` each."""
+    support: NDArray[np.uint8]
+    """Class of each segment by `Support`, ``(n,)``."""
+
+
+def write(path: Path, roads: Iterable[RoadLine], crs: str) -> None:
+    """Write roads to a new GeoPackage.
+
+    The layer ``roads`` has a line per road, ``segments`` a line per metre. Numbers that are not known are
+    null.
+
+    Parameters
+    ----------
+    path : Path
+    roads : iterable of RoadLine
+        At least one; all with the same columns.
+    crs : str
+        CRS of the points, compound if that of the heights is known.
+
+    Raises
+    ------
+    TaskError
+        If the file cannot be written.
+    """
+    batch: list[RoadLine] = []
+    new = True
+    for road in roads:
+        batch.append(road)
+        if sum(len(each.support) for each in batch) >= BATCH:
+            _append(path, batch, crs, new)
+            batch, new = [], False
+    if batch:
+        _append(path, batch, crs, new)
+
+
+def _append(path: Path, batch: list[RoadLine], crs: str, new: bool) -> None:
+    lines = shapely.linestrings(
+        np.concatenate([road.points for road in batch]),
+        indices=np.repeat(np.arange(len(batch)), [len(road.points) for road in batch]),
+    )
+    columns = {name: [road.road[name] for road in batch] for name in batch[0].road}
+    _table(path, ROADS, lines, {name: _column(values) for name, values in columns.items()}, crs, new)
+    pairs = np.concatenate([np.stack([road.points[:-1], road.points[1:]], axis=1) for road in batch])
+    key = next(iter(columns))
+    numbers = {name: np.concatenate([road.segments[name] for road in batch]) for name in batch[0].segments}
+    support = np.concatenate([road.support for road in batch])
+    names = np.array([SUPPORT.get(Support(kind)) for kind in range(len(Support))], object)
+    owner = np.repeat(_column(columns[key]), [len(road.support) for road in batch])
+    values = {f"road_{key}": owner, **numbers, "support": names[support]}
+    _table(path, SEGMENTS, shapely.linestrings(pairs), values, crs, new)
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    """Return a column of numbers, with NaN for None, or of texts."""
+    if any(isinstance(value, str) for value in values):
+        return np.array(values, object)
+    if all(isinstance(value, int) for value in values):
+        return np.array(values, np.int64)
+    return np.array([np.nan if value is None else value for value in values], np.float64)
+
+
+def _table(
+    path: Path, layer: str, lines: NDArray[np.object_], columns: Mapping[str, Any], crs: str, new: bool
+) -> None:
+    from pyogrio import raw
+    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, GeometryError
+
+    try:
+        raw.write(
+            path,
+            geometry=shapely.to_wkb(lines, output_dimension=3),
+            field_data=list(columns.values()),
+            fields=np.array(list(columns), object),
+            layer=layer,
+            driver="GPKG",
+            geometry_type="LineString Z",
+            crs=crs,
+            append=not new,
+            nan_as_null=True,
+        )
+    except (DataLayerError, DataSourceError, FeatureError, GeometryError) as error:
+        raise TaskError(f"{path} cannot be written: {error}; check the disk") from error
