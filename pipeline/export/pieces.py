@@ -152,7 +152,7 @@ def write_whole(folder: Location, name: str, key: str, fill: Callable[[Path], No
     OSError
         If it cannot be written.
     """
-    marker, file = folder / f".{name}.json", stat(folder / name)
+    marker, file = folder / MARKERS / f"{name}.whole", stat(folder / name)
     try:
         if file is not None and json.loads(read(marker)) == {"key": key, "size": file.size}:
             return
