@@ -44,6 +44,11 @@ class Leaf:
         return self.tile.id
 
     @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return self.tile.label
+
+    @property
     def own(self) -> bool:
         """Whether the GLB file of the run is taken, if there is one."""
         return self.tile.place.pattern.export.texture or not self.drape
