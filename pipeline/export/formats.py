@@ -9,12 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.storage.paths import Location, write
+from flexroad.catalog.storage.paths import Location, remove, write
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export import along_roads, height_fields, mosaic, per_tile, road_lines, tiles3d
 from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.photo import Photographed
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.graph.borders import has_borders
@@ -76,9 +77,13 @@ def write_cityjson(
 def write_obj(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
-    """Write the file of materials that all OBJ files share, then the mesh of each tile as OBJ."""
-    write(folder / per_tile.MATERIALS, obj.encode_materials())
-    return _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
+    """Write each mesh as OBJ: all with one file of materials, or each with its own and a photo."""
+    if not options.drape:
+        write(folder / per_tile.MATERIALS, obj.encode_materials())
+        return _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
+    remove(folder / per_tile.MATERIALS)
+    items, encode = map(Photographed, tiles), per_tile.draped_obj_piece
+    return figures(write_pieces(items, folder, obj.VERSION, encode, source.vertical, executor))
 
 
 def _write_each(

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.pieces import Piece, write_pieces
+from flexroad.pipeline.export.pieces import Piece, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import heightfield
@@ -21,6 +22,7 @@ from flexroad.tasks.export.heightfield import HeightField
 VERSION = heightfield.VERSION
 SPACING_M = 1.0
 """Largest distance of nodes (m)."""
+NO_LIMITS = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Scene:
 
 def write_fields(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
-) -> None:
-    """Write the height field of each tile in several formats.
+) -> dict[str, Any]:
+    """Write the height field of each tile in several formats; return the figures of all.
 
     Raises
     ------
@@ -46,24 +48,36 @@ def write_fields(
         If a tile's results cannot be read, or it has no heights.
     """
     own = Scene(source.vertical, options.nodes)
-    scene = Scene(own.vertical, own.nodes, _common_limits(source, own))
-    for _ in write_pieces(tiles, folder, VERSION, piece, scene, executor):
-        pass
+    scene = Scene(own.vertical, own.nodes, _common_limits(source, own, executor))
+    return figures(write_pieces(tiles, folder, VERSION, piece, scene, executor))
 
 
-def _common_limits(source: Source, scene: Scene) -> tuple[float, float]:
+def _common_limits(source: Source, scene: Scene, executor: Executor) -> tuple[float, float]:
     """Return whole metres below the lowest and above the highest node of all fields.
 
     With whole metres another tile rarely changes them, and the files of the others remain valid.
     """
     low, high = math.inf, -math.inf
-    for tile in source.finished():
-        try:
-            field = _field(tile, scene)
-        except TaskError as error:
-            raise ConfigError(f"tile {tile.id}: {error}") from error
-        low, high = min(low, field.low), max(high, field.high)
+    for limits, failure in executor.map(partial(_limits, scene), source.finished(), _lost):
+        if failure:
+            raise ConfigError(failure)
+        low, high = min(low, limits[0]), max(high, limits[1])
     return float(math.floor(low)), float(max(math.ceil(high), math.floor(low) + 1))
+
+
+def _limits(scene: Scene, tile: FinishedTile) -> tuple[tuple[float, float], str]:
+    """Return the lowest and highest node of a tile, or the reason why it has none."""
+    try:
+        field = _field(tile, scene)
+    except ConfigError as error:
+        return NO_LIMITS, str(error)
+    except TaskError as error:
+        return NO_LIMITS, f"{tile.label}: {error}"
+    return (field.low, field.high), ""
+
+
+def _lost(tile: FinishedTile, reason: str) -> tuple[tuple[float, float], str]:
+    return NO_LIMITS, f"{tile.label}: {reason}"
 
 
 def piece(tile: FinishedTile, scene: Scene) -> Piece:
@@ -75,7 +89,8 @@ def piece(tile: FinishedTile, scene: Scene) -> Piece:
         heightfield.NAME_MUJOCO: heightfield.encode_mujoco(field),
         heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.tile.grid.crs, scene.vertical),
     }
-    return Piece({f"{safe_name(tile.id)}{name}": data for name, data in files.items()}, {})
+    named = {f"{safe_name(tile.id)}{name}": data for name, data in files.items()}
+    return Piece(named, {"height_error_m": field.step_m / 2})
 
 
 def _field(tile: FinishedTile, scene: Scene) -> HeightField:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.joined import part_name
+from flexroad.pipeline.export.photo import Photographed, texture_of
 from flexroad.pipeline.export.pieces import Piece
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
@@ -14,6 +18,7 @@ from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
+NO_PHOTO = "no orthophoto, in plain colours"
 
 
 @dataclass(frozen=True)
@@ -27,25 +32,57 @@ class CityPlace:
 
 def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
     """Return the part of a LandXML file."""
-    return Piece({part_name(tile.id): landxml.part(tile.mesh, project.joined).encode()}, {})
+    part = landxml.part(tile.mesh, project.joined).encode()
+    return Piece({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
 
 
 def cityjson_part(tile: FinishedTile, place: CityPlace) -> Piece:
     """Return the lines of a CityJSON file."""
     lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
-    return Piece({part_name(tile.id): lines}, {})
+    return Piece({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
 
 
 def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
     """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
+    return _obj(tile, vertical, MATERIALS, None)
+
+
+def draped_obj_piece(item: Photographed, vertical: str | None) -> Piece:
+    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    tile, name = item.tile, safe_name(item.id)
+    image = texture_of(tile).image
+    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
+    piece = _obj(tile, vertical, materials, image.bounds if image else None)
+    if image is None:
+        return Piece({**piece.files, materials: obj.encode_materials()}, piece.row | {"note": NO_PHOTO})
+    return Piece({**piece.files, materials: obj.encode_materials(photo), photo: image.jpeg}, piece.row)
+
+
+def _obj(tile: FinishedTile, vertical: str | None, materials: str, photo: Bounds | None) -> Piece:
     mesh, name = tile.mesh, safe_name(tile.id)
     place = obj.georeference(mesh, vertical)
     files = {
-        f"{name}{obj.NAME}": obj.encode(mesh, MATERIALS, vertical),
+        f"{name}{obj.NAME}": obj.encode(mesh, materials, vertical, photo),
         f"{name}.json": place.sidecar(obj.AXES),
         f"{name}.prj": place.prj(),
     }
-    return Piece(files, {})
+    return Piece(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+
+
+def _error_m(tile: FinishedTile, unit_m: float) -> float:
+    """Return the largest vertical distance of a mesh's vertices from the surface (m).
+
+    Parameters
+    ----------
+    unit_m : float
+        Of this unit the coordinates of a file are multiples (m).
+    """
+    mesh = tile.mesh
+    points = np.rint((mesh.vertices + mesh.origin) / unit_m) * unit_m
+    west, south, east, north = tile.tile.grid.bounds
+    x, y, z = points.T
+    heights = tile.surface.height(np.clip(x, west, east), np.clip(y, south, north))
+    return float(np.nanmax(np.abs(heights - z), initial=0.0))
 
 
 def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:

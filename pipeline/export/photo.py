@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,28 @@ def photo_state(tile: FinishedTile) -> str:
     layer = tile.tile.layer("dop")
     reaching = layer.reaching(tile.tile.grid.bounds) if layer else None
     return str([(str(path), stat(path)) for path in tile.tile.paths(reaching)]) if reaching else ""
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """A finished tile whose files have its photo; sent to a worker."""
+
+    tile: FinishedTile
+
+    @property
+    def id(self) -> str:
+        """Id of the tile."""
+        return self.tile.id
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return self.tile.label
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of its files by what they are made of."""
+        return f"{self.tile.fingerprint} {photo_state(self.tile)}"
 
 
 def texture_of(tile: FinishedTile) -> TileTexture:

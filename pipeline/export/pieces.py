@@ -128,13 +128,13 @@ def write_pieces(
 
 
 def figures(rows: Iterable[Row]) -> dict[str, Any]:
-    """Return what the manifest says of all tiles: the largest ``error_m``, the number of each ``note``."""
+    """Return what the manifest says of all tiles: the largest error, and the number of each note."""
     errors, notes = list[float](), Counter[str]()
     for row in rows:
-        errors += [row["error_m"]] if "error_m" in row else []
+        errors += [row["height_error_m"]] if "height_error_m" in row else []
         notes.update([row["note"]] if row.get("note") else [])
     said = [f"{count(number, 'tile')}: {note}" for note, number in sorted(notes.items())]
-    return ({"error_m": max(errors)} if errors else {}) | {"notes": said}
+    return ({"height_error_m": max(errors)} if errors else {}) | {"notes": said}
 
 
 def write_whole(folder: Location, name: str, key: str, fill: Callable[[Path], None]) -> None:

@@ -27,6 +27,8 @@ MEDIA_TYPE = "model/obj"
 MEDIA_TYPE_MATERIALS = "model/mtl"
 
 AXES = "x east, y north, z up; relative to origin; metres"
+DECIMALS = 4
+"""Decimals of coordinates (m): they are rounded to 0.05 mm."""
 COLOURS = {"road": (0.23, 0.23, 0.25), "terrain": (0.77, 0.745, 0.68)}
 """Red, green and blue of the classes without a texture, 0 to 1, sRGB."""
 
