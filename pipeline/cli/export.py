@@ -25,7 +25,7 @@ def export(
             "--format",
             metavar="NAME",
             help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm, "
-            "crg, xodr, lines, mosaic.",
+            "crg, xodr, lines, mosaic, pmtiles.",
             rich_help_panel=options.OUTPUTS,
         ),
     ],
@@ -72,7 +72,7 @@ def export(
         typer.Option(
             min=0.01,
             metavar="METRES",
-            help="Cell size of mosaic; default: that of the run.",
+            help="Cell size of mosaic and pmtiles; default: that of the run.",
             rich_help_panel=options.OUTPUTS,
         ),
     ] = None,

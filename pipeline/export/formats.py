@@ -11,7 +11,15 @@ from typing import Any
 
 from flexroad.catalog.storage.paths import Location, remove, write
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import along_roads, height_fields, mosaic, per_tile, road_lines, tiles3d
+from flexroad.pipeline.export import (
+    along_roads,
+    height_fields,
+    mosaic,
+    per_tile,
+    road_lines,
+    terrain_tiles,
+    tiles3d,
+)
 from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
@@ -117,6 +125,7 @@ FORMATS = {
     ),
     "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
+    "pmtiles": Format("Map tiles of heights", terrain_tiles.write_tiles, terrain_tiles.VERSION, 0.002),
     "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),

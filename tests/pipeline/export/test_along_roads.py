@@ -53,7 +53,7 @@ def exported(city, streets):
 def surface_heights(city, easting, northing):
     height = np.full(np.shape(easting), np.nan)
     for tile in select(city).finished():
-        west, south, east, north = tile.graph.tile.grid.bounds
+        west, south, east, north = tile.tile.grid.bounds
         inside = (west <= easting) & (easting <= east) & (south <= northing) & (northing <= north)
         height[inside] = tile.surface.height(easting[inside], northing[inside])
     return height

@@ -78,7 +78,7 @@ def truth(city, places):
     _, _, easting, northing, _ = places[0].T
     height = np.full(POINTS, np.nan)
     for tile in select(city).finished():
-        west, south, east, north = tile.graph.tile.grid.bounds
+        west, south, east, north = tile.tile.grid.bounds
         inside = (west <= easting) & (easting <= east) & (south <= northing) & (northing <= north)
         height[inside] = tile.surface.height(easting[inside], northing[inside])
     assert np.isfinite(height).all()
