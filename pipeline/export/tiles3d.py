@@ -98,25 +98,31 @@ def write_tilesets(
     nodes = [Node(row) for row in write_pieces(leaves, folder, VERSION, leaf_piece, place, executor)]
     nodes.sort(key=lambda node: str(node.row["id"]))
     bare = [node.row["id"] for node in nodes if node.row["bare"]]
-    for number in range(len(LEVELS)):
-        nodes = _raised(nodes, number, folder, place, executor)
-    children, blocks = [], set[str]()
-    for block in nodes:
+    children, named = [], set[str]()
+    for block in blocks(nodes, folder, place, executor):
         column, line = _cell(block, len(LEVELS) - 1)
         name, entry = f"blocks/{column}_{line}.json", block.entry()
         volume = entry["boundingVolume"]
         write(folder / name, _encoded(tiles3d.tileset(entry, tiles3d.extent_m(volume["region"]))))
         error_m = block.row["error_m"]
         children.append({"boundingVolume": volume, "geometricError": error_m, "content": {"uri": name}})
-        blocks.add(name)
+        named.add(name)
     for name in listing(folder / "blocks"):
-        if f"blocks/{name}" not in blocks:
+        if f"blocks/{name}" not in named:
             remove(folder / "blocks" / name)
     whole = tiles3d.extent_m(tiles3d.around([child["boundingVolume"]["region"] for child in children]))
     extras = {"crs": source.crs, "datum": options.datum.text}
     tileset = tiles3d.tileset(tiles3d.group(children, whole), whole, **extras)
     write(folder / "tileset.json", _encoded(tileset))
     return {"notes": [_without_photo(bare)] if bare else []}
+
+
+def blocks(nodes: Sequence[Node], folder: Location, place: Place, executor: Executor) -> list[Node]:
+    """Write the coarse meshes above tiles; return the coarsest, one per area of the last level."""
+    raised = list(nodes)
+    for number in range(len(LEVELS)):
+        raised = _raised(raised, number, folder, place, executor)
+    return raised
 
 
 def _raised(

@@ -26,7 +26,7 @@ ASSET = {"version": "1.1", "generator": "FlexRoad"}
 MARGIN_M = 1.0
 """Height added below and above a tile's box (m): bounding volumes must contain all vertices."""
 EDGE_M = 0.1
-"""Length added around a region (m): for the residual of transforms, and for edges that are no meridians."""
+"""Length added around a region (m): for residuals of transforms, float32, and edges that are no meridians."""
 RADIUS_M = 6_378_137.0
 """Of the Earth (m), for lengths of angles."""
 
@@ -200,7 +200,8 @@ def _columns(matrix: Floats) -> tuple[float, ...]:
 
 
 def _region(longitude: Floats, latitude: Floats, height: Floats) -> tuple[float, ...]:
-    """Return the region around places on the Earth, with `EDGE_M` in plan."""
+    """Return the region around places on the Earth, with `EDGE_M` on all sides."""
     low, high = np.radians([longitude.min(), latitude.min()]), np.radians([longitude.max(), latitude.max()])
     margin = EDGE_M / RADIUS_M / np.array([np.cos(high[1]), 1.0])
-    return (*(low - margin).tolist(), *(high + margin).tolist(), float(height.min()), float(height.max()))
+    heights = float(height.min()) - EDGE_M, float(height.max()) + EDGE_M
+    return (*(low - margin).tolist(), *(high + margin).tolist(), *heights)

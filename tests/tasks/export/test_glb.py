@@ -11,7 +11,9 @@ from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
 from flexroad.tasks.export import glb
+from flexroad.tasks.meshing.relief import Relief, Sheet, sheet
 from flexroad.tasks.types import Mesh, Orthophoto
+from tests.validators.gltf import gltf_issues
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
 RUN_ORIGIN = (295000.0, 5629000.0, 100.0)
@@ -220,3 +222,50 @@ def test_texture_higher_quality_has_smaller_errors():
     images = [image(glb.encode(hills(), RUN_ORIGIN, glb.texture(photo, quality))) for quality in (20, 90)]
     errors = [np.abs(texels - np.moveaxis(noise, 0, -1)).mean() for texels in images]
     assert errors[1] < errors[0]
+
+
+def test_encode_drops_vertices_without_faces():
+    """Such a vertex has no normal, and glTF wants unit vectors."""
+    mesh = hills(6, road_columns=2)
+    lonely = replace(mesh, vertices=np.concatenate([mesh.vertices, [[5.0, 5.0, 5.0]]]))
+    assert glb.encode(lonely, RUN_ORIGIN) == glb.encode(mesh, RUN_ORIGIN)
+    for node in ("road", "terrain"):
+        normals = attribute(glb.encode(lonely, RUN_ORIGIN), node, "NORMAL")
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+
+
+def coarse(jpeg: bytes) -> tuple[bytes, Sheet]:
+    """Return the GLB of a slope of 3 x 2 cells of 10 m with a skirt of 4 m."""
+    heights = np.add.outer(np.arange(3.0), 2 * np.arange(4.0))
+    made = sheet(Relief((100.0, 200.0, 130.0, 220.0), heights, np.ones((2, 3), bool), 0.5), 4.0)
+    local = made.points - (100, 200, 0)
+    return glb.encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg), made
+
+
+def test_encode_sheet_skirt_has_normals_and_colours_of_the_edge():
+    data, made = coarse(glb.jpeg(np.full((8, 8, 3), 90, np.uint8), 85))
+    position, normal, uv = (attribute(data, "ground", name) for name in ("POSITION", "NORMAL", "TEXCOORD_0"))
+    np.testing.assert_allclose(
+        np.column_stack([position[:, 0], -position[:, 2]]), made.points[:, :2] - (100, 200)
+    )
+    np.testing.assert_allclose(normal, normal[made.top])
+    np.testing.assert_allclose(uv, uv[made.top])
+    # Per cell of 10 m, heights rise by 2 m to the east and by 1 m to the south.
+    slope = np.array([-0.2, 1.0, -0.1])
+    np.testing.assert_allclose(normal, np.tile(slope / np.linalg.norm(slope), (len(normal), 1)), atol=1e-6)
+    np.testing.assert_allclose(uv, np.column_stack([position[:, 0] / 30, 1 + position[:, 2] / 20]), atol=1e-6)
+
+
+def test_encoded_files_have_no_issue_by_the_khronos_validator(tmp_path):
+    image = glb.texture(colour_by_place(0.5), 85)
+    files = {
+        "plain": glb.encode(hills(), RUN_ORIGIN),
+        "road": glb.encode(hills(road_columns=20), RUN_ORIGIN),
+        "textured": glb.encode(hills(), RUN_ORIGIN, image),
+        "coarse": coarse(image.jpeg)[0],
+    }
+    for name, data in files.items():
+        (tmp_path / f"{name}.glb").write_bytes(data)
+    assert gltf_issues(tmp_path.iterdir()) == []
+    (tmp_path / "damaged.glb").write_bytes(files["plain"][:-4])
+    assert gltf_issues([tmp_path / "damaged.glb"])
