@@ -17,13 +17,12 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.output import file_sizes, held, remove_unfinished
+from flexroad.pipeline.export.output import MANIFEST, file_sizes, held, remove_unfinished
 from flexroad.pipeline.export.photo import check_photos
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.errors import TaskError
 
-MANIFEST = "export.json"
 SAME = ("variant", "crs", "tiles", "results")
 """Entries of the manifest that two exports into one folder have in common if both are of the same results."""
 DATUM_REMEDY = (

@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import Location, absolute, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.artefacts import check_writable
+
+MANIFEST = "export.json"
 
 
 @contextmanager
@@ -27,13 +30,15 @@ def held(out: Location, run: Run, notify: Callable[[str], None]) -> Iterator[Non
     ConfigError
         If the folder is the run, its store or inside one of them, or another process writes there.
     OSError
-        If it cannot be written.
+        If it, or its manifest, cannot be written.
     """
     for folder in (run.path, run.store):
         inside = [str(absolute(place)) for place in (out, *out.parents)]
         if str(absolute(folder)) in inside:
             raise ConfigError(f"--output {out} lies in the run ({folder}); choose a folder outside")
     check_writable(out)
+    if isinstance(out, Path):
+        output_file(out / MANIFEST)
     with run_lock(out, notify):
         yield
 

@@ -4,7 +4,6 @@ Faults of a single module are tested in that module's tests; `docs/operations.md
 """
 
 import contextlib
-import ctypes
 import errno
 import json
 import os
@@ -34,6 +33,7 @@ from flexroad.pipeline.run.lock import Owner, run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from tests.dask_processes import wait_for
+from tests.permissions import permissions_enforced
 from tests.whole_run import LIGHT, assert_whole, rows, times
 
 pytestmark = pytest.mark.slow
@@ -256,22 +256,6 @@ def no_file_above(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@contextlib.contextmanager
-def permissions_enforced() -> Iterator[None]:
-    """Enforce file permissions in this thread, also for root, by dropping capabilities."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    header, before = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
-    assert libc.capget(header, before) == 0
-    fewer = (ctypes.c_uint32 * 6)(*before)
-    # The effective bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH.
-    fewer[0] &= ~0b110
-    assert libc.capset(header, fewer) == 0
-    try:
-        yield
-    finally:
-        assert libc.capset(header, before) == 0
 
 
 @pytest.mark.parametrize("database_fits", [False, True])
