@@ -2,13 +2,16 @@
 
 import resource
 import signal
+import subprocess
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import rasterio
-from pyproj import CRS
+from pyproj import CRS, Transformer
 from rio_cogeo import cog_validate
+from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.errors import ConfigError
@@ -18,6 +21,7 @@ from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.source import select
+from tests import validators
 
 NAMES = ("height", "normal", "road", "support")
 FINE_M = 0.1
@@ -160,3 +164,54 @@ def test_full_disk_leaves_no_file(town, written, tmp_path, monkeypatch, part):
     with pytest.raises(OSError, match="height.tif"):
         export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
     assert list((tmp_path / "mosaic").iterdir()) == []
+
+
+def sumo_heights(folder, raster, x, y):
+    """The heights that SUMO's netconvert gives to nodes, NaN where it gives none, and its warnings."""
+    to_degrees = Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True)
+    nodes, edges = ElementTree.Element("nodes"), ElementTree.Element("edges")
+    for number, (east, north) in enumerate(zip(*to_degrees.transform(x, y), strict=True)):
+        ElementTree.SubElement(nodes, "node", id=str(number), x=f"{east:.10f}", y=f"{north:.10f}")
+        if number % 2:
+            ends = {"from": str(number - 1), "to": str(number)}
+            ElementTree.SubElement(edges, "edge", {"id": f"e{number}", "numLanes": "1", **ends})
+    ElementTree.ElementTree(nodes).write(folder / "nodes.xml")
+    ElementTree.ElementTree(edges).write(folder / "edges.xml")
+    command = [validators.program("netconvert"), "-n", "nodes.xml", "-e", "edges.xml", "-o", "net.xml"]
+    command += ["--heightmap.geotiff", raster, "--proj.utm", "--precision", "6"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    heights = np.full(len(x), np.nan)
+    for junction in ElementTree.parse(folder / "net.xml").getroot().iter("junction"):
+        if junction.get("id").isdigit():
+            heights[int(junction.get("id"))] = float(junction.get("z", "nan"))
+    return heights, done.stderr
+
+
+@pytest.mark.parametrize("vertical", [None, "EPSG:7837"])
+def test_sumo_gives_the_nodes_of_a_network_the_heights_of_the_mosaic(town, tmp_path, vertical):
+    source = select(town.path)
+    source.__dict__["vertical"] = vertical
+    export(source, tmp_path, ["mosaic"], Options(), SerialExecutor())
+    raster = tmp_path / "mosaic" / "height.tif"
+    west, south, east, north = town.tiles[0].grid.bounds
+    # A quarter of the nodes lies on the second tile.
+    x, y = np.random.default_rng(0).uniform([west + 1, south + 1], [east - 1, north - 1], (200, 2)).T
+    x[:50] += town.tiles[1].grid.west - west
+    y[:50] += town.tiles[1].grid.south - south
+    heights, said = sumo_heights(tmp_path, raster, x, y)
+    assert "height" not in said
+    with rasterio.open(raster) as file:
+        columns, rows = ~file.transform @ (x, y)
+        between = map_coordinates(file.read(1).astype(float), [rows - 0.5, columns - 0.5], order=1)
+    # SUMO interpolates between the cell centres.
+    assert np.abs(heights - between).max() < 0.005
+    surface, _ = town.at(x, y)
+    assert np.median(np.abs(heights - surface)) < 0.002
+    assert np.abs(heights - surface).max() < 0.03
+    missing = town.tiles[3].grid.bounds
+    heights, said = sumo_heights(
+        tmp_path, raster, np.add(missing[::2], [5, -5]), np.add(missing[1::2], [5, -5])
+    )
+    assert np.isnan(heights).all()
+    assert said.count("Could not get height data") == 2
