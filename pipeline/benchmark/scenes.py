@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +15,7 @@ from flexroad.catalog.storage.outputs import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
+from flexroad.tasks.io.vector_date import vector_date
 from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tasks.synthetic.orthophoto import orthophoto
@@ -147,23 +147,11 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
     columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
-        with _fixed_date():
+        with vector_date(MADE):
             geopandas.GeoDataFrame(columns, geometry=shapes, crs=crs).to_file(temporary, layer="roads")
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _fixed_date() -> Iterator[None]:
-    """Set the date that GDAL writes to `MADE`."""
-    import pyogrio
-
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{MADE:%Y-%m-%dT%H:%M:%SZ}"})
-    try:
-        yield
-    finally:
-        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 def _failure(job: SceneJob, reason: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator
+from datetime import UTC
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -43,11 +44,13 @@ def write_lines(
         raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
     crs = compound(source.crs, source.vertical) if source.vertical else source.crs
 
+    date = max(tile.datetime for tile in source.tiles).astimezone(UTC)
+
     def fill(local: Path) -> None:
         # GDAL wants a name that ends like a GeoPackage, and writes other files beside it.
         with ScratchFolder() as scratch:
             file = Path(scratch, f"roads{road_lines.NAME}")
-            road_lines.write(file, (road for row in rows for road in _of_route(folder, row)), crs)
+            road_lines.write(file, (road for row in rows for road in _of_route(folder, row)), crs, date)
             copyfile(file, local)
 
     write_whole(folder, f"{source.run.path.name}{road_lines.NAME}", key, fill)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.vector_date import vector_date
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Floats
 
@@ -41,7 +43,7 @@ class RoadLine:
     """Class of each segment by `Support`, ``(n,)``."""
 
 
-def write(path: Path, roads: Iterable[RoadLine], crs: str) -> None:
+def write(path: Path, roads: Iterable[RoadLine], crs: str, date: datetime) -> None:
     """Write roads to a new GeoPackage.
 
     The layer ``roads`` has a line per road, ``segments`` a line per metre. Numbers that are not known are
@@ -54,6 +56,8 @@ def write(path: Path, roads: Iterable[RoadLine], crs: str) -> None:
         At least one; all with the same columns.
     crs : str
         CRS of the points, compound if that of the heights is known.
+    date : datetime
+        Date of the data (UTC), so that equal roads give equal bytes.
 
     Raises
     ------
@@ -62,13 +66,14 @@ def write(path: Path, roads: Iterable[RoadLine], crs: str) -> None:
     """
     batch: list[RoadLine] = []
     new = True
-    for road in roads:
-        batch.append(road)
-        if sum(len(each.support) for each in batch) >= BATCH:
+    with vector_date(date):
+        for road in roads:
+            batch.append(road)
+            if sum(len(each.support) for each in batch) >= BATCH:
+                _append(path, batch, crs, new)
+                batch, new = [], False
+        if batch:
             _append(path, batch, crs, new)
-            batch, new = [], False
-    if batch:
-        _append(path, batch, crs, new)
 
 
 def _append(path: Path, batch: list[RoadLine], crs: str, new: bool) -> None:

@@ -15,14 +15,17 @@ from tests.permissions import permissions_enforced
 from .conftest import OPTIONS, contents
 
 DATUM = ("--height-offset", "47.5")
+WRITTEN_WHOLE = ("mosaic", "pmtiles")
+"""Formats that have no markers: each export writes them again."""
 each_format = pytest.mark.parametrize("name", FORMATS)
 
 
 @pytest.fixture(scope="module")
 def whole(made_city, tmp_path_factory):
-    """An export in all formats."""
-    out = tmp_path_factory.mktemp("whole")
-    export(select(made_city.path), out, list(FORMATS), OPTIONS, SerialExecutor())
+    """An export in all formats, one after the other: OpenDRIVE refers to OpenCRG files of the same export."""
+    out, source = tmp_path_factory.mktemp("whole"), select(made_city.path)
+    for name in FORMATS:
+        export(source, out, [name], OPTIONS, SerialExecutor())
     return out
 
 
@@ -148,7 +151,8 @@ def test_folder_with_spaces_and_other_letters(made_city, whole, flexroad, tmp_pa
 
 @each_format
 def test_files_of_tiles_no_longer_selected_are_removed(made_city, flexroad, tmp_path, name):
-    first, second = made_city.done
+    # Along the roads of the other tile alone there is none of the least length.
+    second, first = made_city.done
     words = ["export", made_city.path, "--format", name, *DATUM, "-o"]
     flexroad(*words, tmp_path / "one", "--tile", first).expected(0)
     flexroad(*words, tmp_path / "both").expected(0)
@@ -206,7 +210,7 @@ def test_marker_that_names_files_elsewhere_removes_nothing(made_city, flexroad, 
 def test_damaged_markers_are_as_none(made_city, whole, flexroad, tmp_path, name):
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     hidden = [*tmp_path.glob(f"{name}/.pieces/**/*.json"), *tmp_path.glob(f".{name}.json")]
-    assert hidden
+    assert hidden or name in WRITTEN_WHOLE
     for number, file in enumerate(hidden):
         file.write_text(["", "{", "[1]", '{"key": 1, "sizes": 3, "row": 2}'][number % 4])
     flexroad("export", made_city.path, "--format", name, *DATUM, "-o", tmp_path).expected(0)

@@ -1,3 +1,5 @@
+from datetime import UTC, datetime
+
 import geopandas
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ from flexroad.catalog.crs import compound
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import road_lines
 from flexroad.tasks.export.road_lines import RoadLine
+
+DATE = datetime(2025, 3, 1, tzinfo=UTC)
 
 
 def road(number: int, segments: int, lanes: int | None = None) -> RoadLine:
@@ -23,7 +27,7 @@ def road(number: int, segments: int, lanes: int | None = None) -> RoadLine:
 def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(road_lines, "BATCH", batch)
     path = tmp_path / "roads.gpkg"
-    road_lines.write(path, (road(k, 3 + k, 2) for k in (1, 2)), compound("EPSG:25832", "EPSG:7837"))
+    road_lines.write(path, (road(k, 3 + k, 2) for k in (1, 2)), compound("EPSG:25832", "EPSG:7837"), DATE)
     roads = geopandas.read_file(path, layer="roads")
     assert roads["id"].tolist() == [1, 2]
     assert roads["name"].tolist() == ["Road 1", "Road 2"]
@@ -42,7 +46,7 @@ def test_write_lines_and_segments_have_heights_and_columns(tmp_path, monkeypatch
 
 def test_write_unknown_numbers_are_null(tmp_path):
     path = tmp_path / "roads.gpkg"
-    road_lines.write(path, [road(1, 4)], "EPSG:25832")
+    road_lines.write(path, [road(1, 4)], "EPSG:25832", DATE)
     segments = geopandas.read_file(path, layer="segments")
     assert segments.error_m.isna().tolist() == [True, False, True, False]
     assert geopandas.read_file(path, layer="roads").lanes.isna().all()
@@ -51,4 +55,10 @@ def test_write_unknown_numbers_are_null(tmp_path):
 
 def test_write_to_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(TaskError, match=r"roads.gpkg cannot be written: .*; check the disk"):
-        road_lines.write(tmp_path / "none" / "roads.gpkg", [road(1, 4)], "EPSG:25832")
+        road_lines.write(tmp_path / "none" / "roads.gpkg", [road(1, 4)], "EPSG:25832", DATE)
+
+
+def test_write_equal_roads_give_equal_bytes(tmp_path):
+    for name in ("one.gpkg", "two.gpkg"):
+        road_lines.write(tmp_path / name, [road(1, 4)], "EPSG:25832", DATE)
+    assert (tmp_path / "one.gpkg").read_bytes() == (tmp_path / "two.gpkg").read_bytes()
