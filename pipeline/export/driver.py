@@ -86,7 +86,7 @@ def _written(
     notify: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write one format; return its entry in the manifest."""
-    remove_unfinished(folder)
+    remove_unfinished(folder, below=True)
     before = file_sizes(folder)
     if isinstance(folder, Path):
         folder.mkdir(parents=True, exist_ok=True)

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flexroad.catalog.storage.outputs import output_file
-from flexroad.catalog.storage.paths import Location, absolute, listing, remove
+from flexroad.catalog.storage.paths import Location, absolute, listing
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.artefacts import check_writable
+from flexroad.pipeline.store.artefacts import PROBE, check_writable
 
 MANIFEST = "export.json"
 
@@ -40,15 +40,22 @@ def held(out: Location, run: Run, notify: Callable[[str], None]) -> Iterator[Non
     if isinstance(out, Path):
         output_file(out / MANIFEST)
     with run_lock(out, notify):
+        remove_unfinished(out)
         yield
 
 
-def remove_unfinished(folder: Location) -> None:
-    """Remove temporary files that an export which was killed has left; nothing in a bucket."""
+def remove_unfinished(folder: Location, below: bool = False) -> None:
+    """Remove temporary files that an export which was killed has left in a folder; a bucket has none.
+
+    Parameters
+    ----------
+    below : bool
+        Whether folders inside it are searched, too.
+    """
     if isinstance(folder, Path):
-        for name in listing(folder):
-            if name.rpartition("/")[2].startswith(".") and name.endswith(".tmp"):
-                remove(folder / name)
+        for file in folder.rglob(".*") if below else folder.glob(".*"):
+            if file.suffix == ".tmp" or file.name.startswith(PROBE):
+                file.unlink(missing_ok=True)
 
 
 def file_sizes(folder: Location) -> dict[str, int]:

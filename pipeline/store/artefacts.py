@@ -23,6 +23,8 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
 
+PROBE = ".probe-"
+"""Start of the names of files that only try whether a folder can be written."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -66,6 +68,6 @@ def check_writable(folder: Location) -> None:
     OSError
         If not; with the reason and the path.
     """
-    probe = folder / f".probe-{uuid.uuid4().hex}"
+    probe = folder / f"{PROBE}{uuid.uuid4().hex}"
     paths.write(probe, b"")
     paths.remove(probe)
