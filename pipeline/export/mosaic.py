@@ -40,7 +40,7 @@ NO_ROAD = 255
 """Value of the road mask where no tile is finished."""
 PART_CELLS = 2**20
 """Largest number of cells that are sampled at a time."""
-CACHE_BYTES = 256 * 2**20
+CACHE_BYTES = 128 * 2**20
 """Blocks that GDAL keeps in memory; its own default grows with the machine."""
 SAME_CELL = 1e-6
 """Part of a cell by which positions may differ because of rounding."""
