@@ -28,7 +28,7 @@ from flexroad.tasks.meshing.relief import Relief
 RECORDS, MESHES = ".coarse", "coarse"
 """Folders of records, and of GLB files."""
 PREFIX = "coarse_"
-"""Start of the ids of coarse meshes: no tile of the run has such a one."""
+"""Start of the ids of coarse meshes, which keeps them apart from those of tiles."""
 QUALITY = 85
 """Quality of JPEG images."""
 SHARP = 8
