@@ -79,9 +79,16 @@ def texture_of(tile: FinishedTile) -> TileTexture:
         raise ConfigError(f"{error.file} {error}") from error
 
 
-def aerial_of(texture: Texture) -> Aerial:
-    """Return a texture as pixels."""
+def aerial_of(texture: Texture, pixel_m: float) -> Aerial:
+    """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
     from PIL import Image
 
-    colour = np.asarray(Image.open(io.BytesIO(texture.jpeg)), np.float64)
-    return Aerial(texture.bounds, colour, np.ones(colour.shape[:2]))
+    west, south, east, north = texture.bounds
+    image = Image.open(io.BytesIO(texture.jpeg))
+    dx, dy = (east - west) / image.width, (north - south) / image.height
+    # Large photos would take a gigabyte as numbers.
+    factor = max(1, int(pixel_m / max(dx, dy) / 2))
+    colour = np.asarray(image.reduce(factor), np.float64)
+    rows, columns = colour.shape[:2]
+    bounds = west, north - rows * factor * dy, west + columns * factor * dx, north
+    return Aerial(bounds, colour, np.ones((rows, columns)))

@@ -166,11 +166,12 @@ def leaf_piece(leaf: Leaf, place: Place) -> Piece:
     name = safe_name(tile.id)
     uri = f"tiles/{name}{glb.NAME}"
     placed = tiles3d.placed(uri, grid.bounds, heights, place.origin, place.conversion)
+    pixel_m = coarse.TILE.pixel_m
     ground = relief.of_mesh(points, mesh.faces, coarse.TILE.spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
-    image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, coarse.TILE.pixel_m)
+    image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture.image:
-        photo = aerial.joined([aerial_of(texture.image)], ground.bounds, coarse.TILE.pixel_m)
+        photo = aerial.joined([aerial_of(texture.image, pixel_m)], ground.bounds, pixel_m)
         image = replace(photo, share=image.share)
     files, referred = coarse.record(name, ground, image)
     side = LEVELS[0].side_m

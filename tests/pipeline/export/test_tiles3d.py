@@ -19,13 +19,14 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import coarse, pieces
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.photo import aerial_of
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.export.tiles3d import Node, blocks
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.export import glb
 from flexroad.tasks.export.tiles3d import placed
-from flexroad.tasks.meshing.aerial import Aerial
+from flexroad.tasks.meshing.aerial import Aerial, joined
 from flexroad.tasks.meshing.relief import of_mesh
 from tests.validators.gltf import gltf_issues
 from tests.whole_run import LIGHT
@@ -301,3 +302,19 @@ def test_blocks_have_nested_levels_where_there_is_more_than_one_tile(tmp_path):
     image = image_of(tmp_path / near.row["uri"])
     # 1500 m by 3500 m in pixels of 8 m.
     assert image.shape == (438, 188, 3)
+
+
+@pytest.mark.parametrize("size", [(50, 50), (501, 333), (1600, 1600)])
+def test_photo_becomes_pixels_at_its_place_in_little_memory(size):
+    """Red is the distance from the western, green that from the northern edge."""
+    width, height = size
+    red, green = np.meshgrid((np.arange(width) + 0.5) / width * 200, (np.arange(height) + 0.5) / height * 200)
+    jpeg = glb.jpeg(np.stack([red, green, 0 * red], axis=-1).round().astype(np.uint8), 95)
+    pixels = aerial_of(glb.Texture(jpeg, (1000.0, 2000.0, 1100.0, 2100.0)), 2.0)
+    rows, columns, _ = pixels.colour.shape
+    assert max(rows, columns) <= 300
+    image = joined([pixels], (1000.0, 2000.0, 1100.0, 2100.0), 2.0).colour
+    expected = (np.arange(50) + 0.5) * 4
+    # At its end the photo is repeated, as pixels are means of whole numbers of its own.
+    np.testing.assert_allclose(image[:, 1:-1, 0].mean(axis=0), expected[1:-1], atol=1.5)
+    np.testing.assert_allclose(image[1:-1, :, 1].mean(axis=1), expected[1:-1], atol=1.5)
