@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -15,6 +15,7 @@ from flexroad.pipeline.errors import ClusterLost, ConfigError
 
 if TYPE_CHECKING:
     from flexroad.catalog.ellipsoidal import Datum
+    from flexroad.catalog.storage.paths import Location
 
 
 def export(
@@ -154,11 +155,16 @@ def export(
             echo(f"error: {error}; the same command goes on from here", err=True)
             raise typer.Exit(1) from None
     for name in names:
-        written = manifest["formats"][name]
-        size = written["bytes"] / 1e6
-        echo(f"{name}: {count(written['files'], 'file')}, {size:.1f} MB in {folder / name}")
-        for note in written["notes"]:
-            _note(f"{name}: {note}")
+        _say(name, manifest["formats"][name], folder / name)
+
+
+def _say(name: str, written: dict[str, Any], folder: Location) -> None:
+    """Print what the manifest says of a format."""
+    echo(f"{name}: {count(written['files'], 'file')}, {written['bytes'] / 1e6:.1f} MB in {folder}")
+    if summary := written.get("summary"):
+        echo(f"  {summary}")
+    for note in written["notes"]:
+        _note(f"{name}: {note}")
 
 
 def _note(line: str) -> None:

@@ -25,7 +25,7 @@ from flexroad.pipeline.export.pieces import (
     write_pieces,
     write_whole,
 )
-from flexroad.pipeline.export.road_report import report, row, with_note
+from flexroad.pipeline.export.road_report import report, row, with_line
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
@@ -124,7 +124,7 @@ def write_crg(
     rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
     error = summary["crg_max_mm"]
-    return with_note(summary, f"misses the surface by at most {error:.1f} mm" if error is not None else "")
+    return with_line(summary, f"misses the surface by at most {error:.1f} mm" if error is not None else "")
 
 
 def write_xodr(
@@ -147,7 +147,7 @@ def write_xodr(
     write_whole(folder, f"{source.run.path.name}{opendrive.NAME}", key, fill)
     mean, largest = summary["profiles_mean_mm"], summary["profiles_max_mm"]
     missed = f"misses the surface by {mean:.0f} mm on average, at most {largest:.0f} mm, without OpenCRG"
-    return with_note(summary, missed if mean is not None else "")
+    return with_line(summary, missed if mean is not None else "")
 
 
 def write_units(

@@ -21,7 +21,7 @@ from flexroad.pipeline.export.ground import Ground
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import MARKERS, Piece, Row, write_whole
-from flexroad.pipeline.export.road_report import NO_ROAD, totals, with_note
+from flexroad.pipeline.export.road_report import NO_ROAD, totals, with_line
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.tasks.export import road_lines
 from flexroad.tasks.export.road_lines import RoadLine
@@ -54,7 +54,7 @@ def write_lines(
             copyfile(file, local)
 
     write_whole(folder, f"{source.run.path.name}{road_lines.NAME}", key, fill)
-    return with_note(totals(rows, roads))
+    return with_line(totals(rows, roads))
 
 
 def lines_piece(unit: RouteUnit, work: Work) -> Piece:

@@ -87,14 +87,14 @@ def totals(rows: list[Row], roads: Network) -> dict[str, Any]:
     }
 
 
-def with_note(summary: Mapping[str, Any], error: str = "") -> dict[str, Any]:
-    """Return a summary with a line for the user: number and length of the roads, and their error."""
-    text = f"{count(summary['roads'], 'road')}, {summary['length_m'] / 1000:.2f} km"
-    if summary["left_out_m"] >= SHOWN_M:
-        text += f", {summary['left_out_m'] / 1000:.2f} km of centre lines left out"
-    if summary["left_out_areas"]:
-        text += f", {count(summary['left_out_areas'], 'area')} without centre line left out"
-    return {**summary, "notes": [f"{text}; {error}" if error else text, *summary["notes"]]}
+def with_line(figures: Mapping[str, Any], error: str = "") -> dict[str, Any]:
+    """Return figures with a line for the user, the summary: number and length of the roads, their error."""
+    text = f"{count(figures['roads'], 'road')}, {figures['length_m'] / 1000:.2f} km"
+    if figures["left_out_m"] >= SHOWN_M:
+        text += f", {figures['left_out_m'] / 1000:.2f} km of centre lines left out"
+    if figures["left_out_areas"]:
+        text += f", {count(figures['left_out_areas'], 'area')} without centre line left out"
+    return {**figures, "summary": f"{text}; {error}" if error else text}
 
 
 def write_new(where: Location, data: bytes) -> None:
