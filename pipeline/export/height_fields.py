@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 from flexroad.catalog.ids import safe_name
@@ -58,15 +57,17 @@ def _common_limits(source: Source, scene: Scene, executor: Executor) -> tuple[fl
     With whole metres another tile rarely changes them, and the files of the others remain valid.
     """
     low, high = math.inf, -math.inf
-    for limits, failure in executor.map(partial(_limits, scene), source.finished(), _lost):
+    jobs = ((tile, scene) for tile in source.finished())
+    for limits, failure in executor.map(_limits, jobs, _lost):
         if failure:
             raise ConfigError(failure)
         low, high = min(low, limits[0]), max(high, limits[1])
     return float(math.floor(low)), float(max(math.ceil(high), math.floor(low) + 1))
 
 
-def _limits(scene: Scene, tile: FinishedTile) -> tuple[tuple[float, float], str]:
+def _limits(job: tuple[FinishedTile, Scene]) -> tuple[tuple[float, float], str]:
     """Return the lowest and highest node of a tile, or the reason why it has none."""
+    tile, scene = job
     try:
         field = _field(tile, scene)
     except ConfigError as error:
@@ -76,8 +77,8 @@ def _limits(scene: Scene, tile: FinishedTile) -> tuple[tuple[float, float], str]
     return (field.low, field.high), ""
 
 
-def _lost(tile: FinishedTile, reason: str) -> tuple[tuple[float, float], str]:
-    return NO_LIMITS, f"{tile.label}: {reason}"
+def _lost(job: tuple[FinishedTile, Scene], reason: str) -> tuple[tuple[float, float], str]:
+    return NO_LIMITS, f"{job[0].label}: {reason}"
 
 
 def piece(tile: FinishedTile, scene: Scene) -> Piece:

@@ -1,10 +1,19 @@
 """Barbican, London, in all formats of exports: read back, the heights are those of the fitted surfaces."""
 
+import csv
+import shutil
 import zipfile
+from xml.etree import ElementTree
 
+import geopandas
 import numpy as np
+import pyopencrg
 import pytest
+import rasterio
 import rhino3dm
+import shapely
+from pyproj import Transformer
+from rio_cogeo import cog_validate
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.ellipsoidal import Datum
@@ -18,9 +27,26 @@ from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from tests.pipeline.export.test_driver import OFFSET_M, heightfields, true_heights, vertices
+from tests.read_opendrive import quality_issues
+from tests.validators.gltf import gltf_issues
 from tests.validators.opencascade import read_step
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
+
+STREETS = {
+    "Aldersgate Street": [
+        (532096, 181949),
+        (532103, 181881),
+        (532110, 181813),
+        (532119, 181745),
+        (532131, 181677),
+        (532135, 181625),
+    ],
+    "London Wall": [(532405, 181569), (532453, 181574), (532509, 181576), (532566, 181574), (532640, 181572)],
+    "Moor Lane": [(532583, 181796), (532566, 181733), (532552, 181688), (532538, 181637), (532526, 181591)],
+    "Wood Street": [(532308, 181370), (532328, 181438), (532351, 181506), (532368, 181540)],
+}
+"""Drawn by hand on the land cover; no data set of centre lines comes with the rasters."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +64,14 @@ def barbican(real_data, tmp_path_factory):
 @pytest.fixture(scope="module")
 def exported(barbican, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    export(select(barbican), out, list(FORMATS), Options(Datum("offset", str(OFFSET_M))), SerialExecutor())
+    lines = geopandas.GeoDataFrame(
+        {"name": list(STREETS), "width": 9.0, "lanes": 2},
+        geometry=[shapely.LineString(places) for places in STREETS.values()],
+        crs="EPSG:27700",
+    )
+    lines.to_file(out / "streets.gpkg")
+    options = Options(Datum("offset", str(OFFSET_M)), roads=str(out / "streets.gpkg"), left_hand=True)
+    export(select(barbican), out, list(FORMATS), options, SerialExecutor())
     return out
 
 
@@ -87,3 +120,47 @@ def test_3dm_has_the_meshes_of_each_tile(tiles, exported):
                 heights = tile.surface.height(points[:, 0] + west, points[:, 1] + south)
                 # The mesh itself has rounded vertices.
                 np.testing.assert_allclose(points[:, 2], heights, rtol=0, atol=2 * FORMATS["3dm"].precision_m)
+
+
+def test_glb_files_have_no_issue(exported):
+    files = sorted((exported / "3dtiles").rglob("*.glb"))
+    assert len(files) > 9
+    assert gltf_issues(files) == []
+
+
+def test_opencrg_is_within_2_mm_of_the_surface(barbican, exported):
+    """By PyOpenCRG, at places in the run's CRS; beyond the ends of a road it repeats the last heights."""
+    with (exported / "crg" / "roads.csv").open() as file:
+        roads = list(csv.DictReader(file))
+    assert {road["name"] for road in roads} == set(STREETS)
+    root = ElementTree.parse(next((exported / "xodr").glob("*.xodr"))).getroot()
+    degrees = Transformer.from_crs("EPSG:27700", "EPSG:4326", always_xy=True)
+    frame = Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step "
+        + root.findtext("header/geoReference")
+    )
+    for road, rng in zip(roads, np.random.default_rng(0).spawn(len(roads)), strict=True):
+        line = shapely.LineString(STREETS[road["name"]])
+        along = shapely.line_interpolate_point(line, rng.uniform(3, line.length - 3, 2000))
+        places = shapely.get_coordinates(along) + rng.uniform(-2, 2, (2000, 2))
+        crg = pyopencrg.CrgRoad.read(exported / "crg" / f"{road['id']}.crg")
+        height = crg.xy_to_z(*frame.transform(*degrees.transform(*places.T)))
+        error = np.abs(height - true_heights(barbican, places))
+        assert error.max() < 2e-3
+        assert float(road["crg_max_mm"]) < 2
+
+
+def test_opendrive_has_no_issue(exported, tmp_path):
+    file = shutil.copy(next((exported / "xodr").glob("*.xodr")), tmp_path / "roads.xodr")
+    assert quality_issues(file) == []
+
+
+def test_mosaic_has_the_heights_of_the_surfaces(barbican, exported):
+    for file in (exported / "mosaic").glob("*.tif"):
+        assert cog_validate(file)[0]
+    with rasterio.open(exported / "mosaic" / "height.tif") as raster:
+        heights = raster.read(1, masked=True)
+        rows, columns = np.nonzero(~np.ma.getmaskarray(heights))
+        x, y = raster.xy(rows, columns)
+    truth = true_heights(barbican, np.column_stack([x, y]))
+    np.testing.assert_allclose(heights[rows, columns], truth, rtol=0, atol=FORMATS["mosaic"].precision_m)

@@ -28,7 +28,11 @@ KILL_S = 300
 
 @dataclass
 class At:
-    """An observer that acts at one operation, and, if it lasts, at all later ones that need space."""
+    """An observer that acts at one operation, and, if it lasts, at all later ones that need space.
+
+    Operations on the lock do not count: a process that is killed before it has named the owner in its lock
+    leaves one that is waited for, which the tests of the lock show.
+    """
 
     number: int
     act: Callable[[], None]
@@ -36,6 +40,8 @@ class At:
     met: list[Operation] = field(default_factory=list)
 
     def __call__(self, operation: Operation) -> None:
+        if operation.path.name == "lock.json":
+            return
         self.met.append(operation)
         later = (
             self.lasting and operation.kind in ("create", "write", "mkdir") and len(self.met) > self.number
@@ -65,8 +71,8 @@ def whole(made_city, tmp_path_factory):
 
 
 def points(number: int) -> list[int]:
-    """Operations of an export, spread over it; the last one is the removal of the lock."""
-    return sorted({round(k * (number - 2) / (POINTS - 1)) for k in range(POINTS)})
+    """Operations of an export, spread over it."""
+    return sorted({round(k * (number - 1) / (POINTS - 1)) for k in range(POINTS)})
 
 
 def goes_on(city, name, out, whole) -> None:
@@ -147,7 +153,9 @@ def test_interrupted_export_keeps_the_parts_that_it_has(made_city, whole, tmp_pa
 
 def test_dask_writes_the_same_bytes(made_city, whole, cluster, tmp_path):
     executor = DaskExecutor(scheduler=cluster.scheduler_address)
-    export(select(made_city.path), tmp_path, list(FORMATS), OPTIONS, executor)
+    # With OpenCRG in the same export, OpenDRIVE refers to it: that of `whole` does not.
+    export(select(made_city.path), tmp_path, [name for name in FORMATS if name != "xodr"], OPTIONS, executor)
+    export(select(made_city.path), tmp_path, ["xodr"], OPTIONS, executor)
     for name in FORMATS:
         assert contents(tmp_path / name) == contents(whole[0] / name / name), name
 
