@@ -85,7 +85,7 @@ class Branch:
     @property
     def label(self) -> str:
         """Its name in messages."""
-        return f"coarse mesh {self.id}"
+        return f"area {self.id.removeprefix(PREFIX)}"
 
     @property
     def fingerprint(self) -> str:

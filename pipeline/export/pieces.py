@@ -49,13 +49,13 @@ class Item(Protocol):
         ...
 
     @property
-    def label(self) -> str:
-        """Its name in messages."""
+    def fingerprint(self) -> str:
+        """Name of the content by what it is made of."""
         ...
 
     @property
-    def fingerprint(self) -> str:
-        """Name of the content by what it is made of."""
+    def label(self) -> str:
+        """Its name in messages."""
         ...
 
 
@@ -122,7 +122,7 @@ def write_pieces(
     yield from unchanged
     markers = _markers(folder, group)
     for name in listing(markers):
-        if name not in kept and "/" not in name and (other := _written(markers / name)):
+        if name not in kept and (other := _written(markers / name)):
             _remove(folder, other.sizes)
             remove(markers / name)
 
@@ -189,7 +189,7 @@ def _lost(job: Job, reason: str) -> tuple[Row, str]:
 
 
 def _markers(folder: Location, group: str) -> Location:
-    return folder / MARKERS / group if group else folder / MARKERS
+    return folder / (f"{MARKERS}-{group}" if group else MARKERS)
 
 
 def _marker(folder: Location, group: str, tile_id: str) -> Location:

@@ -100,7 +100,7 @@ class FinishedTile:
             If it has.
         """
         if self.place.marker(self.id) != self.state.marker:
-            raise ConfigError(f"tile {self.id}: {COMPUTED_AGAIN}")
+            raise ConfigError(f"{self.label}: {COMPUTED_AGAIN}")
 
     @cached_property
     def _results(self) -> dict[str, Any]:
@@ -122,7 +122,7 @@ class FinishedTile:
         try:
             return self._evaluator(name)
         except StageError as error:
-            raise ConfigError(f"tile {self.id}: {error}") from error
+            raise ConfigError(f"{self.label}: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
