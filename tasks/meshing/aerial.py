@@ -86,9 +86,13 @@ def joined(parts: Sequence[Aerial], bounds: Bounds, pixel_m: float) -> Aerial:
         height, width = part.share.shape
         across = _common(np.linspace(part.bounds[0], part.bounds[2], width + 1), x)
         along = _common(-np.linspace(part.bounds[3], part.bounds[1], height + 1), -y)
-        weight += along @ part.share @ across.T
-        for band in range(3):
-            colour[..., band] += along @ (part.share * part.colour[..., band]) @ across.T
+        # A part covers few of the pixels.
+        row, column = (np.flatnonzero(lengths.any(axis=1)) for lengths in (along, across))
+        along, across = along[row], across[column].T
+        place = np.ix_(row, column)
+        weight[place] += along @ part.share @ across
+        known = part.share[..., None] * part.colour
+        colour[place] += np.stack([along @ known[..., band] @ across for band in range(3)], axis=-1)
     area = (east - west) * (north - south) / (rows * columns)
     colour /= np.where(weight > 0, weight, 1.0)[..., None]
     return Aerial(bounds, colour, np.minimum(weight / area, 1.0))
