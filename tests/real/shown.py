@@ -19,9 +19,11 @@ def table_after(text: str, start: str) -> list[tuple[str, list[float]]]:
     return rows
 
 
-def flexroad(arguments, folder) -> None:
+def flexroad(arguments, folder) -> str:
+    """Run a command; return what it printed."""
     result = subprocess.run([*CALL, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
 
 
 def measured(run, folder) -> list[tuple[str, list[float]]]:
