@@ -14,6 +14,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.quality import assess
@@ -141,19 +142,16 @@ def _estimate(run: RunName, tile: TileName) -> _Estimate | None:
 
 
 def _opened(run: RunName, tile: TileName) -> tuple[TileGraph, Evaluator]:
-    opened, tiles = _run(run)
-    graph = opened.graph(tiles[tile.id], opened.stat_cache()) if tile.id in tiles else None
-    if graph is None or graph.variants.get(run.variant, {}).get("assess") != tile.fingerprint:
+    for _ in range(2):
+        opened, tiles = _run(run)
+        for status in peek_statuses(opened, [tiles[tile.id]] if tile.id in tiles else []):
+            if status.graph.variants.get(run.variant, {}).get("assess") == tile.fingerprint:
+                return status.graph, Evaluator(status.graph, ArtefactStore(opened.store))
         # This process may have opened the run before it was changed.
         _run.cache_clear()
-        opened, tiles = _run(run)
-        graph = opened.graph(tiles[tile.id], opened.stat_cache())
-        if graph.variants[run.variant]["assess"] != tile.fingerprint:
-            raise ConfigError(
-                f"tile {tile.id} has changed during the export; run `flexroad rerun {run.path}`, then export "
-                "again"
-            )
-    return graph, Evaluator(graph, ArtefactStore(opened.store))
+    raise ConfigError(
+        f"tile {tile.id} has changed during the export; run `flexroad rerun {run.path}`, then export again"
+    )
 
 
 @lru_cache(maxsize=1)

@@ -218,6 +218,20 @@ def test_export_with_few_surfaces_in_memory_is_the_same(city, streets, exported,
     assert ground._patch.cache_info().currsize == 1
 
 
+def test_lines_of_a_run_without_its_rasters_have_no_error_estimate(city, streets, exported, tmp_path):
+    ground._estimate.cache_clear()  # of the exports before
+    rasters = city.parent / "survey"
+    rasters.rename(city.parent / "away")
+    try:
+        export(select(city), tmp_path, ["lines"], Options(roads=str(streets)), SerialExecutor())
+    finally:
+        (city.parent / "away").rename(rasters)
+    segments = geopandas.read_file(tmp_path / "lines" / "city_roads.gpkg", layer="segments")
+    before = geopandas.read_file(exported / "lines" / "city_roads.gpkg", layer="segments")
+    np.testing.assert_array_equal(segments.height_m, before.height_m)
+    assert segments.error_m.isna().all()
+
+
 def test_roads_in_another_crs_are_the_same_roads(city, streets, exported, tmp_path):
     degrees = geopandas.read_file(streets).to_crs("EPSG:4326")
     degrees.to_file(tmp_path / "degrees.geojson")
