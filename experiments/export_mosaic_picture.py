@@ -1,7 +1,7 @@
 """Draw docs/images/export_mosaic.png: the mosaic of a run and a map tile of its PMTiles file.
 
-``python experiments/export_mosaic_picture.py FOLDER docs/images/export_mosaic.png``, where FOLDER has the formats
-mosaic and pmtiles. The documents show ``flexroad catalog synthetic`` with nine tiles of 200 m,
+``python experiments/export_mosaic_picture.py FOLDER docs/images/export_mosaic.png``, where FOLDER has the
+formats mosaic and pmtiles. The documents show ``flexroad catalog synthetic`` with nine tiles of 200 m,
 of which one was not computed.
 """
 

@@ -26,7 +26,7 @@ from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from tests.pipeline.export.test_driver import OFFSET_M, heightfields, true_heights, vertices
+from tests.read_exports import OFFSET_M, heightfields, true_heights, vertices
 from tests.read_opendrive import quality_issues
 from tests.validators.gltf import gltf_issues
 from tests.validators.opencascade import read_step

@@ -3,14 +3,10 @@
 import gzip
 import json
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import rhino3dm
-import trimesh
-from PIL import Image
-from pyproj import Transformer
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.ellipsoidal import Datum
@@ -25,10 +21,9 @@ from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from tests.read_exports import OFFSET_M, heightfields, true_heights, vertices
 
-OFFSET_M = 47.5
 OPTIONS = Options(Datum("offset", str(OFFSET_M)))
-NAMESPACE = "{http://www.landxml.org/schema/LandXML-1.2}"
 
 
 @pytest.fixture(scope="module")
@@ -46,82 +41,6 @@ def exported(city, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     export(select(city), out, list(FORMATS), OPTIONS, SerialExecutor())
     return out
-
-
-def true_heights(city, places):
-    """The heights of the fitted surfaces at places, ``(n, 2)``."""
-    heights = np.full(len(places), np.nan)
-    for tile in select(city).finished():
-        west, south, east, north = tile.tile.grid.bounds
-        x, y = places.T
-        inside = (west <= x) & (x <= east) & (south <= y) & (y <= north)
-        heights[inside] = tile.surface.height(x[inside], y[inside])
-    return heights
-
-
-def landxml(path):
-    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    root = ElementTree.fromstring(text)
-    rows = [[float(number) for number in point.text.split()] for point in root.iter(f"{NAMESPACE}P")]
-    north, east, height = np.array(rows).T
-    return np.column_stack([east, north, height])
-
-
-def cityjson(path):
-    head, *features = map(json.loads, path.read_text().splitlines())
-    scale, shift = (np.array(head["transform"][name]) for name in ("scale", "translate"))
-    return np.concatenate([np.array(feature["vertices"]) * scale + shift for feature in features])
-
-
-def obj(folder):
-    points = []
-    for file in sorted(folder.glob("*.obj")):
-        origin = json.loads(file.with_suffix(".json").read_text())["origin"]
-        lines = [line.split()[1:] for line in file.read_text().splitlines() if line.startswith("v ")]
-        points.append(np.array(lines, float) + origin)
-    return np.concatenate(points)
-
-
-def tiles3d(folder, crs):
-    """The vertices of all tiles by the tilesets, back in the CRS of the run."""
-    back = Transformer.from_crs("EPSG:4978", crs, always_xy=True)
-    geographic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-    points = []
-    for block in json.loads((folder / "tileset.json").read_text())["root"]["children"]:
-        file = folder / block["content"]["uri"]
-        root = json.loads(file.read_text())["root"]
-        for leaf in root["children"]:
-            matrix = np.reshape(root["transform"], (4, 4)).T @ np.reshape(leaf["transform"], (4, 4)).T
-            scene = trimesh.load(file.parent / leaf["content"]["uri"])
-            east, up, south = scene.to_geometry().vertices.T
-            placed = np.column_stack([east, -south, up]) @ matrix[:3, :3].T + matrix[:3, 3]
-            x, y, _ = back.transform(*placed.T)
-            points.append(np.column_stack([x, y, geographic.transform(*placed.T)[2] - OFFSET_M]))
-    return np.concatenate(points)
-
-
-def heightfields(folder, names="*"):
-    """The nodes of all fields, and the precision that the files say."""
-    points, precision = [], 0.0
-    for file in sorted(folder.glob(f"{names}_heightfield.json")):
-        place = json.loads(file.read_text())
-        west, south, east, north = place["bounds"]
-        columns, rows = place["size"]
-        values = np.asarray(Image.open(file.with_suffix(".png")), float)
-        x, y = np.meshgrid(np.linspace(west, east, columns), np.linspace(north, south, rows))
-        heights = place["low_m"] + values * place["step_m"]
-        points.append(np.column_stack([x.ravel(), y.ravel(), heights.ravel()]))
-        precision = max(precision, place["precision_m"])
-    return np.concatenate(points), precision
-
-
-def vertices(out, crs="EPSG:25832"):
-    return {
-        "3dtiles": tiles3d(out / "3dtiles", crs),
-        "landxml": landxml(next((out / "landxml").iterdir())),
-        "cityjson": cityjson(next((out / "cityjson").iterdir())),
-        "obj": obj(out / "obj"),
-    }
 
 
 def test_vertices_of_all_formats_lie_on_the_surface(city, exported):
