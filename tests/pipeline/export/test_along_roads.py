@@ -13,7 +13,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export import ground, pieces
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.options import Options
@@ -216,6 +216,15 @@ def test_export_with_few_surfaces_in_memory_is_the_same(city, streets, exported,
     for file in (exported / "crg").glob("*.crg"):
         assert (tmp_path / "crg" / file.name).read_bytes() == file.read_bytes()
     assert ground._patch.cache_info().currsize == 1
+
+
+def test_workers_write_the_same_files(city, streets, exported, tmp_path, cluster):
+    workers = DaskExecutor(scheduler=cluster.scheduler_address)
+    export(select(city), tmp_path, ["crg", "xodr"], Options(roads=str(streets)), workers)
+    files = [file for file in exported.glob("*/*") if file.suffix in (".crg", ".xodr", ".csv")]
+    assert len(files) == 2 + 1 + 2
+    for file in files:
+        assert (tmp_path / file.relative_to(exported)).read_bytes() == file.read_bytes()
 
 
 def test_lines_of_a_run_without_its_rasters_have_no_error_estimate(city, streets, exported, tmp_path):
