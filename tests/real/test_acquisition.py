@@ -1,7 +1,12 @@
-"""docs/acquisition.md on real data: its commands give its tables, and independent heights agree."""
+"""docs/acquisition.md on real data: its commands give its tables, and independent heights agree.
 
+Roads along centre lines, as docs/export.md shows them, are exported from the same scan.
+"""
+
+import csv
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import laspy
@@ -12,10 +17,12 @@ import rasterio
 from scipy.ndimage import map_coordinates
 
 from flexroad.pipeline.inspect.points import Ground
+from tests.read_opendrive import quality_issues
 from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
 
-PAGE = (Path(__file__).parents[2] / "docs" / "acquisition.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE, EXPORTS = (DOCS / "acquisition.md").read_text(), (DOCS / "export.md").read_text()
 SETS = ("autzen", "ign", "stbarth", "brighton", "deepscenario")
 ROADS = Path(__file__).parent / "roads"
 FOOT = 0.3048
@@ -115,3 +122,33 @@ def test_deepscenario_roads_agree_with_map_and_vehicles(folder, source):
     for variant, expected in zip(("plane", "rgt", "flexroad"), shown, strict=True):
         surface = Ground.open(folder / "runs/deepscenario", variant).at(x[covered], y[covered])
         assert abs(surface.height - z[covered]).mean() == pytest.approx(expected, abs=0.001)
+
+
+@pytest.fixture(scope="module")
+def along_roads(folder) -> tuple[list[str], list[str]]:
+    """Lines that the commands of docs/export.md print on Autzen, and those that the page shows."""
+    (block,) = re.findall(r"```console\n(\$ flexroad run [^`]*runs/autzen_roads[^`]*)```", EXPORTS)
+    lines = block.splitlines()
+    for command in (line[2:] for line in lines if line[0] == "$"):
+        said = flexroad(shlex.split(command)[1:], folder)
+    printed = [line for line in said.splitlines() if line.startswith(("crg", "xodr", "lines", "  "))]
+    return printed, [line for line in lines if line[0] != "$"]
+
+
+def test_export_along_roads_prints_the_lines_of_the_page(along_roads):
+    printed, shown = along_roads
+    assert printed == shown
+
+
+def test_errors_of_opencrg_are_those_of_the_page(folder, along_roads):
+    with (folder / "delivery" / "crg" / "roads.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    largest = np.array([float(row["crg_max_mm"]) for row in rows])
+    medians = [float(row["crg_median_mm"]) for row in rows]
+    assert ((largest > 2).sum(), len(rows)) == (1, 36)
+    assert (round(min(medians), 2), round(max(medians), 2)) == (0.02, 0.16)
+
+
+def test_opendrive_has_no_issue(folder, along_roads, tmp_path):
+    file = shutil.copy(next((folder / "delivery" / "xodr").glob("*.xodr")), tmp_path / "roads.xodr")
+    assert quality_issues(file) == []
