@@ -1,0 +1,60 @@
+"""The memory of an export does not grow with the number of its tiles."""
+
+import gc
+import tracemalloc
+from dataclasses import replace
+
+import pytest
+
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.source import Source, select
+from flexroad.pipeline.export.states import FileStates
+
+from .conftest import OPTIONS
+
+pytestmark = pytest.mark.slow
+
+FEW, MANY = 60, 240
+GROWTH_BYTES = 1_200_000
+"""Bound of the growth: the meshes of the 180 tiles more are 2 MB. A buffer of 1 MB is full only with many."""
+SPREAD_M = {"3dtiles": 1000.0}
+"""Distance of the tiles: a coarse mesh is made of all tiles of a square kilometre at once."""
+
+
+def many(city, number: int, spread_m: float = 0.0) -> Source:
+    """The first tile of a run under many ids, all with its results."""
+    whole = select(city.path, city.done[:1])
+    (tile,), (state,), files = whole.tiles, whole.states, FileStates(whole.run)
+    grids = (replace(tile.grid, west=tile.grid.west + k * spread_m) for k in range(number))
+    tiles = tuple(replace(tile, id=f"{k:04}", grid=grid) for k, grid in enumerate(grids))
+    return replace(whole, tiles=tiles, states=tuple(replace(state, files=files(one)) for one in tiles))
+
+
+def peak_bytes(source: Source, name: str, out) -> int:
+    gc.collect()
+    tracemalloc.start()
+    try:
+        assert export(source, out, [name], OPTIONS, SerialExecutor())["tiles"] == len(source.tiles)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["3dtiles", "landxml", "cityjson", "obj", "heightfield", "step", "3dm"])
+def test_memory_does_not_grow_with_the_tiles(made_city, tmp_path, name):
+    few, lots = (many(made_city, number, SPREAD_M.get(name, 0.0)) for number in (FEW, MANY))
+    # Code is loaded and compiled before anything is measured.
+    peak_bytes(few, name, tmp_path / "first")
+    growth = peak_bytes(lots, name, tmp_path / "many") - peak_bytes(few, name, tmp_path / "few")
+    assert growth < GROWTH_BYTES, growth
+
+
+def test_growth_would_be_noticed(made_city):
+    """The meshes alone exceed the bound."""
+    tracemalloc.start()
+    kept = [tile.mesh for tile in many(made_city, MANY - FEW).finished()]
+    size = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert len(kept) == MANY - FEW
+    assert size > 1.5 * GROWTH_BYTES
