@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import errno
 import math
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import reason
 from flexroad.pipeline.errors import ConfigError
@@ -33,6 +34,8 @@ from flexroad.tasks.export import cog
 from flexroad.tasks.types import Floats
 
 VERSION = 1
+DRAFTS = ".drafts"
+"""Name of the folder of temporary rasters."""
 NORMAL_STEPS = 32767
 """Value of a component of length 1."""
 NO_NORMAL = -32768
@@ -89,10 +92,8 @@ def write_mosaics(
         If a file cannot be written.
     """
     grid = whole_grid([tile.grid for tile in source.tiles], options.resolution_m)
-    beside = folder if isinstance(folder, Path) else None
-    with TemporaryDirectory(prefix=".mosaic-", dir=beside) as name:
-        drafts = Path(name)
-        limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": name}
+    with _drafts(folder) as drafts:
+        limits = {"GDAL_CACHEMAX": CACHE_BYTES, "CPL_TMPDIR": str(drafts)}
         with _gdal(folder, **limits), ExitStack() as opened:
             rasters = [opened.enter_context(_draft(drafts, layer, grid, source)) for layer in LAYERS]
             for tile in tiles:
@@ -101,6 +102,23 @@ def write_mosaics(
             target = folder / f"{layer.name}.tif"
             with atomic_file(target) as local, _gdal(target, **limits):
                 _finish(drafts / layer.name, local, layer)
+
+
+@contextmanager
+def _drafts(folder: Location) -> Iterator[Path]:
+    """Yield a temporary folder beside the files, as they need the most space; of a bucket, a local one."""
+    if not isinstance(folder, Path):
+        with ScratchFolder() as name:
+            yield Path(name)
+        return
+    drafts = folder / DRAFTS
+    # That of an export that was killed is large.
+    shutil.rmtree(drafts, ignore_errors=True)
+    drafts.mkdir()
+    try:
+        yield drafts
+    finally:
+        shutil.rmtree(drafts, ignore_errors=True)
 
 
 @contextmanager
@@ -138,11 +156,12 @@ def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
         return whole
     west, north = min(grid.west for grid in grids), max(grid.north for grid in grids)
     east, south = max(grid.east for grid in grids), min(grid.south for grid in grids)
-    edges = math.floor(west / cell), math.floor(south / cell), math.ceil(east / cell), math.ceil(north / cell)
-    width, height = edges[2] - edges[0], edges[3] - edges[1]
+    left, bottom = (math.floor(edge / cell + SAME_CELL) for edge in (west, south))
+    right, top = (math.ceil(edge / cell - SAME_CELL) for edge in (east, north))
+    width, height = right - left, top - bottom
     if max(width, height) > MOST_CELLS:
         raise ConfigError(f"--resolution {cell:g}: {width} x {height} cells are too many; give a larger one")
-    return Grid(grids[0].crs, edges[0] * cell, edges[3] * cell, cell, width, height)
+    return Grid(grids[0].crs, left * cell, top * cell, cell, width, height)
 
 
 def _draft(folder: Path, layer: Layer, grid: Grid, source: Source) -> Any:

@@ -138,6 +138,8 @@ def test_whole_grid_of_a_cell_size_has_multiples_of_it():
     a = Grid("EPSG:25832", 500030.5, 5600100.0, 1.0, 50, 50)
     b = replace(a, west=500200.0)
     assert mosaic.whole_grid([a, b], 25.0) == Grid("EPSG:25832", 500025.0, 5600100.0, 25.0, 9, 2)
+    # 5600100 / 0.1 is not a whole number in the arithmetic of computers.
+    assert mosaic.whole_grid([a], 0.1).shape == (500, 500)
     with pytest.raises(ConfigError, match="several sizes or lattices; give --resolution METRES"):
         mosaic.whole_grid([a, b], None)
     with pytest.raises(ConfigError, match="--resolution 1e-09: .* cells are too many"):
@@ -164,6 +166,14 @@ def test_full_disk_leaves_no_file(town, written, tmp_path, monkeypatch, part):
     with pytest.raises(OSError, match="height.tif"):
         export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
     assert list((tmp_path / "mosaic").iterdir()) == []
+
+
+def test_files_of_an_export_that_was_killed_are_removed(town, tmp_path):
+    left = tmp_path / "mosaic" / mosaic.DRAFTS / "height"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"draft")
+    export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
+    assert sorted(file.name for file in (tmp_path / "mosaic").iterdir()) == [f"{name}.tif" for name in NAMES]
 
 
 def sumo_heights(folder, raster, x, y):
