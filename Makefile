@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all validators fuzz lint bench container clean
+.PHONY: help setup reproduce run rerun test test-all viewer validators fuzz lint bench container clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -80,6 +80,11 @@ test: $(STAMP) ## Run the tests but for the slow ones: minutes
 
 test-all: $(STAMP) ## Run all tests
 	$(PYTEST)
+
+viewer: ## Build the browser viewer into viewer/dist and test its parts (needs npm)
+	npm ci --prefix viewer --ignore-scripts --no-audit --no-fund
+	node viewer/build.js
+	node --test viewer/tests/
 
 # Programs of others that check exports; FLEXROAD_VALIDATORS=.validators makes the tests use them.
 VALIDATORS := .validators

@@ -24,6 +24,10 @@ def test_wheel_contains_one_import_package(tmp_path):
         "tasks/load.py",
         "pipeline/graph/graph.py",
         "configs/paper.yaml",
+        "viewer/dist/LICENSES.txt",
+        "viewer/dist/index.html",
+        "viewer/dist/viewer.css",
+        "viewer/dist/viewer.js",
         "py.typed",
     ):
         assert f"flexroad/{file}" in names

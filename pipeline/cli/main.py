@@ -21,6 +21,7 @@ from flexroad.pipeline.cli.results import figures, report, tables
 from flexroad.pipeline.cli.run import rerun, run, status
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.cli.train import train
+from flexroad.pipeline.cli.view import view
 from flexroad.pipeline.errors import ConfigError
 
 app = typer.Typer(
@@ -34,7 +35,7 @@ app = typer.Typer(
 app.add_typer(catalogs, name="catalog")
 app.add_typer(prepare, name="prepare")
 app.add_typer(configs, name="config")
-for command in (init, run, rerun, status, clean, report, query, export, tables, figures, train):
+for command in (init, run, rerun, status, clean, report, query, export, view, tables, figures, train):
     app.command(cls=Command)(command)
 
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import Location
@@ -23,7 +26,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.io.vertical import vertical_crs
-from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface
+from flexroad.tasks.quality import assess
+from flexroad.tasks.types import Floats, Mesh, Quality, RoadClusters, RoadMask, Surface, TileData
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +83,19 @@ class FinishedTile:
         """Figures and support of the surface."""
         quality: Quality = self._result("assess")
         return quality
+
+    @property
+    def data(self) -> TileData:
+        """The rasters; read from the source files."""
+        data: TileData = self._result("load")
+        return data
+
+    @property
+    def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
+        """Estimated error (m) and support of each cell of the core; needs the source files."""
+        options = self.graph.nodes[self.state.nodes["assess"]].options
+        assert isinstance(options, assess.Options)
+        return assess.cell_errors(self.data, self.road, self.clusters, self.surface, options)
 
     @cached_property
     def graph(self) -> TileGraph:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from flexroad.catalog import Layer, Tile
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.worker.evaluator import check_unchanged
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.export import glb
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.load import layer_source
+from flexroad.tasks.types import Orthophoto
 
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 
@@ -40,17 +42,37 @@ def tile_texture(graph: TileGraph) -> TileTexture:
     if not graph.product_sources:
         return TileTexture(note=NO_PHOTO)
     (layer,) = graph.product_sources
+    try:
+        photo = tile_photo(tile, layer, export.texture_px)
+    finally:
+        check_unchanged(graph, tile.paths(layer))
+    if photo is None:
+        return TileTexture(note=NO_PHOTO)
+    unknown = 1 - photo.known.mean()
+    note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
+    return TileTexture(glb.texture(photo, export.texture_quality), note)
+
+
+def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:
+    """Return the orthophoto of a tile, None if no pixel of it is known.
+
+    Parameters
+    ----------
+    layer : Layer
+        The tile's orthophoto.
+    largest_px : int
+        Largest width and height (pixels); a finer photo is averaged.
+
+    Raises
+    ------
+    TaskError
+        If a file is missing, broken, or not one of a photo.
+    """
     source = layer_source(replace(tile, layers=(layer,)), layer.name)
     assert source is not None
     west, south, east, north = tile.grid.bounds
     try:
-        photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / export.texture_px)
+        photo = read_photo(source, tile.grid, finest_m=max(east - west, north - south) / largest_px)
     except LayerMissing:
-        return TileTexture(note=NO_PHOTO)
-    finally:
-        check_unchanged(graph, source.paths)
-    unknown = 1 - photo.known.mean()
-    if unknown == 1:
-        return TileTexture(note=NO_PHOTO)
-    note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
-    return TileTexture(glb.texture(photo, export.texture_quality), note)
+        return None
+    return photo if photo.known.any() else None

@@ -1,0 +1,207 @@
+"""A run as a folder that a browser opens without a server: page, scripts, and one script per tile.
+
+The page is written last, and an earlier one is removed first: a folder with a page is whole.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flexroad.catalog import Bounds, Tile
+from flexroad.catalog.crs import in_plan, name, short
+from flexroad.catalog.ids import safe_name
+from flexroad.catalog.storage.paths import Location, exists, read, remove, write
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export.pieces import write_pieces
+from flexroad.pipeline.export.source import FinishedTile
+from flexroad.pipeline.export.states import RunPlace, tile_states
+from flexroad.pipeline.export.viewer_tile import Look, piece
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
+from flexroad.tasks.export import glb, viewer
+from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.roads import rasterise
+
+VERSION = 100 * viewer.VERSION + glb.VERSION
+PAGE = "index.html"
+MARK = b'<meta name="generator" content="FlexRoad viewer">'
+"""Text of a page that this program has written."""
+PENDING, DONE, FAILED = range(3)
+"""States of tiles in the index."""
+MEASURES = {
+    "error_estimate_m": ("Error estimate", "m"),
+    "suspect_m2": ("Largest suspect patch", "m²"),
+    "measured_road": ("Road measured by the scan", "%"),
+    "dtm_road": ("Road from the terrain model", "%"),
+    "inferred_road": ("Road inferred", "%"),
+    "residual_p95_m": ("Road points off the surface, p95", "m"),
+    "edge_step_m": ("Step at the road's edge, p95", "m"),
+    "l2_road_m": ("Road against the reference", "m"),
+    "l2_terrain_m": ("Terrain against the reference", "m"),
+    "triangles": ("Triangles", ""),
+    "seconds": ("Computing time", "s"),
+}
+"""Title and unit of the columns of metrics.parquet that colour the map; % marks shares."""
+DIGITS = 4
+"""Digits of the figures in the index."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written."""
+
+    page: Location
+    tiles: int
+    """Tiles with a script."""
+    others: int
+    """Tiles on the map that have no surface."""
+    notes: tuple[str, ...]
+    """What some tiles lack, one line per tile."""
+
+
+def write_viewer(
+    run: Run,
+    out: Location,
+    executor: Executor,
+    ids: Sequence[str] = (),
+    bbox: Bounds | None = None,
+    photo_px: int = 1024,
+    track: Track = untracked,
+) -> Written:
+    """Write the viewer of a run, or of the selected tiles, into a folder.
+
+    Raises
+    ------
+    ConfigError
+        If the folder has a page of another program, no tile can be shown, tiles have different CRSs, or a
+        tile's results cannot be read.
+    CatalogError
+        If an id is not in the run, or no tile touches the box.
+    OSError
+        If a file cannot be written.
+    """
+    tiles = shown_tiles(run, ids, bbox)
+    variant = run.config.export.variants[0]
+    _remove_page(out)
+    index, done = _index(run, tiles, variant)
+    options = run.config.chains[variant]["segment"]
+    roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
+    look = Look(run.origin, photo_px, roads)
+    finished = track(_finished(run, done, variant), "writing tiles", len(done))
+    rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+    for file in built_files():
+        if file.name != PAGE:
+            write(out / file.name, file.read_bytes())
+    write(out / viewer.NAME_RUN, viewer.encode_run(index))
+    write(out / PAGE, (_built() / PAGE).read_bytes())
+    notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
+    return Written(out / PAGE, len(done), len(tiles) - len(done), notes)
+
+
+def shown_tiles(run: Run, ids: Sequence[str], bbox: Bounds | None) -> tuple[Tile, ...]:
+    """Return the tiles of the map.
+
+    Raises
+    ------
+    ConfigError
+        If none has a place, or they have different CRSs.
+    CatalogError
+        If an id is not in the run, or no tile touches the box.
+    """
+    tiles = tuple(tile for tile in run.catalog.select(ids, bbox).tiles if not tile.fault)
+    if not tiles:
+        raise ConfigError(
+            f"{run.path}: no selected tile has a usable entry in the catalog; see `flexroad status`"
+        )
+    systems = {tile.grid.crs for tile in tiles}
+    if len(systems) > 1:
+        raise ConfigError(f"{run.path} has tiles in {len(systems)} CRSs; select tiles of one with --bbox")
+    return tiles
+
+
+def built_files() -> list[Path]:
+    """Return the files that each viewer has: page, style, script and licences."""
+    return sorted(path for path in _built().iterdir() if path.is_file())
+
+
+def _built() -> Path:
+    # In a checkout the package's folders are links; resolve() leads to the root, which has viewer/.
+    return Path(__file__).resolve().parents[2] / "viewer" / "dist"
+
+
+def _remove_page(out: Location) -> None:
+    """Remove the page of an earlier viewer."""
+    page = out / PAGE
+    if exists(page) and MARK not in read(page):
+        raise ConfigError(f"{page} is no page of `flexroad view`; choose another folder with -o")
+    remove(page)
+
+
+def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[FinishedTile]:
+    place = RunPlace.of(run)
+    for tile, state in tile_states(run, done, variant):
+        if state:
+            yield FinishedTile(tile, variant, state, place)
+
+
+def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
+    """Return the index of the run, and its finished tiles."""
+    states, rows, errors = list[int](), list[dict[str, Any]](), list[str]()
+    for status in peek_statuses(run, tiles):
+        states.append(DONE if status.done else FAILED if status.failed else PENDING)
+        rows.append(_row(status, variant))
+        errors.append(_error(status))
+    bounds = [tile.grid.bounds for tile in tiles]
+    measures = {name: [_figure(row.get(name)) for row in rows] for name in MEASURES}
+    known = {name: values for name, values in measures.items() if any(value is not None for value in values)}
+    columns = {
+        "id": [tile.id for tile in tiles],
+        "file": [safe_name(tile.id) for tile in tiles],
+        "west": [west for west, _, _, _ in bounds],
+        "south": [south for _, south, _, _ in bounds],
+        "width": [east - west for west, _, east, _ in bounds],
+        "height": [north - south for _, south, _, north in bounds],
+        "state": states,
+        "flags": [_flags(row) for row in rows],
+        "error": errors,
+        "measures": known,
+    }
+    crs, vertical = tiles[0].grid.crs, vertical_crs(tiles[0])
+    label = short(crs)
+    index = {
+        "name": run.path.name or "run",
+        "variant": variant,
+        "crs_name": label if label == name(in_plan(crs)) else f"{label}, {name(in_plan(crs))}",
+        "vertical": name(vertical) if vertical else None,
+        "origin": list(run.origin),
+        "measures": {key: dict(zip(("title", "unit"), MEASURES[key], strict=True)) for key in known},
+        "tiles": columns,
+    }
+    return index, [tile for tile, state in zip(tiles, states, strict=True) if state == DONE]
+
+
+def _row(status: TileStatus, variant: str) -> dict[str, Any]:
+    """Return the figures of a finished tile; none of others."""
+    rows: Iterable[dict[str, Any]] = status.last_record.rows if status.done and status.last_record else ()
+    return next((row for row in rows if row.get("variant") == variant), {})
+
+
+def _error(status: TileStatus) -> str:
+    failures = status.last_record.failures if status.failed and status.last_record else ()
+    lines = dict.fromkeys(f"{f.line}{f' [{f.file}]' if f.file else ''}" for f in failures)
+    return "; ".join(lines)
+
+
+def _flags(row: dict[str, Any]) -> list[str]:
+    return [flag for flag in (row.get("flags") or "").split(", ") if flag]
+
+
+def _figure(value: Any) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{value:.{DIGITS}g}")

@@ -1,0 +1,157 @@
+"""Scripts of the browser viewer: one per tile, and one with the index of the run.
+
+Browsers read no data files from ``file://``, but they run scripts. Each script hands its data to a function
+of ``viewer.js``: ``FLEXROAD.tile(id, {...})`` or ``FLEXROAD.run({...})``. Data are JSON; arrays are base64
+of little-endian numbers, of which rasters and mesh are compressed by zlib.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.roads.routes import CentreLine
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats
+
+VERSION = 1
+NAME_TILE, NAME_RUN = ".js", "run.js"
+MOST_CELLS = 256
+"""Largest width and height of the rasters (cells); finer ones are thinned."""
+STEP_M = 0.001
+"""Step of quantised heights (m); larger if heights span more than 65 m."""
+CODES = 65534
+"""Number of steps of quantised heights: 16 bits, of which 0 means no height."""
+ESTIMATE_STEP_M = 0.002
+"""Step of the error estimate (m): 8 bits, up to 0.5 m; larger ones have the last value."""
+
+
+@dataclass(frozen=True, eq=False)
+class TileScene:
+    """What the viewer shows of one tile."""
+
+    id: str
+    glb: bytes
+    """The mesh, with the orthophoto if there is one."""
+    grid: Grid
+    """The tile's core."""
+    corners: Floats
+    """Longitude and latitude of the corners, ``(4, 2)``: south-west, south-east, north-west, north-east."""
+    support: NDArray[np.uint8]
+    """The core's `tasks.quality.support.Support`, ``(H, W)``."""
+    dsm: Floats | None = None
+    """``(H, W)``, m; NaN where unknown; None if the source files cannot be read. So the next two."""
+    dtm: Floats | None = None
+    estimate: Floats | None = None
+    """Error estimate of the surface, ``(H, W)``, m."""
+    surface: NurbsSurface | None = None
+    """None if the surface is of another kind: the viewer then takes heights from the mesh."""
+    lines: tuple[CentreLine, ...] = ()
+    """Road lines on the tile."""
+
+
+def encode_tile(scene: TileScene) -> bytes:
+    """Return the script of a tile. Equal inputs give equal bytes."""
+    stride = max(1, -(-max(scene.grid.shape) // MOST_CELLS))
+    thinned = slice(stride // 2, None, stride)
+    rows, cols = scene.support[thinned, thinned].shape
+    shift = (stride // 2 + 0.5 - stride / 2) * scene.grid.cell
+    west, north = scene.grid.west + shift, scene.grid.north - shift
+    content = {
+        "glb": _packed(scene.glb),
+        "grid": {
+            "west": west,
+            "north": north,
+            "cell": stride * scene.grid.cell,
+            "rows": rows,
+            "cols": cols,
+        },
+        "corners": np.round(scene.corners, 8).tolist(),
+        "support": _packed(scene.support[thinned, thinned].tobytes()),
+        "dsm": _heights(scene.dsm, thinned),
+        "dtm": _heights(scene.dtm, thinned),
+        "estimate": _estimate(scene.estimate, thinned),
+        "surface": _surface(scene.surface),
+        "lines": [_line(line, scene.grid) for line in scene.lines],
+    }
+    return _call("tile", scene.id, content)
+
+
+def encode_run(content: Mapping[str, Any]) -> bytes:
+    """Return the script with the index of a run: JSON values; NaN is no value."""
+    return _call("run", _finite(content))
+
+
+def _call(function: str, *arguments: Any) -> bytes:
+    texts = (json.dumps(argument, separators=(",", ":"), allow_nan=False) for argument in arguments)
+    return f"FLEXROAD.{function}({','.join(texts)});\n".encode("ascii")
+
+
+def _finite(value: Any) -> Any:
+    """Return JSON values with None instead of numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, 6)).decode("ascii")
+
+
+def _heights(values: Floats | None, thinned: slice) -> dict[str, Any] | None:
+    if values is None:
+        return None
+    values = values[thinned, thinned]
+    known = np.isfinite(values)
+    if not known.any():
+        return None
+    low, high = float(values[known].min()), float(values[known].max())
+    step = max(STEP_M, (high - low) / CODES)
+    codes = np.zeros(values.shape, "<u2")
+    codes[known] = np.minimum(np.round((values[known] - low) / step), CODES).astype("<u2") + 1
+    return {"low": low, "step": step, "data": _packed(codes.tobytes())}
+
+
+def _estimate(values: Floats | None, thinned: slice) -> str | None:
+    if values is None:
+        return None
+    values = values[thinned, thinned]
+    known = np.isfinite(values)
+    codes = np.zeros(values.shape, np.uint8)
+    codes[known] = np.minimum(np.round(values[known] / ESTIMATE_STEP_M), 254).astype(np.uint8) + 1
+    return _packed(codes.tobytes())
+
+
+def _surface(surface: NurbsSurface | None) -> dict[str, Any] | None:
+    if surface is None:
+        return None
+    weighted = bool((surface.W != 1).any())
+    return {
+        "degree": list(surface.degree),
+        "bounds": [float(edge) for edge in surface.bounds],
+        "datum": float(surface.datum),
+        "knots_u": _doubles(surface.knots_u),
+        "knots_v": _doubles(surface.knots_v),
+        "A": _doubles(surface.A),
+        "W": _doubles(surface.W) if weighted else None,
+    }
+
+
+def _doubles(values: Floats) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, "<f8").tobytes()).decode("ascii")
+
+
+def _line(line: CentreLine, grid: Grid) -> dict[str, Any]:
+    """Return a line with points relative to the tile's south-west corner, in centimetres."""
+    places = np.round(line.points - (grid.west, grid.south), 2)
+    return {"name": line.name, "points": places.ravel().tolist()}

@@ -1,0 +1,109 @@
+// A drive along a road line: the camera goes at the eye's height of a driver, from line to line where they meet.
+
+import { continuation, lengths, nearestLine, placeAt } from "./lines.js";
+
+const EYE_M = 2.2;
+const AHEAD_M = 18;
+const START_WITHIN_M = 400;
+
+export class Drive {
+  /** `ended()` is called where the road line ends. */
+  constructor(stage, ended) {
+    this.stage = stage;
+    this.ended = ended;
+    this.speed = 12;
+    this.running = false;
+  }
+
+  /** All road lines of the loaded tiles. */
+  get lines() {
+    return [...this.stage.objects.values()].flatMap((object) => object.data.lines);
+  }
+
+  /** Starts at the place nearest to the one looked at; returns whether there is a line. */
+  start() {
+    const [easting, northing] = this.stage.toGround(this.stage.controls.target);
+    const found = nearestLine(this.lines, easting, northing, START_WITHIN_M);
+    if (!found) return false;
+    const [eye, target] = [this.stage.camera.position, this.stage.controls.target];
+    const view = [target.x - eye.x, eye.z - target.z];
+    const forward = view[0] * found.direction[0] + view[1] * found.direction[1] >= 0;
+    this.take(found.line, forward ? found.line.points : [...found.line.points].reverse());
+    this.at = forward ? found.along : this.along[this.along.length - 1] - found.along;
+    this.running = true;
+    this.stage.controls.enabled = false;
+    this.last = null;
+    this.heights = null;
+    requestAnimationFrame((now) => this.step(now));
+    return true;
+  }
+
+  /** Stops and gives the camera back. */
+  stop() {
+    if (!this.running) return;
+    this.running = false;
+    this.stage.controls.enabled = true;
+    this.stage.moved();
+  }
+
+  take(line, points) {
+    this.line = line;
+    this.points = points;
+    this.along = lengths(points);
+  }
+
+  step(now) {
+    if (!this.running) return;
+    // After a pause of the page the drive goes on where it was.
+    const seconds = Math.min((now - (this.last ?? now)) / 1000, 0.25);
+    this.last = now;
+    this.at += this.speed * seconds;
+    const length = this.along[this.along.length - 1];
+    if (this.at >= length && !this.goOn(length)) {
+      this.stop();
+      this.ended();
+      return;
+    }
+    this.look(seconds);
+    requestAnimationFrame((next) => this.step(next));
+  }
+
+  goOn(length) {
+    const end = this.points[this.points.length - 1];
+    const { direction } = placeAt(this.points, this.along, length);
+    const next = continuation(this.lines, this.line, end, direction);
+    if (!next) return false;
+    this.take(next.line, next.points);
+    this.at -= length;
+    return true;
+  }
+
+  look(seconds) {
+    const here = placeAt(this.points, this.along, this.at);
+    const there = this.ahead();
+    const near = this.stage.heightAt(here.easting, here.northing);
+    if (near === null) return;
+    const far = this.stage.heightAt(...there) ?? near;
+    // Seams and lost tiles do not shake the camera.
+    const share = this.heights ? 1 - Math.exp(-seconds * 6) : 1;
+    const before = this.heights ?? [near, far, ...there];
+    this.heights = [near, far, ...there].map((value, i) => before[i] + share * (value - before[i]));
+    const [eyeHeight, farHeight, east, north] = this.heights;
+    const lift = EYE_M / this.stage.look.z;
+    this.stage.camera.position.copy(this.stage.toScene(here.easting, here.northing, eyeHeight + lift));
+    this.stage.controls.target.copy(this.stage.toScene(east, north, farHeight + lift * 0.6));
+    this.stage.camera.lookAt(this.stage.controls.target);
+    this.stage.moved();
+  }
+
+  ahead() {
+    const length = this.along[this.along.length - 1];
+    if (this.at + AHEAD_M <= length) {
+      const { easting, northing } = placeAt(this.points, this.along, this.at + AHEAD_M);
+      return [easting, northing];
+    }
+    const { easting, northing, direction } = placeAt(this.points, this.along, length);
+    const rest = this.at + AHEAD_M - length;
+    return [easting + rest * direction[0], northing + rest * direction[1]];
+  }
+}

@@ -1,0 +1,134 @@
+// The overview with its settings: colour, search, and the tiles to look at first.
+
+import { byId, el, fill, show } from "./dom.js";
+import { OverviewMap } from "./map.js";
+import { choices } from "./map_colours.js";
+import { legend, reason, section, select, tileHead, tileList } from "./panel.js";
+import { DONE, FAILED, worst } from "./run.js";
+import { count, isFlagged, stateText } from "./words.js";
+
+const LISTED = 10;
+
+export class MapView {
+  /** `open(tile)` shows a tile in 3D; `changed()` is called when the address must follow. */
+  constructor(run, { open, changed }) {
+    this.run = run;
+    this.open = open;
+    this.changed = changed;
+    this.choices = choices(run);
+    this.choice = this.choices[0];
+    this.map = new OverviewMap(byId("map"), run, {
+      open: (tile) => this.choose(tile),
+      point: (tile, x, y) => this.tip(tile, x, y),
+    });
+    this.map.paint(this.choice.colour);
+  }
+
+  /** Colours the map by a choice; unknown keys are ignored. */
+  by(key) {
+    const choice = this.choices.find((one) => one.key === key);
+    if (!choice) return;
+    this.choice = choice;
+    this.map.paint(choice.colour);
+  }
+
+  /** Returns the settings. */
+  panel() {
+    const [first] = this.choices;
+    const rate = this.choices.find((choice) => choice.key === "error_estimate_m");
+    const listed = worst(this.run, LISTED);
+    this.results = el("div", {});
+    this.chosen = el("section", { hidden: true });
+    return [
+      this.chosen,
+      section(
+        "Colour of the tiles",
+        select("Colour of the tiles", this.choices, this.choice.key, (key) => {
+          this.by(key);
+          fill(this.legend, legend(this.choice.legend, this.choice.ramp));
+          this.changed();
+        }),
+        (this.legend = el("div", {}, legend(this.choice.legend, this.choice.ramp))),
+      ),
+      section(
+        "Find a tile",
+        el("input", {
+          type: "search",
+          placeholder: "Id of a tile",
+          "aria-label": "Id of a tile",
+          input: (event) => this.find(event.target.value.trim()),
+        }),
+        this.results,
+      ),
+      listed.length
+        ? section(
+            "Look at first",
+            tileList(listed, {
+              mark: first.colour,
+              value: (tile) => (tile.state === DONE ? rate?.text(tile) : null),
+              open: (tile) => this.choose(tile),
+            }),
+          )
+        : null,
+    ];
+  }
+
+  find(text) {
+    const found = text ? this.run.tiles.filter((tile) => tile.id.toLowerCase().includes(text.toLowerCase())) : [];
+    const more = found.length > LISTED ? el("p", { class: "quiet small" }, `and ${count(found.length - LISTED, "more")}`) : null;
+    const none = text && !found.length ? el("p", { class: "quiet small" }, "No tile has this in its id.") : null;
+    const list = tileList(found.slice(0, LISTED), {
+      mark: this.choices[0].colour,
+      value: () => null,
+      open: (tile) => this.choose(tile),
+    });
+    fill(this.results, list, more, none);
+  }
+
+  /** Opens a finished tile; of others, says what is known. */
+  choose(tile) {
+    this.map.select(tile);
+    if (tile.state === DONE) {
+      this.open(tile);
+      return;
+    }
+    fill(
+      this.chosen,
+      tileHead(tile),
+      tile.state === FAILED ? null : el("p", { class: "quiet small" }, "It has no surface yet."),
+    );
+    show(this.chosen, true);
+    byId("panel").classList.add("open");
+    byId("panel-content").scrollTop = 0;
+  }
+
+  tip(tile, x, y) {
+    const element = byId("tip");
+    show(element, Boolean(tile));
+    if (!tile) return;
+    const value = this.choice.text?.(tile);
+    fill(
+      element,
+      el("b", {}, tile.id),
+      value ? el("div", {}, `${this.choice.label}: ${value}`) : el("div", {}, stateText(tile)),
+      reason(tile) ? el("div", { class: "quiet" }, reason(tile)) : null,
+    );
+    const { clientWidth, clientHeight } = byId("map-view");
+    element.style.left = `${Math.max(Math.min(x + 16, clientWidth - element.offsetWidth - 8), 8)}px`;
+    element.style.top = `${Math.max(Math.min(y + 16, clientHeight - element.offsetHeight - 8), 8)}px`;
+  }
+}
+
+/** Returns the run's tiles in words: how many are done, failed, flagged. */
+export function summary(run) {
+  const number = (test) => run.tiles.filter(test).length;
+  const parts = [
+    [number((tile) => tile.state === DONE), "done"],
+    [number((tile) => tile.state === DONE && isFlagged(tile)), "to look at"],
+    [number((tile) => tile.state === FAILED), "failed"],
+    [number((tile) => tile.state !== DONE && tile.state !== FAILED), "not computed"],
+  ];
+  const shown = parts.filter(([amount]) => amount).map(([amount, label]) => `${amount} ${label}`);
+  return `${count(run.tiles.length, "tile")}: ${shown.join(", ")}`;
+}
+

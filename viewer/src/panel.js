@@ -1,0 +1,145 @@
+// The settings beside map and scene, as elements; what they do is passed in.
+
+import { el } from "./dom.js";
+import { ESTIMATE_COLOURS, ESTIMATE_MOST, SUPPORT_COLOURS } from "./material.js";
+import { DONE, FAILED } from "./run.js";
+import { OWN } from "./tile_object.js";
+import { SUPPORT, flagText, stateText } from "./words.js";
+
+/** Returns a section with a heading. */
+export function section(title, ...content) {
+  return el("section", {}, title ? el("h2", {}, title) : null, content);
+}
+
+/** Returns a select of choices with key and label. */
+export function select(label, choices, key, change) {
+  const options = choices.map((choice) => el("option", { value: choice.key, selected: choice.key === key }, choice.label));
+  return el("select", { "aria-label": label, change: (event) => change(event.target.value) }, options);
+}
+
+/** Returns buttons of which one is pressed. */
+export function buttons(choices, key, change) {
+  const made = choices.map((choice) =>
+    el(
+      "button",
+      {
+        type: "button",
+        "data-key": choice.key,
+        "aria-pressed": String(choice.key === key),
+        disabled: Boolean(choice.off),
+        title: choice.off,
+        click: () => change(choice.key),
+      },
+      choice.label,
+    ),
+  );
+  return el("div", { class: "choices", role: "group" }, made);
+}
+
+/** Returns a check box. */
+export function check(name, label, checked, change, off) {
+  const box = el("input", {
+    type: "checkbox",
+    name,
+    checked,
+    disabled: Boolean(off),
+    change: (event) => change(event.target.checked),
+  });
+  return el("label", { class: off ? "check off" : "check", title: off }, box, label);
+}
+
+/** Returns a slider with its value as text. */
+export function slider(name, label, { min, max, step, value }, text, change) {
+  const shown = el("output", {}, text(value));
+  const input = el("input", {
+    type: "range",
+    name,
+    min,
+    max,
+    step,
+    value,
+    "aria-label": label,
+    input: (event) => {
+      shown.textContent = text(Number(event.target.value));
+      change(Number(event.target.value));
+    },
+  });
+  return el("div", {}, el("div", { class: "split" }, el("span", {}, label), shown), input);
+}
+
+/** Returns entries of colour, label and number. */
+export function legend(entries, ramp) {
+  const bar = ramp && [
+    el("div", { class: "ramp", style: `background: linear-gradient(to right, ${ramp.stops.join(", ")})` }),
+    el("div", { class: "split quiet" }, el("span", {}, ramp.low), el("span", {}, ramp.high)),
+  ];
+  const rows = entries.map(({ colour, label, number }) =>
+    el(
+      "div",
+      {},
+      el("span", { class: "swatch", style: `background: ${colour}` }),
+      el("span", {}, label),
+      number === undefined ? null : el("span", { class: "number" }, String(number)),
+    ),
+  );
+  return el("div", { class: "legend" }, bar, rows);
+}
+
+/** Returns the legend of the surface's colours. */
+export function surfaceLegend(colour) {
+  if (colour === "support") return legend([1, 2, 3].map((k) => ({ colour: SUPPORT_COLOURS[k], label: SUPPORT[k] })));
+  if (colour === "estimate") {
+    return legend([], { stops: ESTIMATE_COLOURS, low: "0 m", high: `${ESTIMATE_MOST} m and more` });
+  }
+  if (colour === "photo") return null;
+  return legend([
+    { colour: OWN.road, label: "road" },
+    { colour: OWN.terrain, label: "terrain" },
+  ]);
+}
+
+/** Returns a list of tiles as buttons: mark, id, value, and why a tile is listed. */
+export function tileList(tiles, { mark, value, open }) {
+  const rows = tiles.map((tile) =>
+    el(
+      "li",
+      {},
+      el(
+        "button",
+        { type: "button", click: () => open(tile) },
+        el("span", { class: "swatch", style: `background: ${mark(tile)}` }),
+        el("span", { class: "id" }, tile.id),
+        el("span", { class: "value" }, value(tile) ?? ""),
+        reason(tile) ? el("span", { class: "why" }, reason(tile)) : null,
+      ),
+    ),
+  );
+  return el("ol", { class: "list" }, rows);
+}
+
+/** Returns why a tile needs a look, in one line; empty if it does not. */
+export function reason(tile) {
+  if (tile.state === FAILED) return tile.error || "failed";
+  return tile.flags.map(flagText).join("; ");
+}
+
+/** Returns id, state and problems of a tile. */
+export function tileHead(tile) {
+  return [
+    el("h3", {}, tile.id),
+    el("p", { class: "quiet" }, stateText(tile)),
+    tile.state === FAILED ? el("p", { class: "error" }, tile.error || "The reason is in the run's failures.csv.") : null,
+    tile.state === DONE && tile.flags.length
+      ? el("ul", { class: "notes" }, tile.flags.map((flag) => el("li", {}, flagText(flag))))
+      : null,
+  ];
+}
+
+/** Returns the figures of a tile, folded away; null if it has none. */
+export function tileFigures(tile, choices, open, toggle) {
+  const figures = choices.filter((choice) => choice.text).map((choice) => [choice.label, choice.text(tile)]);
+  const known = figures.filter(([, text]) => text !== null);
+  if (!known.length) return null;
+  const list = el("dl", { class: "facts" }, known.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]));
+  return el("details", { open, toggle: (event) => toggle(event.target.open) }, el("summary", {}, "Figures of this tile"), list);
+}

@@ -1,0 +1,58 @@
+// The card with what is under the cursor: coordinates, height, slopes, class, scan and terrain model.
+
+import { el, fill } from "./dom.js";
+import { nearestLine } from "./lines.js";
+import { lonLat, metres, signed } from "./place.js";
+import { along, steepest } from "./slopes.js";
+import { SUPPORT } from "./words.js";
+
+const LINE_WITHIN_M = 12;
+
+export class Readout {
+  constructor(element, run) {
+    this.element = element;
+    this.run = run;
+  }
+
+  /** Shows a place that `Stage.pick` found; null clears the card. */
+  show(pick) {
+    this.element.hidden = !pick;
+    if (!pick) return;
+    const { easting, northing, height, object } = pick;
+    Object.assign(this.element.dataset, { easting, northing, height, kind: pick.kind, tile: object.tile.id });
+    const [longitude, latitude] = lonLat(object.tile, object.data.corners, easting, northing);
+    const cells = object.cellsAt(easting, northing);
+    const rows = [
+      ["Height", `${metres(height)} m`, "strong"],
+      ["East, north", `${metres(easting, 2)}, ${metres(northing, 2)}`],
+      ["Lat, lon", `${latitude.toFixed(6)}°, ${longitude.toFixed(6)}°`],
+      ...this.slopes(pick),
+      ["Surface", [pick.kind, SUPPORT[cells.support]].filter((text) => text && text !== "no data").join(", ")],
+      compared("Scan (DSM)", cells.dsm - height),
+      compared("Terrain model (DTM)", cells.dtm - height),
+      Number.isNaN(cells.estimate) ? null : ["Error estimate", `${Math.round(100 * cells.estimate)} cm`],
+    ];
+    fill(
+      this.element,
+      rows.filter(Boolean).map(([name, text, kind]) => el("div", { class: kind ?? "" }, el("dt", {}, name), el("dd", {}, text))),
+    );
+  }
+
+  slopes(pick) {
+    const found = nearestLine(pick.object.data.lines, pick.easting, pick.northing, LINE_WITHIN_M);
+    if (pick.kind === "road" && found) {
+      const { grade, crossfall } = along(pick, found.direction);
+      const name = found.line.name ? ` of ${found.line.name}` : "";
+      return [
+        [`Grade${name}`, `${Math.abs(grade).toFixed(1)} %`],
+        ["Crossfall", `${Math.abs(crossfall).toFixed(1)} % to the ${crossfall >= 0 ? "right" : "left"}`],
+      ];
+    }
+    const { percent, towards } = steepest(pick);
+    return [["Slope", `${percent.toFixed(1)} %, falls to ${towards}`]];
+  }
+}
+
+function compared(name, difference) {
+  return Number.isNaN(difference) ? null : [name, `${signed(difference, 2)} m`];
+}
