@@ -18,8 +18,8 @@ export class Readout {
   show(pick) {
     this.element.hidden = !pick;
     if (!pick) return;
-    const { easting, northing, height, object } = pick;
-    Object.assign(this.element.dataset, { easting, northing, height, kind: pick.kind, tile: object.tile.id });
+    const { easting, northing, height, drawn, object } = pick;
+    Object.assign(this.element.dataset, { easting, northing, height, drawn, kind: pick.kind, tile: object.tile.id });
     const [longitude, latitude] = lonLat(object.tile, object.data.corners, easting, northing);
     const cells = object.cellsAt(easting, northing);
     const rows = [

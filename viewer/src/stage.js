@@ -166,7 +166,7 @@ export class Stage {
     return null;
   }
 
-  /** Returns place, height, slopes and tile under a pixel of the canvas; null where the sky is. */
+  /** Returns place, height, slopes and tile under a pixel of the canvas, and the height of the mesh; null where the sky is. */
   pick(x, y) {
     const { clientWidth, clientHeight } = this.renderer.domElement;
     const ray = new Raycaster();
@@ -191,6 +191,7 @@ export class Stage {
       easting,
       northing,
       height: surface?.height ?? height,
+      drawn: height,
       byEasting: surface?.byEasting ?? -x / y,
       byNorthing: surface?.byNorthing ?? z / y,
       kind: first.object.name,

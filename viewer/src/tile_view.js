@@ -26,7 +26,7 @@ export class TileView {
     this.stage = new Stage(this.canvas, run, scripts, {
       changed: () => this.followed(),
       loading: (number) => this.loading(number),
-      failed: (tile, error) => this.hint(`Tile ${tile.id}: ${error.message}`, 8000),
+      failed: (tile, error) => this.hint(`Tile ${tile.id}: ${error.message}`, tile === this.tile ? 0 : 8000),
       frame: () => this.overlay.update(),
     });
     this.overlay = new Overlay(this.stage);

@@ -1,0 +1,178 @@
+"""The viewer's folder is whole or has no page, and has what the run has."""
+
+import base64
+import http.client
+import json
+import threading
+import zlib
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from flexroad.catalog import Catalog
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.export import viewer
+from flexroad.pipeline.export.serving import server
+from flexroad.pipeline.export.viewer import MARK, PAGE, write_viewer
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    """A run of four tiles of 60 m with orthophotos: two done, one failed, one not computed."""
+    folder = tmp_path_factory.mktemp("view")
+    catalog = Catalog.read(write_scenes(folder / "survey", 4, seed=3, size_m=60, dop=True))
+    broken = catalog.tiles[2].layer("dsm")
+    catalog.tiles[2].paths(broken)[0].write_bytes(b"<script>")
+    run = Run.create(folder / "city", load_config("production"), catalog)
+    run_tiles(run, SerialExecutor(), only=lambda tile: tile != catalog.tiles[3])
+    return run.path
+
+
+@pytest.fixture(scope="module")
+def folder(city, tmp_path_factory):
+    out = tmp_path_factory.mktemp("page")
+    write_viewer(Run.open(city), out, SerialExecutor())
+    return out
+
+
+def handed_over(path):
+    """The arguments of the call in a script."""
+    text = path.read_text("ascii")
+    start, end = text.index("("), text.rindex(")")
+    return json.loads(f"[{text[start + 1 : end]}]")
+
+
+def test_index_has_all_tiles_with_their_states_and_errors(city, folder):
+    (index,) = handed_over(folder / "run.js")
+    tiles = index["tiles"]
+    assert sorted(tiles["state"]) == [viewer.PENDING, viewer.DONE, viewer.DONE, viewer.FAILED]
+    failed = tiles["state"].index(viewer.FAILED)
+    assert tiles["error"][failed].startswith("load: ")
+    assert [bool(error) for error in tiles["error"]].count(True) == 1
+    grids = {tile.id: tile.grid for tile in Run.open(city).catalog.tiles}
+    for tile_id, west, north in zip(tiles["id"], tiles["west"], tiles["height"], strict=True):
+        assert (west, north) == (grids[tile_id].west, 60)
+    done = [state == viewer.DONE for state in tiles["state"]]
+    assert [value is not None for value in tiles["measures"]["error_estimate_m"]] == done
+
+
+def test_tile_script_has_surface_rasters_and_degrees_of_the_run(city, folder):
+    tile = next(
+        tile
+        for tile in Run.open(city).catalog.tiles
+        if tile.id in handed_over(folder / "run.js")[0]["tiles"]["id"]
+    )
+    tile_id, scene = handed_over(folder / "tiles" / f"{tile.id}.js")
+    assert tile_id == tile.id
+    grid = scene["grid"]
+    assert (grid["west"], grid["rows"], grid["cols"]) == (tile.grid.west, 60, 60)
+    codes = np.frombuffer(zlib.decompress(base64.b64decode(scene["dtm"]["data"])), "<u2").reshape(60, 60)
+    assert (codes > 0).all()
+    assert zlib.decompress(base64.b64decode(scene["glb"]))[:4] == b"glTF"
+    to_degrees = Transformer.from_crs(tile.grid.crs, "EPSG:4326", always_xy=True)
+    west, south, east, north = tile.grid.bounds
+    assert scene["corners"][0] == pytest.approx(to_degrees.transform(west, south), abs=1e-8)
+    assert scene["corners"][3] == pytest.approx(to_degrees.transform(east, north), abs=1e-8)
+    assert scene["lines"]
+    assert all(-0.01 <= value <= 60.01 for line in scene["lines"] for value in line["points"])
+
+
+def test_second_writing_changes_no_tile(city, folder):
+    before = {file: file.stat().st_mtime_ns for file in (folder / "tiles").iterdir()}
+    written = write_viewer(Run.open(city), folder, SerialExecutor())
+    assert (written.tiles, written.others, written.notes) == (2, 2, ())
+    assert {file: file.stat().st_mtime_ns for file in (folder / "tiles").iterdir()} == before
+
+
+def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch):
+    write_viewer(Run.open(city), tmp_path, SerialExecutor())
+    assert MARK in (tmp_path / PAGE).read_bytes()
+
+    def fails(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(viewer, "write_pieces", fails)
+    with pytest.raises(OSError, match="disk full"):
+        write_viewer(Run.open(city), tmp_path, SerialExecutor())
+    assert not (tmp_path / PAGE).exists()
+
+
+def test_page_of_another_program_is_kept(city, tmp_path):
+    (tmp_path / PAGE).write_text("<h1>mine</h1>")
+    with pytest.raises(ConfigError, match="no page of `flexroad view`; choose another folder"):
+        write_viewer(Run.open(city), tmp_path, SerialExecutor())
+    assert (tmp_path / PAGE).read_text() == "<h1>mine</h1>"
+
+
+def test_selection_without_a_surface_is_a_map_alone(city, tmp_path):
+    run = Run.open(city)
+    written = write_viewer(run, tmp_path, SerialExecutor(), [run.catalog.tiles[2].id])
+    assert (written.tiles, written.others) == (0, 1)
+    assert (tmp_path / PAGE).exists()
+    assert not (tmp_path / "tiles").exists()
+
+
+def test_missing_sources_are_noted_and_the_mesh_is_shown(city, tmp_path):
+    run = Run.open(city)
+    tile = run.catalog.tiles[0]
+    file = tile.paths(tile.layer("dop"))[0]
+    aside = file.with_suffix(".aside")
+    file.rename(aside)
+    try:
+        written = write_viewer(run, tmp_path, SerialExecutor(), [tile.id])
+    finally:
+        aside.rename(file)
+    assert len(written.notes) == 1
+    assert written.notes[0].startswith(f"tile {tile.id}: no photo: ")
+    assert handed_over(tmp_path / "tiles" / f"{tile.id}.js")[1]["glb"]
+
+
+def test_command_writes_into_the_run_and_names_the_page(city, flexroad):
+    said = flexroad("view", city).expected(0)
+    assert said.out == f"2 tiles in 3D; 2 without a surface are on the map only: {city / 'viewer' / PAGE}\n"
+    assert (city / "viewer" / PAGE).exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "nowhere is no run"),
+        (["{city}", "--tile", "x"], "no tile 'x' in the catalog"),
+        (["{city}", "--bbox", "0", "0", "1", "1"], "no tile touches --bbox"),
+    ],
+)
+def test_command_with_bad_input_says_one_line(city, flexroad, words, message):
+    said = flexroad("view", *(word.format(city=city) for word in words)).expected(2)
+    (line,) = said.errors
+    assert message in line
+
+
+def answer(port, path, host=None):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{port}"})
+    return connection.getresponse().status
+
+
+def test_server_gives_files_of_the_folder_to_this_computer_alone(folder):
+    (folder.parent / "secret.txt").write_text("secret")
+    with server(folder, 0) as web:
+        thread = threading.Thread(target=web.serve_forever)
+        thread.start()
+        address, port = web.server_address[:2]
+        try:
+            assert address == "127.0.0.1"
+            assert answer(port, "/") == 200
+            assert answer(port, "/run.js", f"localhost:{port}") == 200
+            assert answer(port, "/tiles/") == 404
+            assert answer(port, "/../secret.txt") == 404
+            assert answer(port, "/", "evil.example") == 403
+        finally:
+            web.shutdown()
+            thread.join()
+    (folder.parent / "secret.txt").unlink()
