@@ -97,7 +97,9 @@ def write_viewer(
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
-    write(out / viewer.NAME_RUN, viewer.encode_run(index))
+    pictures = {row["tile"]: row["picture"] for row in rows if row["picture"]}
+    write(out / viewer.NAME_PICTURES, viewer.encode_pictures(pictures))
+    write(out / viewer.NAME_RUN, viewer.encode_run(index | {"pictures": bool(pictures)}))
     write(out / PAGE, (_built() / PAGE).read_bytes())
     notes = tuple(f"tile {row['tile']}: {note}" for row in rows for note in row["notes"])
     return Written(out / PAGE, len(done), len(tiles) - len(done), notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,7 +44,7 @@ class Look:
 
 
 def piece(tile: FinishedTile, look: Look) -> Piece:
-    """Return the script of a tile; its row names what could not be read."""
+    """Return the script of a tile; its row has its picture, and names what could not be read."""
     source, notes = tile.tile, list[str]()
     photo = _photo(source, look.photo_px, notes)
     quality, surface = tile.quality, tile.surface
@@ -51,10 +52,14 @@ def piece(tile: FinishedTile, look: Look) -> Piece:
         data, (estimate, _) = tile.data, tile.cell_errors
     except ConfigError as error:
         dsm = dtm = estimate = None
+        seen = ""
         notes.append(f"no scan and terrain model to compare with: {error}")
     else:
         window = data.grid.window(data.core)
         dsm, dtm = data.dsm[window], data.dtm[window]
+        height = surface.lattice(data.core.eastings, data.core.northings)
+        small = viewer.picture(height, tile.road.mask[window], data.core.cell)
+        seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(
         tile.id,
         glb.encode(tile.mesh, (*look.origin, 0.0), photo),
@@ -68,7 +73,7 @@ def piece(tile: FinishedTile, look: Look) -> Piece:
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"
-    return Piece({name: viewer.encode_tile(scene)}, {"tile": tile.id, "notes": notes})
+    return Piece({name: viewer.encode_tile(scene)}, {"tile": tile.id, "notes": notes, "picture": seen})
 
 
 def corners(tile: Tile) -> Floats:

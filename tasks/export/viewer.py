@@ -1,13 +1,14 @@
-"""Scripts of the browser viewer: one per tile, and one with the index of the run.
+"""Scripts of the browser viewer: one per tile, one with the index of the run, one with small pictures.
 
 Browsers read no data files from ``file://``, but they run scripts. Each script hands its data to a function
-of ``viewer.js``: ``FLEXROAD.tile(id, {...})`` or ``FLEXROAD.run({...})``. Data are JSON; arrays are base64
-of little-endian numbers, of which rasters and mesh are compressed by zlib.
+of ``viewer.js``: ``FLEXROAD.tile(id, {...})``, ``FLEXROAD.run({...})`` or ``FLEXROAD.pictures({...})``. Data
+are JSON; arrays are base64 of little-endian numbers, of which rasters and mesh are compressed by zlib.
 """
 
 from __future__ import annotations
 
 import base64
+import io
 import json
 import zlib
 from collections.abc import Mapping, Sequence
@@ -20,16 +21,22 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 VERSION = 1
-NAME_TILE, NAME_RUN = ".js", "run.js"
+NAME_TILE, NAME_RUN, NAME_PICTURES = ".js", "run.js", "pictures.js"
 MOST_CELLS = 256
 """Largest width and height of the rasters (cells); finer ones are thinned."""
 STEP_M = 0.001
 """Step of quantised heights (m); larger if heights span more than 65 m."""
 CODES = 65534
 """Number of steps of quantised heights: 16 bits, of which 0 means no height."""
+PICTURE_PX, PICTURE_QUALITY = 64, 55
+"""Largest width and height of the pictures on the map, and their quality (WebP)."""
+SUN = (-0.5, 0.5, 0.7)
+"""Direction of the light of the pictures: east, north, up."""
+ROAD_SHADE, TERRAIN_SHADE = 0.45, 0.92
+"""Brightness of level ground in the pictures, from 0 to 1."""
 ESTIMATE_STEP_M = 0.002
 """Step of the error estimate (m): 8 bits, up to 0.5 m; larger ones have the last value."""
 
@@ -88,6 +95,35 @@ def encode_tile(scene: TileScene) -> bytes:
 def encode_run(content: Mapping[str, Any]) -> bytes:
     """Return the script with the index of a run: JSON values; NaN is no value."""
     return _call("run", _finite(content))
+
+
+def picture(height: Floats, road: Bools, cell: float) -> bytes:
+    """Return a tile seen from above as a small grey WebP image: hillshade, roads darker.
+
+    Parameters
+    ----------
+    height : (H, W) array
+        The surface (m).
+    road : (H, W) array of bool
+    cell : float
+        Size of a cell (m).
+    """
+    from PIL import Image
+
+    by_south, by_east = np.gradient(height, cell) if min(height.shape) > 1 else np.zeros((2, *height.shape))
+    east, north, up = np.array(SUN) / np.linalg.norm(SUN)
+    light = (-by_east * east + by_south * north + up) / np.sqrt(1 + by_east**2 + by_south**2)
+    shade = np.where(road, ROAD_SHADE, TERRAIN_SHADE) * (1 + 1.5 * (light - up))
+    grey = Image.fromarray((255 * np.clip(shade, 0, 1)).astype(np.uint8))
+    grey.thumbnail((PICTURE_PX, PICTURE_PX), Image.Resampling.BOX)
+    encoded = io.BytesIO()
+    grey.save(encoded, "WEBP", quality=PICTURE_QUALITY)
+    return encoded.getvalue()
+
+
+def encode_pictures(pictures: Mapping[str, str]) -> bytes:
+    """Return the script with the pictures of tiles, by id, as base64."""
+    return _call("pictures", pictures)
 
 
 def _call(function: str, *arguments: Any) -> bytes:

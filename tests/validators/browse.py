@@ -66,7 +66,7 @@ def main() -> None:
         page.on("request", lambda request: requests.append(request.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.append(line.text) if line.type == "error" else None)
-        page.goto(wanted["url"])
+        page.goto(wanted["url"], timeout=PATIENCE_MS)
         results = [take(page, step) for step in wanted["steps"]]
         browser.close()
     others = [url for url in requests if not url.startswith(("file:", "data:"))]

@@ -4,11 +4,11 @@ import { el, fill, svg } from "./dom.js";
 import { metres, signed } from "./place.js";
 
 const SERIES = [
-  { name: "dsm", label: "Scan (DSM)" },
-  { name: "dtm", label: "Terrain model (DTM)" },
+  { name: "dsm", label: "Scan" },
+  { name: "dtm", label: "Terrain model" },
   { name: "surface", label: "Surface" },
 ];
-const MARGIN = { left: 52, right: 14, top: 10, bottom: 26 };
+const MARGIN = { left: 52, right: 14, top: 24, bottom: 26 };
 
 /** Draws stations into an element; `hover(station)` is called for the one under the pointer, null for none. */
 export function chart(element, stations, hover) {

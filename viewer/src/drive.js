@@ -5,13 +5,15 @@ import { continuation, lengths, nearestLine, placeAt } from "./lines.js";
 const EYE_M = 2.2;
 const AHEAD_M = 18;
 const START_WITHIN_M = 400;
+const REPORT_MS = 200;
 
 export class Drive {
-  /** `ended()` is called where the road line ends. */
-  constructor(stage, ended) {
+  /** `passed(pick)` is called with the surface below, some times a second; `ended()` where the road line ends. */
+  constructor(stage, { passed, ended }) {
     this.stage = stage;
+    this.passed = passed;
     this.ended = ended;
-    this.speed = 12;
+    this.speed = 40 / 3.6;
     this.running = false;
   }
 
@@ -65,7 +67,17 @@ export class Drive {
       return;
     }
     this.look(seconds);
+    this.report(now);
     requestAnimationFrame((next) => this.step(next));
+  }
+
+  report(now) {
+    if (now - (this.reported ?? -Infinity) < REPORT_MS) return;
+    this.reported = now;
+    const { easting, northing, direction } = placeAt(this.points, this.along, this.at);
+    const object = this.stage.objectAt(easting, northing);
+    const surface = object?.at(easting, northing);
+    if (surface) this.passed({ easting, northing, ...surface, drawn: surface.height, kind: "road", object, direction });
   }
 
   goOn(length) {

@@ -17,6 +17,9 @@ window.FLEXROAD = {
     received = data;
   },
   tile: (id, data) => scripts.take(id, data),
+  pictures: (pictures) => {
+    received.pictures = pictures;
+  },
 };
 
 window.addEventListener("load", () => {
@@ -37,6 +40,7 @@ class Page {
     this.maps = new MapView(run, { open: (tile) => this.openTile(tile), changed: () => this.follow() });
     this.listen();
     this.obey();
+    if (run.pictures) this.loadPictures();
   }
 
   listen() {
@@ -47,7 +51,23 @@ class Page {
       if (window.location.hash !== this.hash) this.obey();
     });
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.theme());
+    document.addEventListener("keydown", (event) => this.key(event));
     window.FLEXROAD.inspect = () => this.inspect();
+  }
+
+  /** Loads the small pictures of the tiles, when the map is already there. */
+  loadPictures() {
+    const script = el("script", { src: "pictures.js", load: () => this.maps.map.show(received.pictures) });
+    document.head.append(script);
+  }
+
+  /** Keys work wherever the focus is, but in fields that use them. */
+  key(event) {
+    const own = event.target.closest("input[type=search], input[type=range], select, dialog");
+    const pressed = event.key === "Enter" && event.target.closest("button, summary");
+    if (own || pressed || event.ctrlKey || event.metaKey || event.altKey) return;
+    const used = this.inTile ? this.tiles.key(event) : this.maps.key(event);
+    if (used) event.preventDefault();
   }
 
   /** Shows what the address says. */
@@ -68,7 +88,6 @@ class Page {
   async openTile(tile, state = {}) {
     if (!this.views()) return;
     this.switch(true);
-    fill(byId("title"), tile.id);
     fill(byId("summary"), this.run.name);
     const look = lookOf(state);
     if (Object.keys(look).length) this.tiles.stage.apply(look);
@@ -76,11 +95,9 @@ class Page {
     this.maps.map.selected = tile;
     await this.tiles.open(tile, state.camera, look.colour);
     this.follow();
-    byId("scene").focus({ preventScroll: true });
   }
 
   showMap() {
-    const before = this.tiles?.tile;
     this.tiles?.close();
     this.switch(false);
     fill(byId("title"), this.run.name);
@@ -88,7 +105,6 @@ class Page {
     fill(byId("panel-content"), this.maps.panel());
     this.maps.map.resize();
     this.follow();
-    if (before) byId("map").focus({ preventScroll: true });
   }
 
   switch(toTile) {
@@ -155,7 +171,7 @@ class Page {
       view: this.inTile ? "tile" : "map",
       tile: this.tiles?.tile?.id ?? null,
       loaded: stage ? [...stage.objects.keys()].map((tile) => tile.id) : [],
-      loading: stage?.loading ?? 0,
+      loading: (stage?.loading ?? 0) + (stage?.later ? 1 : 0),
       look: stage?.look,
       camera: stage?.active ? stage.where() : null,
       lines: this.tiles?.drive.lines.length ?? 0,

@@ -2,10 +2,12 @@
 
 import { gestures } from "./gestures.js";
 import { DONE, FAILED, boundsOf, tileAt } from "./run.js";
+import { bytesOf } from "./unpack.js";
 import { ViewBox } from "./view_box.js";
 
 const LABEL_PX = 110;
 const GAP_PX = 6;
+const PICTURE_PX = 16;
 /** Room for the bar above and the scale below (pixels). */
 const MARGINS = { top: 84, bottom: 48, sides: 24 };
 
@@ -18,6 +20,8 @@ export class OverviewMap {
     this.colour = () => "#888";
     this.selected = null;
     this.fitted = false;
+    this.pictures = {};
+    this.images = new Map();
     gestures(canvas, {
       move: (x, y) => this.changed(() => this.box.move(x, y)),
       zoom: (factor, x, y) => this.changed(() => this.box.zoom(factor, x, y)),
@@ -27,7 +31,6 @@ export class OverviewMap {
         if (tile) open(tile);
       },
     });
-    canvas.addEventListener("keydown", (event) => this.key(event, open, point));
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
   }
@@ -36,6 +39,26 @@ export class OverviewMap {
   paint(colour) {
     this.colour = colour;
     this.draw();
+  }
+
+  /** Draws pictures of tiles, by id: WebP as base64. */
+  show(pictures) {
+    this.pictures = pictures;
+    this.draw();
+  }
+
+  /** Returns the picture of a tile once it is decoded. */
+  image(tile) {
+    const text = this.pictures[tile.id];
+    if (!text) return null;
+    if (!this.images.has(tile)) {
+      this.images.set(tile, null);
+      createImageBitmap(new Blob([bytesOf(text)], { type: "image/webp" })).then((image) => {
+        this.images.set(tile, image);
+        this.draw();
+      });
+    }
+    return this.images.get(tile);
   }
 
   /** Marks a tile and moves the map if it lies outside. */
@@ -97,6 +120,12 @@ export class OverviewMap {
       context.globalAlpha = tile.state === DONE ? 1 : 0.85;
       context.fillStyle = this.colour(tile);
       context.fillRect(left, top, width, height);
+      const image = width > PICTURE_PX ? this.image(tile) : null;
+      if (image) {
+        context.globalCompositeOperation = "multiply";
+        context.drawImage(image, left, top, width, height);
+        context.globalCompositeOperation = "source-over";
+      }
       if (tile.state === FAILED && width > GAP_PX) cross(context, left, top, width, height);
       if (width > LABEL_PX) label(context, tile.id, left, top, width);
     }
@@ -128,8 +157,8 @@ export class OverviewMap {
     } else if (event.key === "Enter" && this.selected) open(this.selected);
     else if (zooms[event.key]) this.changed(() => this.box.zoom(zooms[event.key], this.box.width / 2, this.box.height / 2));
     else if (event.key === "0") this.fit();
-    else return;
-    event.preventDefault();
+    else return false;
+    return true;
   }
 }
 
@@ -151,11 +180,10 @@ function cross(context, left, top, width, height) {
 
 function label(context, text, left, top, width) {
   context.font = "12px system-ui, sans-serif";
-  context.fillStyle = "rgba(255,255,255,0.95)";
-  context.shadowColor = "rgba(0,0,0,0.7)";
-  context.shadowBlur = 3;
+  // A canvas gives an opaque fill back as #rrggbb.
+  const [red, green, blue] = [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16));
+  context.fillStyle = 0.3 * red + 0.59 * green + 0.11 * blue > 150 ? "#14252e" : "#ffffff";
   context.fillText(text, left + 8, top + 18, width - 16);
-  context.shadowBlur = 0;
 }
 
 function scaleBar(context, box, colour, font) {

@@ -24,6 +24,11 @@ export class MapView {
     this.map.paint(this.choice.colour);
   }
 
+  /** Does what a key means; returns whether it means anything. */
+  key(event) {
+    return this.map.key(event, (tile) => this.choose(tile), (tile, x, y) => this.tip(tile, x, y));
+  }
+
   /** Colours the map by a choice; unknown keys are ignored. */
   by(key) {
     const choice = this.choices.find((one) => one.key === key);
@@ -62,7 +67,7 @@ export class MapView {
       ),
       listed.length
         ? section(
-            "Look at first",
+            rate ? "Look at first, by error estimate" : "Look at first",
             tileList(listed, {
               mark: first.colour,
               value: (tile) => (tile.state === DONE ? rate?.text(tile) : null),

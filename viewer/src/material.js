@@ -1,6 +1,9 @@
 // How the surface is coloured: by class, photo, support or error estimate, with hillshading. Colours are sRGB throughout.
 
-import { Color, DoubleSide, ShaderMaterial, Vector3, Vector4 } from "three";
+import { Color, ColorManagement, DoubleSide, ShaderMaterial, Vector3, Vector4 } from "three";
+
+// Before the first colour is made: colours stay as they are written.
+ColorManagement.enabled = false;
 
 export const COLOURS = { class: 0, photo: 1, support: 2, estimate: 3 };
 export const SUPPORT_COLOURS = ["#808080", "#4f9d7c", "#e0b04c", "#c8553d"];

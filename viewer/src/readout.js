@@ -3,7 +3,7 @@
 import { el, fill } from "./dom.js";
 import { nearestLine } from "./lines.js";
 import { lonLat, metres, signed } from "./place.js";
-import { along, steepest } from "./slopes.js";
+import { along, compass, steepest } from "./slopes.js";
 import { SUPPORT } from "./words.js";
 
 const LINE_WITHIN_M = 12;
@@ -40,17 +40,26 @@ export class Readout {
 
   slopes(pick) {
     const found = nearestLine(pick.object.data.lines, pick.easting, pick.northing, LINE_WITHIN_M);
-    if (pick.kind === "road" && found) {
-      const { grade, crossfall } = along(pick, found.direction);
-      const name = found.line.name ? ` of ${found.line.name}` : "";
+    const direction = pick.direction ?? found?.direction;
+    if (pick.kind === "road" && direction) {
+      const { grade, crossfall } = along(pick, direction);
+      // Beside a standing cursor nobody drives: up and down have no meaning there.
+      const sense = pick.direction ? (grade < 0 ? " down" : " up") : "";
       return [
-        [`Grade${name}`, `${Math.abs(grade).toFixed(1)} %`],
-        ["Crossfall", `${Math.abs(crossfall).toFixed(1)} % to the ${crossfall >= 0 ? "right" : "left"}`],
+        ["Grade along the road", `${Math.abs(grade).toFixed(1)} %${sense}`],
+        ["Crossfall", `${Math.abs(crossfall).toFixed(1)} %, falls to ${side(crossfall, direction, pick.direction)}`],
       ];
     }
     const { percent, towards } = steepest(pick);
     return [["Slope", `${percent.toFixed(1)} %, falls to ${towards}`]];
   }
+}
+
+/** Returns where the crossfall leads: to the left or right of a driver, else by the compass. */
+function side(crossfall, [east, north], driven) {
+  if (driven) return crossfall >= 0 ? "the right" : "the left";
+  const sign = crossfall >= 0 ? 1 : -1;
+  return compass(((Math.atan2(sign * north, sign * -east) * 180) / Math.PI + 360) % 360);
 }
 
 function compared(name, difference) {

@@ -2,22 +2,20 @@
 //
 // x is east, y is up, z is south, all relative to the run's origin; heights are relative to `base`, times the exaggeration.
 
-import { Color, ColorManagement, Group, LinearSRGBColorSpace, PerspectiveCamera, Raycaster, Scene, Spherical, Vector2, Vector3, WebGLRenderer } from "three";
+import { Color, Group, LinearSRGBColorSpace, PerspectiveCamera, Raycaster, Scene, Spherical, Vector2, Vector3, WebGLRenderer } from "three";
 import { MapControls } from "three/addons/controls/MapControls.js";
 
 import { COLOURS, sharedUniforms } from "./material.js";
-import { contains, near } from "./run.js";
+import { DONE, contains, near, tileAt } from "./run.js";
 import { unpacked } from "./tile_data.js";
 import { TileObject } from "./tile_object.js";
-
-ColorManagement.enabled = false;
 
 const EYE = 1.5;
 const MOST_TILES = window.matchMedia("(max-width: 700px)").matches ? 5 : 9;
 const NEARBY = 1.6;
 
 export class Stage {
-  /** Draws into a canvas; `events` are changed(), loading(number), failed(tile, error). */
+  /** Draws into a canvas; `events` are changed(), entered(tile), loading(number), failed(tile, error), frame(). */
   constructor(canvas, run, scripts, events) {
     this.run = run;
     this.scripts = scripts;
@@ -205,7 +203,7 @@ export class Stage {
     this.frame = requestAnimationFrame(() => {
       this.frame = null;
       if (!this.active) return;
-      this.events.frame?.();
+      this.events.frame();
       const away = Math.max(this.camera.position.distanceTo(this.controls.target), 5);
       this.camera.near = away / 200;
       this.camera.far = away * 12 + 1500;
@@ -235,6 +233,11 @@ export class Stage {
     const away = this.camera.position.distanceTo(this.controls.target);
     const within = Math.min(Math.max(away, size * 0.5), size * 3);
     const wanted = new Set(near(this.run, easting, northing, within, MOST_TILES));
+    const under = tileAt(this.run, easting, northing);
+    if (under && under !== this.tile && under.state === DONE && this.objects.has(under)) {
+      this.tile = under;
+      this.events.entered(under);
+    }
     this.scripts.keepOnly(wanted);
     for (const tile of wanted) this.load(tile);
     // Tiles a little farther away stay: small moves must not load them again and again.

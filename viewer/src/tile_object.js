@@ -24,11 +24,12 @@ import { bilinear, centre, nearest } from "./raster.js";
 import { contains } from "./run.js";
 
 export const OWN = { road: "#565b66", terrain: "#c6bea9" };
-const POINT_COLOURS = [
-  [0.5, "#d1495b"],
-  [0.15, "#edae49"],
-  [-0.15, "#2a9d8f"],
-  [-Infinity, "#3d5a98"],
+/** Colours of scan points by their least height above the surface (m). */
+export const POINTS = [
+  { above: 0.5, colour: "#d1495b", label: "0.5 m or more above the surface" },
+  { above: 0.15, colour: "#edae49", label: "0.15 to 0.5 m above" },
+  { above: -0.15, colour: "#2a9d8f", label: "within 0.15 m" },
+  { above: -Infinity, colour: "#3d5a98", label: "below" },
 ];
 
 export class TileObject {
@@ -142,7 +143,7 @@ export class TileObject {
     geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
     const points = new Points(
       geometry,
-      new PointsMaterial({ size: 3, sizeAttenuation: false, vertexColors: true, toneMapped: false }),
+      new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true, toneMapped: false }),
     );
     points.position.set(x0 - this.origin[0], base, this.origin[1] - z0);
     this.group.add(points);
@@ -150,7 +151,7 @@ export class TileObject {
   }
 }
 
-const RGB = POINT_COLOURS.map(([above, text]) => [above, new Color(text).toArray()]);
+const RGB = POINTS.map(({ above, colour }) => [above, new Color(colour).toArray()]);
 
 function pointColour(off) {
   return RGB.find(([above]) => off >= above)[1];

@@ -4,11 +4,12 @@ import { chart, legend as chartLegend } from "./chart.js";
 import { byId, el, fill, show } from "./dom.js";
 import { Drive } from "./drive.js";
 import { Overlay } from "./overlay.js";
-import { buttons, check, section, slider, surfaceLegend, tileFigures, tileHead } from "./panel.js";
+import { buttons, check, legend, section, slider, surfaceLegend, tileFigures, tileHead } from "./panel.js";
 import { metres, signed } from "./place.js";
 import { csv, section as along, summary } from "./profile.js";
 import { Readout } from "./readout.js";
 import { Stage } from "./stage.js";
+import { POINTS } from "./tile_object.js";
 
 const CLICK_PX = 5;
 const KEYS = { r: "road", t: "terrain", w: "wire", s: "points" };
@@ -25,24 +26,31 @@ export class TileView {
     this.canvas = byId("scene");
     this.stage = new Stage(this.canvas, run, scripts, {
       changed: () => this.followed(),
+      entered: (tile) => this.enter(tile),
       loading: (number) => this.loading(number),
       failed: (tile, error) => this.hint(`Tile ${tile.id}: ${error.message}`, tile === this.tile ? 0 : 8000),
       frame: () => this.overlay.update(),
     });
     this.overlay = new Overlay(this.stage);
     this.readout = new Readout(byId("readout"), run);
-    this.drive = new Drive(this.stage, () => this.driveEnded());
+    this.drive = new Drive(this.stage, { passed: (pick) => this.readout.show(pick), ended: () => this.driveEnded() });
     this.places = [];
     this.listen();
   }
 
   /** Shows a tile in 3D. */
   async open(tile, camera, colour) {
-    this.tile = tile;
     this.chosen ||= Boolean(colour);
-    this.redraw();
+    this.enter(tile);
     await this.stage.open(tile, camera);
     if (this.tile === tile) this.redraw();
+  }
+
+  /** Takes the tile that is now looked at. */
+  enter(tile) {
+    this.tile = tile;
+    fill(byId("title"), tile.id);
+    this.redraw();
   }
 
   close() {
@@ -78,7 +86,7 @@ export class TileView {
         layer("terrain", "Terrain"),
         layer("wire", "Wireframe"),
         layer("points", "Scan points (DSM)", lacks(data?.dsm, "scan to compare with")),
-        look.points ? pointLegend() : null,
+        look.points ? legend(POINTS) : null,
       ),
       section(
         null,
@@ -167,7 +175,6 @@ export class TileView {
     this.canvas.addEventListener("pointerleave", (event) => {
       if (event.pointerType !== "touch") this.point(null);
     });
-    this.canvas.addEventListener("keydown", (event) => this.key(event));
     byId("section-close").addEventListener("click", () => this.measure(false));
     byId("section-save").addEventListener("click", () => this.save());
     fill(byId("section-legend"), chartLegend());
@@ -214,7 +221,7 @@ export class TileView {
     if (!this.stations || byId("section").hidden) return;
     const found = summary(this.stations);
     const text = found
-      ? `${metres(found.length, 1)} m, rises ${signed(found.rise, 2)} m, ${signed(found.grade, 1)} % on average`
+      ? `${metres(found.length, 1)} m, ${found.rise < 0 ? "falls" : "rises"} ${Math.abs(found.rise).toFixed(2)} m, ${signed(found.grade, 1)} % on average`
       : "No surface along this line";
     fill(byId("section-text"), text);
     chart(byId("chart"), this.stations, (station) =>
@@ -243,12 +250,10 @@ export class TileView {
   toggleDrive() {
     if (this.drive.running) this.drive.stop();
     else if (this.drive.start()) {
-      this.readout.show(null);
       byId("panel").classList.remove("open");
       this.hint("Escape or the button stops the drive.", 3000);
     } else this.hint("There is no road line near here.", 3000);
     this.redraw();
-    this.canvas.focus({ preventScroll: true });
   }
 
   driveEnded() {
@@ -276,8 +281,8 @@ export class TileView {
     fill(byId("loading"), number === 1 ? "Loading a tile" : `Loading ${number} tiles`);
   }
 
+  /** Does what a key means; returns whether it means anything. */
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
     const name = event.key.toLowerCase();
     const { controls } = this.stage;
     const arrows = { arrowleft: [1, 0], arrowright: [-1, 0], arrowup: [0, 1], arrowdown: [0, -1] };
@@ -289,8 +294,8 @@ export class TileView {
     else if (name === "d" && this.drive.lines.length) this.toggleDrive();
     else if (zooms[name]) this.zoom(zooms[name]);
     else if (arrows[name] && !this.drive.running) this.step(controls, arrows[name], event.shiftKey);
-    else return;
-    event.preventDefault();
+    else return false;
+    return true;
   }
 
   colourByKey(colour) {
@@ -324,18 +329,4 @@ export class TileView {
 
 function spot(place) {
   return place ? [place.easting, place.northing, place.height] : null;
-}
-
-function pointLegend() {
-  const rows = [
-    ["#d1495b", "0.5 m or more above the surface"],
-    ["#edae49", "0.15 to 0.5 m above"],
-    ["#2a9d8f", "within 0.15 m"],
-    ["#3d5a98", "below"],
-  ];
-  return el(
-    "div",
-    { class: "legend" },
-    rows.map(([colour, label]) => el("div", {}, el("span", { class: "swatch", style: `background: ${colour}` }), el("span", {}, label))),
-  );
 }

@@ -83,6 +83,18 @@ def test_tile_script_has_surface_rasters_and_degrees_of_the_run(city, folder):
     assert all(-0.01 <= value <= 60.01 for line in scene["lines"] for value in line["points"])
 
 
+def test_pictures_are_of_the_finished_tiles(folder):
+    (index,), (pictures,) = (handed_over(folder / name) for name in ("run.js", "pictures.js"))
+    done = [
+        tile
+        for tile, state in zip(*(index["tiles"][name] for name in ("id", "state")), strict=True)
+        if state == 1
+    ]
+    assert index["pictures"]
+    assert sorted(pictures) == sorted(done)
+    assert all(base64.b64decode(text)[8:12] == b"WEBP" for text in pictures.values())
+
+
 def test_second_writing_changes_no_tile(city, folder):
     before = {file: file.stat().st_mtime_ns for file in (folder / "tiles").iterdir()}
     written = write_viewer(Run.open(city), folder, SerialExecutor())

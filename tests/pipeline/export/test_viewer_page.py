@@ -25,8 +25,8 @@ pytestmark = pytest.mark.slow
 
 SCRIPT = Path(validators.__file__).with_name("browse.py")
 SETTLED = "() => { const now = FLEXROAD.inspect(); return now.loaded.length > 0 && now.loading === 0 }"
-MIDDLE = [350, 120, 600, 600]
-"""The middle of a page of 1400 x 900 pixels, without its panels."""
+MIDDLE = [200, 90, 420, 450]
+"""A part of the default page without its panels: x, y, width and height (pixels)."""
 AGREED_M = 0.015
 HIT = "<img src=x onerror='window.hit = 1'><script>window.hit = 1</script>"
 
@@ -47,7 +47,7 @@ def page(run, tmp_path_factory):
     return write_viewer(Run.open(run.path), out, SerialExecutor()).page
 
 
-def visit(page, *steps, fragment="", width=1400, height=900):
+def visit(page, *steps, fragment="", width=1000, height=640):
     """What steps on a page gave, with its requests and errors."""
     wanted = {
         "url": page.absolute().as_uri() + fragment,
@@ -138,7 +138,7 @@ def test_click_on_the_map_opens_the_tile_and_its_neighbours_and_escape_returns(r
 
 def test_picked_heights_are_those_of_the_surface(run, page):
     tile = run.catalog.tiles[0]
-    places = [[x, y] for x in range(380, 1000, 90) for y in range(250, 800, 80)]
+    places = [[x, y] for x in range(230, 630, 65) for y in range(180, 580, 60)]
     steps = [step for place in places for step in ({"move": place}, {"eval": READOUT})]
     found = browse(page, {"wait": SETTLED}, *steps, fragment=f"#tile={tile.id}")[2::2]
     picked = [shown for shown in found if shown.get("tile")]
@@ -160,7 +160,7 @@ def test_link_restores_camera_and_layers(run, page):
     first = browse(
         page,
         {"wait": SETTLED},
-        {"drag": [600, 500, 700, 430]},
+        {"drag": [400, 350, 460, 310]},
         {"press": "input[name=terrain]"},
         {"press": "[data-key=support]"},
         {"wait": "() => location.hash.includes('hide=terrain')"},
@@ -224,8 +224,8 @@ def test_section_between_two_clicks_has_the_heights_of_the_run(run, page):
         page,
         {"wait": SETTLED},
         {"press": "[data-tool=measure]"},
-        {"click": [420, 450]},
-        {"click": [800, 500]},
+        {"click": [260, 330]},
+        {"click": [520, 350]},
         {"wait": "() => document.querySelector('#chart path.surface')"},
         {"eval": table},
         {"eval": "document.getElementById('section-text').textContent"},
@@ -339,7 +339,7 @@ def test_markup_in_ids_and_errors_is_text(tmp_path):
     page = made(tmp_path, [HIT, "b"], [FAILED, DONE], [HIT, ""])
     results = browse(
         page,
-        {"move": [500, 200]},
+        {"move": [200, 300]},
         {"press": ".list button"},
         {"eval": "document.getElementById('app').textContent"},
         {"eval": "[window.hit === undefined, document.querySelectorAll('#app img, #app script').length]"},

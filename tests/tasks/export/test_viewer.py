@@ -1,14 +1,23 @@
 """Scripts of the viewer: rasters within half a step, thinned at the right places; texts stay texts."""
 
 import base64
+import io
 import json
 import zlib
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.export.viewer import ESTIMATE_STEP_M, MOST_CELLS, TileScene, encode_run, encode_tile
+from flexroad.tasks.export.viewer import (
+    ESTIMATE_STEP_M,
+    MOST_CELLS,
+    TileScene,
+    encode_run,
+    encode_tile,
+    picture,
+)
 
 GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 40, 30)
 
@@ -72,6 +81,22 @@ def test_error_estimates_are_within_half_a_step_up_to_half_a_metre():
     assert codes[0, 0] == 0
     assert codes[0, 1] == 255
     np.testing.assert_allclose((codes[1:] - 1.0) * ESTIMATE_STEP_M, estimate[1:], rtol=0, atol=0.00101)
+
+
+def test_picture_has_roads_darker_and_slopes_to_the_sun_brighter():
+    eastings, northings = np.meshgrid(np.arange(200.0), np.arange(100.0)[::-1])
+    road = (eastings > 120) & (eastings < 150)
+    seen = np.asarray(Image.open(io.BytesIO(picture(np.zeros((100, 200)), road, 1.0))).convert("L"), int)
+    assert seen.shape == (32, 64)
+    assert seen[:, 42].max() < seen[:, 10].min() - 60
+    # The sun is in the north-west: a slope that rises to the south-east faces it.
+    towards, away = (
+        np.asarray(
+            Image.open(io.BytesIO(picture(rise * (eastings - northings), road, 1.0))).convert("L"), int
+        )
+        for rise in (0.1, -0.1)
+    )
+    assert towards[16, 10] > away[16, 10] + 30
 
 
 def test_texts_of_the_index_stay_texts():
