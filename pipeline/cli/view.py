@@ -82,7 +82,7 @@ def view(
         echo(f"note: {note}", err=True)
     if len(written.notes) > MOST_NOTES:
         echo(f"note: and {count(len(written.notes) - MOST_NOTES, 'more note')}", err=True)
-    others = f"; {written.others} without a surface are on the map only" if written.others else ""
+    others = f", {written.others} more on the map only" if written.others else ""
     echo(f"{count(written.tiles, 'tile')} in 3D{others}: {written.page}")
     if serve and isinstance(folder, Path):
         _serve(folder, port)

@@ -147,7 +147,7 @@ def test_missing_sources_are_noted_and_the_mesh_is_shown(city, tmp_path):
 
 def test_command_writes_into_the_run_and_names_the_page(city, flexroad):
     said = flexroad("view", city).expected(0)
-    assert said.out == f"2 tiles in 3D; 2 without a surface are on the map only: {city / 'viewer' / PAGE}\n"
+    assert said.out == f"2 tiles in 3D, 2 more on the map only: {city / 'viewer' / PAGE}\n"
     assert (city / "viewer" / PAGE).exists()
 
 
