@@ -123,7 +123,7 @@ def test_click_on_the_map_opens_the_tile_and_its_neighbours_and_escape_returns(r
         page,
         {"eval": INSPECT},
         {"click": place},
-        {"wait": SETTLED},
+        {"wait": "() => FLEXROAD.inspect().loaded.length === 3"},
         {"eval": INSPECT},
         {"eval": "location.hash"},
         {"key": "Escape"},
