@@ -22,22 +22,42 @@ def report(
     path: options.Run,
     form: Annotated[
         Literal["md", "csv", "html"],
-        typer.Option("--format", help="html: one page with pictures.", rich_help_panel=options.OUTPUTS),
+        typer.Option(
+            "--format", help="html: one page with a map and pictures.", rich_help_panel=options.OUTPUTS
+        ),
     ] = "md",
+    compared: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="RUN",
+            help="html: compare with another run over the same tiles.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
+    viewer: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="html: link tiles to this 3D viewer; default: RUN/view if it exists.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
     allow: options.Allow = None,
 ) -> None:
-    """Write a report on a run: metrics, worst tiles, steps, failures.
+    """Write a report on a run: what failed, where to look, how good it is.
 
     The file is RUN/report.md, .csv or .html.
     """
     from rich.console import Console
 
-    from flexroad.catalog.storage.paths import read
+    from flexroad.catalog.storage.paths import parse_location, read
     from flexroad.pipeline.monitor.progress import StepProgress
     from flexroad.pipeline.report import write_report
     from flexroad.pipeline.run.record import Run
 
-    written = write_report(Run.open(path, allow or ()), form, StepProgress(Console(stderr=True)))
+    others = (None if other is None else parse_location(other) for other in (viewer, compared))
+    written = write_report(Run.open(path, allow or ()), form, StepProgress(Console(stderr=True)), *others)
     if form != "html":
         echo_document(read(written).decode())
     echo(f"written to {written}", err=True)

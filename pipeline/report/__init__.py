@@ -1,39 +1,70 @@
-"""Reports on a run as Markdown, CSV, or one HTML file with pictures."""
+"""Reports on a run as Markdown, CSV, or one HTML page with a map and pictures."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Literal
+from urllib.parse import quote
 
-from flexroad.catalog.storage.paths import Location, write
+from flexroad.catalog.storage.paths import Location, exists, is_remote, write
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.pages import csv_page, html_page, markdown_page
+from flexroad.pipeline.report.pages import csv_page, markdown_page
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
+from flexroad.pipeline.store.tables import read_metrics
 
 Format = Literal["md", "csv", "html"]
+VIEWER, PAGE = "view", "index.html"
+"""Folder in RUN where a 3D viewer is looked for, and its page."""
 
 
-def write_report(run: Run, form: Format, track: Track = untracked) -> Location:
+def write_report(
+    run: Run,
+    form: Format,
+    track: Track = untracked,
+    viewer: Location | None = None,
+    compared: Location | None = None,
+) -> Location:
     """Write RUN/report.<form> and return its path.
 
     Parameters
     ----------
+    run : Run
     form : {"md", "csv", "html"}
     track : callable
         Shows the progress of each step.
+    viewer : Location, optional
+        Folder of `flexroad view`, to which an HTML report links; by default RUN/view if there is one.
+    compared : Location, optional
+        Another run over the same tiles, with which an HTML report compares the figures.
 
     Raises
     ------
     ConfigError
-        If the run has no rows yet.
+        If a run has no rows yet, or ``viewer`` has no page.
     """
+    address = _viewer_address(run, viewer) if form == "html" else ""
+    before = (compared.name, read_metrics(compared)) if compared is not None and form == "html" else None
     content = gather(run, track)
     if form == "html":
-        from flexroad.pipeline.report.pictures import tile_pictures
+        from flexroad.pipeline.report.browser.page import html_page
 
-        text = html_page(content, tile_pictures(run, content, track))
+        text = html_page(run, content, address, before, track)
     else:
         text = {"md": markdown_page, "csv": csv_page}[form](content)
     path = run.path / f"report.{form}"
     write(path, text.encode())
     return path
+
+
+def _viewer_address(run: Run, folder: Location | None) -> str:
+    """Return the address of the viewer's page relative to RUN, empty if there is none."""
+    if folder is None:
+        return f"{VIEWER}/{PAGE}" if exists(run.path / VIEWER / PAGE) else ""
+    if not exists(folder / PAGE):
+        raise ConfigError(f"{folder} has no {PAGE}; make it with `flexroad view {run.path} -o {folder}`")
+    if is_remote(folder) or is_remote(run.path):
+        return str(folder / PAGE)
+    return quote(Path(os.path.relpath(str(folder / PAGE), str(run.path))).as_posix())

@@ -14,6 +14,7 @@ from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, summary, untracked
 from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.tables import read_metrics
 
 FIGURES = {
@@ -46,6 +47,13 @@ class Content:
     title: str
     state: str
     """Tiles done, failed, pending, in one line."""
+    counts: Summary
+    states: dict[str, TileState]
+    """State of every tile by id, in the order of the catalog."""
+    rows: pd.DataFrame
+    """The rows of metrics.parquet."""
+    variant: str
+    """The variant that is exported first."""
     reference: str
     """What the figures were measured against, in one paragraph."""
     main: pd.DataFrame
@@ -84,7 +92,8 @@ def gather(run: Run, track: Track = untracked) -> Content:
     """
     rows = read_metrics(run.path)
     done = rows[rows.status == "done"]
-    counts = summary(run, track)
+    states: dict[str, TileState] = {}
+    counts = summary(run, track, states.__setitem__)
     variants = [name for name in run.config.chains if name in set(done.variant)]
     exported = run.config.export.variants[0]
     failures = pd.DataFrame(
@@ -94,6 +103,10 @@ def gather(run: Run, track: Track = untracked) -> Content:
     return Content(
         title=f"FlexRoad: {run.config.name} over {count(counts.tiles, 'tile')}",
         state=_state(counts),
+        counts=counts,
+        states=states,
+        rows=rows,
+        variant=exported,
         reference=_reference(run, set(done.tile_id)),
         main=_over_tiles(done, variants, FIGURES, "mean"),
         median=_over_tiles(done, variants, FIGURES, "median"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
 
@@ -16,11 +16,15 @@ from markupsafe import Markup
 from flexroad.catalog.text import printable
 from flexroad.pipeline.report import meshes, quality
 from flexroad.pipeline.report.content import Content
+from flexroad.tasks.quality.places import Place
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as text, with its interval if it has one."""
 MARKUP = re.compile(r"[\\`*|~$]|<(?=[A-Za-z/!?])|^>|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
 """Characters that are markup in Markdown at this place: not, for example, ``_`` within a word."""
+
+MAIN = "Mean over tiles"
+WORST_ESTIMATES = "Worst tiles by error estimate, without ground truth"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +33,16 @@ class TilePictures:
 
     tile_id: str
     pictures: tuple[tuple[str, bytes], ...]
-    """Caption and PNG."""
+    """Caption and picture, the most telling ones first and last."""
     notes: tuple[str, ...] = ()
+    places: Mapping[str, Place] = field(default_factory=dict)
+    """Where to look, by flag."""
 
 
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     parts = [f"# {_marked(content.title)}", content.state + ".", _marked(content.reference)]
-    for title, table, line in _sections(content):
+    for title, table, line in sections(content):
         parts += [f"## {title}", *([line] if line else []), markdown(table)]
     versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", content.config)), default=0))
@@ -50,14 +56,6 @@ def csv_page(content: Content) -> str:
     return content.main.to_csv(index=False)
 
 
-def html_page(content: Content, tiles: Sequence[TilePictures]) -> str:
-    """Return the report as one self-contained HTML page."""
-    sections = list(_sections(content))
-    return template("page.html.j2").render(
-        title=content.title, content=content, sections=sections, tiles=tiles
-    )
-
-
 def template(name: str, *folders: Path) -> jinja2.Template:
     """Return a template from the given folders or this one, with filters for tables and pictures."""
     loader = jinja2.FileSystemLoader([*folders, Path(__file__).parent])
@@ -65,19 +63,25 @@ def template(name: str, *folders: Path) -> jinja2.Template:
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, finalize=_without_controls
     )
     environment.filters["table"] = _html
-    environment.filters["inline"] = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    environment.filters["inline"] = inline
     return environment.get_template(name)
 
 
-def _sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
+def inline(picture: bytes) -> str:
+    """Return a PNG or WebP picture as an address that has its bytes."""
+    kind = "webp" if picture[8:12] == b"WEBP" else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
+
+
+def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
     """Return title, table and explanation of every table that is not empty."""
     named = (
-        ("Mean over tiles", content.main, ""),
+        (MAIN, content.main, ""),
         ("Median over tiles", content.median, ""),
         ("Further figures, mean over tiles", content.further, ""),
         ("Per stratum, mean over tiles", content.strata, ""),
         ("Worst tiles by road L2", content.worst, ""),
-        ("Worst tiles by error estimate, without ground truth", content.worst_estimates, quality.MEANING),
+        (WORST_ESTIMATES, content.worst_estimates, quality.MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
         ("Meshes", content.meshes, meshes.MEANING),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),

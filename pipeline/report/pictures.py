@@ -1,9 +1,16 @@
-"""The pictures of a report: maps and mesh views of its tiles."""
+"""The pictures of a report: maps and mesh views of its tiles, as WebP."""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+
+from PIL import Image
+
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.report.estimate_picture import estimate_picture
 from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
 from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
@@ -12,21 +19,38 @@ from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
+from flexroad.tasks.quality.assess import Options, compare
+from flexroad.tasks.quality.places import places
+from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface, TileData
 
 MOST = 24
 """Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
+QUALITY = 80
+"""Quality of the WebP pictures: a tenth of the bytes of PNG."""
 NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 
 
-def tile_pictures(run: Run, content: Content, track: Track = untracked) -> list[TilePictures]:
-    """Draw the exported variant of every tile, or of the worst tiles of a large run."""
+def tile_pictures(
+    run: Run, content: Content, first: Sequence[str] = (), track: Track = untracked
+) -> list[TilePictures]:
+    """Draw the exported variant of every tile, or of a large run that of the worst tiles.
+
+    Parameters
+    ----------
+    run : Run
+    content : Content
+        Its tables.
+    first : sequence of str
+        Ids of finished tiles that are drawn in any case, and come first.
+    track : callable
+        Shows the progress.
+    """
     variant = run.config.export.variants[0]
-    tile_ids = _shown(content)
+    tile_ids = list(dict.fromkeys([*first, *_shown(content)]))
     maps: dict[str, TilePictures] = {}
     meshes: dict[str, Mesh] = {}
     tiles = {tile.id: tile for tile in run.catalog.tiles}
-    statuses = peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids])
+    statuses = peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids if tile_id in tiles])
     for status in track(statuses, "drawing tiles", len(tile_ids)):
         graph = status.graph
         evaluate = Evaluator(graph, ArtefactStore(run.store))
@@ -37,13 +61,25 @@ def tile_pictures(run: Run, content: Content, track: Track = untracked) -> list[
             # For example if source files were deleted after the run; the tables do not need them.
             maps[graph.tile.id] = TilePictures(graph.tile.id, (), (f"No pictures: {error}",))
     views = render_meshes(meshes)
-    return [_with_view(pictures, views.get(tile_id)) for tile_id, pictures in maps.items()]
+    return [_finished(pictures, views.get(tile_id)) for tile_id, pictures in maps.items()]
 
 
 def _shown(content: Content) -> list[str]:
     if len(content.tiles) <= MOST:
         return list(content.tiles)
-    return list(dict.fromkeys([*content.worst["tile"], *content.worst_estimates["tile"]]))
+    return list(dict.fromkeys([*content.worst_estimates["tile"], *content.worst["tile"]]))
+
+
+def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) -> bytes:
+    """Return a picture as WebP, smaller if it is wider than ``width_px``."""
+    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    if width_px is not None and image.width > width_px:
+        image = image.resize(
+            (width_px, round(image.height * width_px / image.width)), Image.Resampling.LANCZOS
+        )
+    buffer = io.BytesIO()
+    image.save(buffer, "webp", quality=quality, method=6)
+    return buffer.getvalue()
 
 
 def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
@@ -51,15 +87,20 @@ def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
     data: TileData = evaluate(nodes["load"])
     road: RoadMask = evaluate(nodes["segment"])
     clusters: RoadClusters = evaluate(nodes["ecsrc"])
+    surface: Surface = evaluate(nodes["fit"])
     mesh: Mesh = evaluate(nodes["sample"])
     quality: Quality = evaluate(nodes["assess"])
     core, window = data.core, data.grid.window(data.core)
     dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
     truth = (data.dtm if data.reference is None else data.reference)[window]
     against = "DTM" if data.reference is None else "reference"
+    options = Options.model_validate(graph.nodes[nodes["assess"]].options.model_dump())
+    cells = compare(data, road, clusters, surface, options)
+    at = {flag: place for flag, place in places(cells, core, options).items() if flag in quality.flags}
     return TilePictures(
         graph.tile.id,
         (
+            ("Error estimate along the road", estimate_picture(dsm, cells.estimate, raw, core, at)),
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
             ("Support of the surface along the road", support_picture(dsm, quality.support, raw, core)),
@@ -68,17 +109,15 @@ def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
             ),
         ),
-        (*_flags(quality), *data.notes, *road.notes),
+        (*data.notes, *road.notes),
+        at,
     )
 
 
-def _flags(quality: Quality) -> tuple[str, ...]:
-    return (f"Flags: {', '.join(quality.flags)}.",) if quality.flags else ()
-
-
-def _with_view(tile: TilePictures, view: bytes | None) -> TilePictures:
+def _finished(tile: TilePictures, view: bytes | None) -> TilePictures:
+    """Add the view of the mesh, if there is one, and make the pictures small."""
     if not tile.pictures:
         return tile
-    if view is None:
-        return TilePictures(tile.tile_id, tile.pictures, (*tile.notes, NO_MESH))
-    return TilePictures(tile.tile_id, (*tile.pictures, ("Mesh, from the south", view)), tile.notes)
+    views, notes = ((("The road from the south", view),), ()) if view else ((), (NO_MESH,))
+    pictures = tuple((caption, webp(png)) for caption, png in (*tile.pictures, *views))
+    return replace(tile, pictures=pictures, notes=(*tile.notes, *notes))

@@ -202,10 +202,15 @@ def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, 
         yield status.graph.tile.id, state, status.last_record
 
 
-def summary(run: Run, track: Track = untracked) -> Summary:
-    """Return the current summary of a run; checks every tile, its sources and its products."""
+def summary(
+    run: Run, track: Track = untracked, each: Callable[[str, TileState], object] = lambda tile_id, state: None
+) -> Summary:
+    """Return the current summary of a run; checks every tile, its sources and its products.
+
+    ``each`` receives id and state of every tile, in the catalog's order.
+    """
     with open_database(run) as database:
-        current = _checked(run, database, track=track)[0]
+        current = _checked(run, database, track=track, each=each)[0]
     last = read_summary(run.path)
     names = ("new", "changed", "vanished", "seconds", "interrupted", "refused")
     return replace(current, **{name: last[name] for name in names if name in last})
@@ -224,13 +229,18 @@ def recorded_summary(run: Run, database: RunDatabase, since: str) -> tuple[Summa
 
 
 def _checked(
-    run: Run, database: RunDatabase, since: str | None = None, track: Track = untracked
+    run: Run,
+    database: RunDatabase,
+    since: str | None = None,
+    track: Track = untracked,
+    each: Callable[[str, TileState], object] = lambda tile_id, state: None,
 ) -> tuple[Summary, int]:
     """Return what `recorded_summary` returns, from the tiles' folders and source files."""
     counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
     states = tile_states(run, database, since)
     for status, state in track(states, "checking tiles", len(run.catalog.tiles)):
         counts[state] += 1
+        each(status.graph.tile.id, state)
         record = status.last_record
         finished += record is not None and record.finished >= (since or "")
         without_roads += status.done and record is not None and record.without_roads

@@ -8,6 +8,8 @@ road with a large error estimate.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -78,6 +80,26 @@ class Options(base.Options):
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A surface beside DSM and DTM in the cells of a tile's core; arrays are ``(H, W)``."""
+
+    on_road: Bools
+    """Road cells of the raw mask within the survey."""
+    kept: Bools
+    """Those that the filter kept and that have a DSM height."""
+    classes: NDArray[np.uint8]
+    """The cells' `Support`."""
+    height: Floats
+    """Height of the surface (m)."""
+    off_dsm: Floats
+    """Surface minus DSM (m)."""
+    off_dtm: Floats
+    """Surface minus DTM (m)."""
+    estimate: Floats
+    """Estimated error of the surface (m), by `error_estimate`."""
+
+
 def assess(
     data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
 ) -> Quality:
@@ -101,13 +123,10 @@ def assess(
     Quality
         Figures over the road cells of the core; NaN where the tile or the surface has no such data.
     """
-    window, cell = data.grid.window(data.core), data.core.cell
-    estimate, classes = cell_errors(data, road, clusters, surface, options)
-    on_road = road.mask[window] & (classes != Support.NONE)
-    kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
-    height = surface.lattice(data.core.eastings, data.core.northings)
-    off_dsm, off_dtm = height - data.dsm[window], height - data.dtm[window]
-    residuals, to_dtm = _finite(off_dsm[kept]), _finite(off_dtm[on_road])
+    cells = compare(data, road, clusters, surface, options)
+    on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
+    estimate, cell = cells.estimate, data.core.cell
+    residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])
     figures = {
         "residual_median_m": _quantile(residuals, 50),
         "residual_nmad_m": nmad(residuals),
@@ -133,6 +152,21 @@ def assess(
     return Quality(**figures, flags=tuple(flags), support=classes)
 
 
+def compare(
+    data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
+) -> Compared:
+    """Compare a surface with DSM and DTM cell by cell; the parameters are those of `assess`."""
+    window = data.grid.window(data.core)
+    classes = support(data, road, clusters, options.agree_m)[window]
+    on_road = road.mask[window] & (classes != Support.NONE)
+    kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
+    height = surface.lattice(data.core.eastings, data.core.northings)
+    off_dsm, off_dtm = height - data.dsm[window], height - data.dtm[window]
+    dsm_above_dtm = data.dsm[window] - data.dtm[window]
+    estimate = error_estimate(off_dsm, off_dtm, dsm_above_dtm, kept, classes, data.core.cell)
+    return Compared(on_road, kept, classes, height, off_dsm, off_dtm, estimate)
+
+
 def cell_errors(
     data: TileData, road: RoadMask, clusters: RoadClusters, surface: Surface, options: Options
 ) -> tuple[Floats, NDArray[np.uint8]]:
@@ -140,13 +174,8 @@ def cell_errors(
 
     The estimate is NaN beyond the survey.
     """
-    window = data.grid.window(data.core)
-    classes = support(data, road, clusters, options.agree_m)[window]
-    dsm, dtm = data.dsm[window], data.dtm[window]
-    kept = road.mask[window] & clusters.mask[window] & np.isfinite(dsm) & (classes != Support.NONE)
-    height = surface.lattice(data.core.eastings, data.core.northings)
-    estimate = error_estimate(height - dsm, height - dtm, dsm - dtm, kept, classes, data.core.cell)
-    return np.where(classes == Support.NONE, np.nan, estimate), classes
+    cells = compare(data, road, clusters, surface, options)
+    return np.where(cells.classes == Support.NONE, np.nan, cells.estimate), cells.classes
 
 
 def error_estimate(

@@ -149,7 +149,8 @@ def test_report_writes_every_format(finished, form):
         assert "Steps between neighbouring tiles" in text
         assert "no fault" in text
     if form == "html":
-        assert text.count("data:image/png;base64,") >= 12
+        assert text.count("data:image/webp;base64,") >= 4 * 6
+        assert "Did it work?" in text
         assert "http" not in text.split("<body>")[1].split("Configuration")[0]
 
 

@@ -1,0 +1,1 @@
+"""The report as one HTML page: a map first, then what to look at, with the tables folded away."""
