@@ -131,7 +131,7 @@ def _flagged(table: TileTable) -> Iterator[Statement]:
         for name in str(flags).split(", ")
         if name and name != NO_ROAD
     )
-    told = ", ".join(f"{name} {n}" for name, n in names.most_common())
+    told = ", ".join(f"{name} {n:,}" for name, n in names.most_common())
     yield Statement(
         "flagged",
         f"{count(number, 'done tile')} should be looked at, by their flags: {told}. Below is where.",
