@@ -16,7 +16,7 @@ from tests.made_report import failed_row, made_content, made_row, made_run, many
 
 pytestmark = pytest.mark.slow
 
-BROWSE = Path(validators.__file__).with_name("browse.py")
+BROWSE = Path(validators.__file__).with_name("browse_report.py")
 EVIL = "<script>document.title='evil'</script><b>x</b>"
 SELECTED = {"js": "document.querySelector('#tile h3')?.textContent ?? ''"}
 PIXELS = {"js": "document.getElementById('map').toDataURL('image/png')"}
