@@ -28,7 +28,7 @@ export const OWN = { road: "#565b66", terrain: "#c6bea9" };
 export const POINTS = [
   { above: 0.5, colour: "#d1495b", label: "0.5 m or more above the surface" },
   { above: 0.15, colour: "#edae49", label: "0.15 to 0.5 m above" },
-  { above: -0.15, colour: "#2a9d8f", label: "within 0.15 m" },
+  { above: -0.15, colour: "#7d97a6", label: "within 0.15 m" },
   { above: -Infinity, colour: "#3d5a98", label: "below" },
 ];
 
