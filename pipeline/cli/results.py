@@ -45,7 +45,7 @@ def report(
     ] = None,
     allow: options.Allow = None,
 ) -> None:
-    """Write a report on a run: what failed, where to look, how good it is.
+    """Write a report on a run: failures, places, figures.
 
     The file is RUN/report.md, .csv or .html.
     """

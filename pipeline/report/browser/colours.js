@@ -26,8 +26,8 @@ const tone = () => (isDark() ? "dark" : "light");
 
 function themeColours() {
   return isDark()
-    ? { dark: true, ground: "#171c23", none: "#39414c", edge: "rgba(0,0,0,.45)", halo: "#10141a", mark: "#ffffff" }
-    : { dark: false, ground: "#eef1f4", none: "#d3d8de", edge: "rgba(255,255,255,.6)", halo: "#ffffff", mark: "#111820" };
+    ? { dark: true, ground: "#171c23", beyond: "#6d747d", none: "#39414c", edge: "rgba(0,0,0,.45)", halo: "#10141a", mark: "#ffffff" }
+    : { dark: false, ground: "#eef1f4", beyond: "#ffffff", none: "#d3d8de", edge: "rgba(255,255,255,.6)", halo: "#ffffff", mark: "#111820" };
 }
 
 function mix(stops, share) {

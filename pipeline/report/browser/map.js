@@ -185,6 +185,9 @@ class TileMap {
     for (const [i, [x, y, w, h]] of visible) {
       const n = places[i];
       if (n === undefined || n === null) continue;
+      // Shows where a tile reaches beyond the survey.
+      c.fillStyle = theme.beyond;
+      c.fillRect(x, y, w, h);
       c.drawImage(image, (n % columns) * side, Math.floor(n / columns) * side, side, side, x, y, w, h);
     }
   }

@@ -24,7 +24,7 @@ MAX_ERROR = 400
 """Longest text of an error on the page."""
 
 STATES = {
-    "fine": "done",
+    "fine": "done, no flag",
     "flagged": "done, flagged",
     "no-road": "done, no road",
     "failed": "failed",
