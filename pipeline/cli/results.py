@@ -39,7 +39,7 @@ def report(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="html: link tiles to this 3D viewer; default: RUN/view if it exists.",
+            help="html: link tiles to this 3D viewer; default: RUN/viewer if it exists.",
             rich_help_panel=options.INPUTS,
         ),
     ] = None,

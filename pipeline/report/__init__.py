@@ -16,7 +16,7 @@ from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.store.tables import read_metrics
 
 Format = Literal["md", "csv", "html"]
-VIEWER, PAGE = "view", "index.html"
+VIEWER, PAGE = "viewer", "index.html"
 """Folder in RUN where a 3D viewer is looked for, and its page."""
 
 
@@ -36,7 +36,7 @@ def write_report(
     track : callable
         Shows the progress of each step.
     viewer : Location, optional
-        Folder of `flexroad view`, to which an HTML report links; by default RUN/view if there is one.
+        Folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is one.
     compared : Location, optional
         Another run over the same tiles, with which an HTML report compares the figures.
 

@@ -1,4 +1,4 @@
-"""Open a page in a browser without a screen and take steps on it: ``python browse_report.py FILE < steps.json``.
+"""Open a page in a browser and take steps on it: ``python browse_report.py FILE < steps.json``.
 
 Prints the results of the steps, the requests, the errors of the page and whether it is wider than the window,
 as JSON. Run by the interpreter of `tests.validators`, which has Playwright.
