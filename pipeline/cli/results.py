@@ -115,7 +115,7 @@ def figures(
 ) -> None:
     """Draw the paper's figures from a run.
 
-    They are PDF and PNG, with a page of captions.
+    They are PDF and PNG, small WebP pictures, and a page of captions.
     """
     from flexroad.pipeline.reproduce.figures import write_figures
     from flexroad.pipeline.run.record import Run

@@ -26,7 +26,7 @@ from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface,
 MOST = 24
 """Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
 QUALITY = 80
-"""Quality of the WebP pictures: a tenth of the bytes of PNG."""
+"""Quality of the WebP pictures, which take a quarter of the bytes of PNG."""
 NO_MESH = "No 3D view: no usable OpenGL library (on Debian: apt-get install libegl1)."
 
 

@@ -44,6 +44,8 @@ function format(value) {
   return String(Number(value.toPrecision(3)));
 }
 
+const length = (metres) => (metres >= 1000 ? `${metres / 1000} km` : `${metres} m`);
+
 const withUnit = (value, unit) => (unit === "%" || unit === "°" ? format(value) + unit : `${format(value)} ${unit}`.trim());
 
 // A scale gives the colour of a tile, the text of its value, and the entries of the legend.

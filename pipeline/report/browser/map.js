@@ -168,7 +168,30 @@ class TileMap {
         c.strokeRect(x, y, w, h);
       }
     }
+    if (printing) this.paintScale(theme);
     this.on.view(this);
+  }
+
+  // Length of the scale bar: a round number of metres that takes at most 130 pixels.
+  scaleMetres() {
+    const most = 130 / this.view.scale, power = 10 ** Math.floor(Math.log10(most));
+    return [5, 2, 1].map((n) => n * power).find((n) => n <= most);
+  }
+
+  // On paper the map has another size than in the window, and its scale bar is a part of it.
+  paintScale(theme) {
+    const c = this.context, metres = this.scaleMetres(), right = 14 + metres * this.view.scale, y = this.height - 14;
+    c.strokeStyle = c.fillStyle = theme.mark;
+    c.lineWidth = 2;
+    c.beginPath();
+    c.moveTo(14, y - 10);
+    c.lineTo(14, y);
+    c.lineTo(right, y);
+    c.lineTo(right, y - 10);
+    c.stroke();
+    c.font = "14px sans-serif";
+    c.textAlign = "center";
+    c.fillText(length(metres), (14 + right) / 2, y - 5);
   }
 
   // Whole pixels, so that neighbours have no line between them.

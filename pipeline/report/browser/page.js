@@ -47,10 +47,9 @@ function hover(i, px, py) {
 }
 
 function drawScaleBar(map) {
-  const most = 130 / map.view.scale, power = 10 ** Math.floor(Math.log10(most));
-  const metres = [5, 2, 1].map((n) => n * power).find((n) => n <= most);
+  const metres = map.scaleMetres();
   find("scale").style.width = `${metres * map.view.scale}px`;
-  find("scale").textContent = metres >= 1000 ? `${metres / 1000} km` : `${metres} m`;
+  find("scale").textContent = length(metres);
 }
 
 function selectTile(i, byKey = false) {

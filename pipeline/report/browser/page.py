@@ -121,7 +121,7 @@ def html_page(
         comparison=comparison,
         looks=[_look(name, table, numbers, options, pictures, viewer) for name in first],
         ranked_by=ranked_by,
-        meaning=quality.MEANING,
+        meaning=quality.MEANING.replace("`", ""),
         viewer=viewer,
         view_command=f"flexroad view {shlex.quote(str(run.path))} -o {shlex.quote(str(run.path / 'view'))}",
         sections=[one for one in sections(content) if one[0] not in (MAIN, WORST_ESTIMATES)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -139,7 +140,8 @@ def described(options: Options) -> dict[str, dict[str, Any]]:
 
 def coordinates(east: float, north: float) -> str:
     """Return a place as easting and northing in whole metres: ``588,612 / 4,519,130``."""
-    return f"{east:,.0f} / {north:,.0f}"
+    # Half a metre is rounded up, as by the page's script.
+    return " / ".join(f"{math.floor(value + 0.5):,}" for value in (east, north))
 
 
 def _number(value: Any, percent: bool) -> str:

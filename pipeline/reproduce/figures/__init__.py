@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from a run, as PDF and PNG files with a page of captions."""
+"""The paper's figures, drawn from a run, as PDF, PNG and WebP files with a page of captions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_figures(
     run : Run
         A run with finished tiles.
     folder : Path
-        Folder for NAME.pdf, NAME.png and figures.md.
+        Folder for NAME.pdf, NAME.png, NAME.webp and figures.md.
     tile_id : str, optional
         The tile of the maps, renders and profile; by default the tile with the median road L2.
     roles : Roles, optional

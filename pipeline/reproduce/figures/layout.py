@@ -12,10 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
 from flexroad.catalog.storage.paths import write
+from flexroad.pipeline.report.pictures import webp
 
 WIDTH_IN = 7.0
 """Width of a figure: the text width of a page (inches)."""
 DPI = 220
+SMALL_PX = 960
+"""Width of the WebP picture, for web pages and mails."""
 
 RAW, PLANE, FLEXROAD, TRUTH, PATH = "#f08c00", "#2f9e44", "#1c5fb8", "#8a8f98", "#d6293e"
 """Colours as in the paper's Fig. 1: raw DSM, plane, FlexRoad, reference (grey) and the vehicle's path."""
@@ -62,10 +65,11 @@ def new_figure(height_in: float) -> Figure:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write NAME.pdf and NAME.png; equal figures give equal bytes."""
+    """Write NAME.pdf, NAME.png and NAME.webp, a small picture; equal figures give equal bytes."""
     # A date or a software version in the metadata would change the bytes.
     for kind, metadata in (("pdf", {"CreationDate": None, "Producer": None}), ("png", {"Software": None})):
         buffer = io.BytesIO()
         with rc_context(STYLE):
             figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
         write(folder / f"{name}.{kind}", buffer.getvalue())
+    write(folder / f"{name}.webp", webp(buffer.getvalue(), SMALL_PX))

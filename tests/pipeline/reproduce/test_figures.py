@@ -26,7 +26,7 @@ from flexroad.pipeline.reproduce.figures import (
     trade_off,
     trajectory,
 )
-from flexroad.pipeline.reproduce.figures.layout import DPI
+from flexroad.pipeline.reproduce.figures.layout import DPI, SMALL_PX
 from flexroad.pipeline.reproduce.metrics_data import collect
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -311,6 +311,8 @@ def test_write_figures_twice_gives_equal_files(run, rows, tmp_path):
             assert picture.width == 7 * DPI
             assert np.asarray(picture.convert("L")).std() > 10, f"{name} is blank"
         assert (tmp_path / "one" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        with Image.open(tmp_path / "one" / f"{name}.webp") as picture:
+            assert picture.width == SMALL_PX
         assert f"({name}.png)" in page
     assert page.splitlines()[0] == collect(run).line
     assert tile_view.typical_tile(rows, "flexroad") in page
