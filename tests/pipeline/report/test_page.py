@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.report import write_report
+from flexroad.pipeline.report import _viewer_address, write_report
 from flexroad.pipeline.report.browser.compare import compare
 from flexroad.pipeline.report.browser.histograms import histograms
 from flexroad.pipeline.report.browser.outcome import headline, statements
@@ -198,3 +198,12 @@ def test_report_without_table_or_viewer_names_the_remedy(run, tmp_path):
     with pytest.raises(ConfigError, match="metrics.parquet does not exist"):
         write_report(run, "html", compared=tmp_path)
     assert not (run.path / "report.html").exists()
+
+
+def test_viewer_is_found_in_the_run_or_given_and_its_address_is_relative(run, tmp_path):
+    assert _viewer_address(run, None) == ""
+    for folder in (run.path / "view", tmp_path / "3D & more"):
+        folder.mkdir()
+        (folder / "index.html").touch()
+    assert _viewer_address(run, None) == "view/index.html"
+    assert _viewer_address(run, tmp_path / "3D & more") == "../3D%20%26%20more/index.html"
