@@ -8,6 +8,7 @@ import { ViewBox } from "./view_box.js";
 const LABEL_PX = 110;
 const GAP_PX = 6;
 const PICTURE_PX = 16;
+const HATCH_PX = 24;
 /** Room for the bar above and the scale below (pixels). */
 const MARGINS = { top: 84, bottom: 48, sides: 24 };
 
@@ -126,7 +127,7 @@ export class OverviewMap {
         context.drawImage(image, left, top, width, height);
         context.globalCompositeOperation = "source-over";
       }
-      if (tile.state === FAILED && width > GAP_PX) cross(context, left, top, width, height);
+      if (tile.state === FAILED && width > HATCH_PX) cross(context, left, top, width, height);
       if (width > LABEL_PX) label(context, tile.id, left, top, width);
     }
     context.globalAlpha = 1;

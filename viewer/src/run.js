@@ -64,13 +64,15 @@ export function near(run, easting, northing, within, most) {
     .map(([, , tile]) => tile);
 }
 
-/** Returns the tiles that need a look first: failed ones, then by the error estimate. */
+/** Returns the tiles that need a look first: failed ones, up to a half, then those with the largest error estimates. */
 export function worst(run, most) {
-  const estimate = (tile) => tile.measures.error_estimate_m ?? -1;
-  return run.tiles
-    .filter((tile) => tile.state === FAILED || tile.flags.length || estimate(tile) > 0)
-    .sort((a, b) => (b.state === FAILED) - (a.state === FAILED) || estimate(b) - estimate(a))
-    .slice(0, most);
+  const estimate = (tile) => tile.measures.error_estimate_m ?? 0;
+  const failed = run.tiles.filter((tile) => tile.state === FAILED);
+  const others = run.tiles
+    .filter((tile) => tile.state === DONE && (tile.flags.length || estimate(tile) > 0))
+    .sort((a, b) => estimate(b) - estimate(a));
+  const first = failed.slice(0, Math.max(most / 2, most - others.length));
+  return [...first, ...others.slice(0, most - first.length)];
 }
 
 function offCentre(tile, easting, northing) {
