@@ -202,8 +202,8 @@ def test_report_without_table_or_viewer_names_the_remedy(run, tmp_path):
 
 def test_viewer_is_found_in_the_run_or_given_and_its_address_is_relative(run, tmp_path):
     assert _viewer_address(run, None) == ""
-    for folder in (run.path / "view", tmp_path / "3D & more"):
+    for folder in (run.path / "viewer", tmp_path / "3D & more"):
         folder.mkdir()
         (folder / "index.html").touch()
-    assert _viewer_address(run, None) == "view/index.html"
+    assert _viewer_address(run, None) == "viewer/index.html"
     assert _viewer_address(run, tmp_path / "3D & more") == "../3D%20%26%20more/index.html"
