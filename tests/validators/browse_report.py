@@ -28,7 +28,7 @@ def take(page, step):
             page.locator(selector).select_option(value)
         case {"picture": path}:
             page.screenshot(path=path)
-    page.wait_for_timeout(150)
+    page.wait_for_timeout(400)
     return None
 
 

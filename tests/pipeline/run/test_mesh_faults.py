@@ -9,8 +9,9 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.report.browser.page import html_page
 from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.pages import html_page, markdown_page
+from flexroad.pipeline.report.pages import markdown_page
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
@@ -102,7 +103,7 @@ def test_mesh_with_fault_fails_its_tile_with_one_line(survey, quick_config, tmp_
     assert list(table["meshes with faults"]) == [0, 1, 1]
     assert list(table.meshes) == [4, 4, 4]
     assert "| rgt | 4 | 20,886 | 1 | error: 1 of 4 meshes have faults |" in markdown_page(gather(run))
-    assert "error: 1 of 4 meshes have faults" in html_page(gather(run), ())
+    assert "error: 1 of 4 meshes have faults" in html_page(run, gather(run))
     monkeypatch.undo()
     assert run_tiles(run, SerialExecutor(), force=frozenset({"sample"})).done == 4
     assert set(checks(run).result) == {"no fault"}
