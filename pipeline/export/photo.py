@@ -40,8 +40,8 @@ def photo_state(tile: FinishedTile) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Photographed:
-    """A finished tile whose files have its photo; sent to a worker."""
+class OfTile:
+    """What has the id and the name of a finished tile; sent to a worker."""
 
     tile: FinishedTile
 
@@ -54,6 +54,11 @@ class Photographed:
     def label(self) -> str:
         """Its name in messages."""
         return self.tile.label
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed(OfTile):
+    """A finished tile whose files have its photo."""
 
     @property
     def fingerprint(self) -> str:

@@ -16,7 +16,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export import coarse
 from flexroad.pipeline.export.coarse import LEVELS, Branch, Place, branch_piece
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.photo import aerial_of, photo_state, texture_of
+from flexroad.pipeline.export.photo import OfTile, aerial_of, photo_state, texture_of
 from flexroad.pipeline.export.pieces import Piece, Row, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.store.products import TileProducts
@@ -31,22 +31,11 @@ NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Leaf:
-    """A finished tile whose mesh is placed on the Earth; sent to a worker."""
+class Leaf(OfTile):
+    """A finished tile whose mesh is placed on the Earth."""
 
-    tile: FinishedTile
     drape: bool
     """Whether its mesh is to have the orthophoto, even if that of the run has none."""
-
-    @property
-    def id(self) -> str:
-        """Id of the tile."""
-        return self.tile.id
-
-    @property
-    def label(self) -> str:
-        """Its name in messages."""
-        return self.tile.label
 
     @property
     def own(self) -> bool:
