@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 from urllib.parse import quote
 
 from flexroad.catalog.storage.paths import Location, exists, is_remote, write
@@ -13,11 +13,16 @@ from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, markdown_page
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
-from flexroad.pipeline.store.tables import read_metrics
+from flexroad.pipeline.store.tables import PREVIOUS, read_metrics
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Format = Literal["md", "csv", "html"]
 VIEWER, PAGE = "viewer", "index.html"
 """Folder in RUN where a 3D viewer is looked for, and its page."""
+LAST = "the state before the last run"
+"""Name of the run as it was before."""
 
 
 def write_report(
@@ -38,7 +43,8 @@ def write_report(
     viewer : Location, optional
         Folder of `flexroad view`, to which an HTML report links; by default RUN/viewer if there is one.
     compared : Location, optional
-        Another run over the same tiles, with which an HTML report compares the figures.
+        Another run over the same tiles, with which an HTML report compares the figures; by default this run
+        before its last execution.
 
     Raises
     ------
@@ -46,7 +52,7 @@ def write_report(
         If a run has no rows yet, or ``viewer`` has no page.
     """
     address = _viewer_address(run, viewer) if form == "html" else ""
-    before = (compared.name, read_metrics(compared)) if compared is not None and form == "html" else None
+    before = _before(run, compared) if form == "html" else None
     content = gather(run, track)
     if form == "html":
         from flexroad.pipeline.report.browser.page import html_page
@@ -57,6 +63,15 @@ def write_report(
     path = run.path / f"report.{form}"
     write(path, text.encode())
     return path
+
+
+def _before(run: Run, compared: Location | None) -> tuple[str, pd.DataFrame] | None:
+    """Return name and rows of the run to compare with, None if there is none."""
+    if compared is not None:
+        return compared.name, read_metrics(compared)
+    if not exists(run.path / PREVIOUS):
+        return None
+    return LAST, read_metrics(run.path, PREVIOUS)
 
 
 def _viewer_address(run: Run, folder: Location | None) -> str:

@@ -7,7 +7,7 @@
     RUN/run.json         store, origin, versions
     RUN/tiles/           products and markers
     RUN/store/           artefacts, unless the store is shared
-    RUN/metrics.parquet  one row per (tile, variant)
+    RUN/metrics.parquet  one row per (tile, variant); metrics.previous.parquet: before the last execution
     RUN/failures.csv     one row per failure
     RUN/log.jsonl        one event per line
     RUN/collection.json  STAC collection of the done tiles

@@ -18,6 +18,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.event_log import EventLog
+from flexroad.pipeline.run.previous import keep_previous
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import open_database, recorded_summary, tile_states, tile_statuses
 from flexroad.pipeline.run.summary import Summary, summarise, write_summary
@@ -202,6 +203,8 @@ def _close(
     )
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
+        if plan.todo:
+            keep_previous(run.path, run.config.cluster.flush)
         write_tables(run.path, database.rows(), database.failures(), run.config.cluster.flush)
         states = zip(run.catalog.tiles, database.states(), strict=True)
         write_collection(run, [tile for tile, state in states if state in ("done", "cached")])

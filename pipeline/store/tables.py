@@ -14,6 +14,8 @@ from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import Failure, MetricsRow
 
+METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
+"""Tables of a run, and before its last execution."""
 CHUNK = 10_000
 """Rows held in memory at a time; also the row groups of metrics.parquet."""
 
@@ -80,7 +82,7 @@ def write_tables(
 
     schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
     with (
-        atomic_file(run / "metrics.parquet", flushed) as path,
+        atomic_file(run / METRICS, flushed) as path,
         pq.ParquetWriter(path, schema, write_page_checksum=True) as table,
     ):
         for chunk in _chunks(rows):
@@ -98,15 +100,21 @@ def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
         yield chunk
 
 
-def read_metrics(run: Location) -> pd.DataFrame:
+def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
     """Read the rows of a run.
+
+    Parameters
+    ----------
+    run : Location
+    name : str
+        File in the folder of the run.
 
     Raises
     ------
     ConfigError
         If the table does not exist yet or is damaged.
     """
-    path = run / "metrics.parquet"
+    path = run / name
     if not exists(path):
         raise ConfigError(f"{path} does not exist; `flexroad rerun {run}` finishes the run")
     try:
@@ -116,7 +124,8 @@ def read_metrics(run: Location) -> pd.DataFrame:
         # Tables of older versions lack the newer columns.
         return frame.reindex(columns=list(COLUMNS))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} is damaged: {error}; `flexroad rerun {run}` writes it again") from error
+        remedy = f"`flexroad rerun {run}` writes it again" if name == METRICS else "remove it"
+        raise ConfigError(f"{path} is damaged: {error}; {remedy}") from error
 
 
 def frame_of(data: bytes) -> pd.DataFrame:
