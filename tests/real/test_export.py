@@ -1,6 +1,7 @@
 """Barbican, London, in all formats of exports: read back, the heights are those of the fitted surfaces."""
 
 import csv
+import io
 import shutil
 import zipfile
 from xml.etree import ElementTree
@@ -12,6 +13,8 @@ import pytest
 import rasterio
 import rhino3dm
 import shapely
+from PIL import Image
+from pmtiles.reader import MmapSource, Reader, all_tiles
 from pyproj import Transformer
 from rio_cogeo import cog_validate
 
@@ -164,3 +167,40 @@ def test_mosaic_has_the_heights_of_the_surfaces(barbican, exported):
         x, y = raster.xy(rows, columns)
     truth = true_heights(barbican, np.column_stack([x, y]))
     np.testing.assert_allclose(heights[rows, columns], truth, rtol=0, atol=FORMATS["mosaic"].precision_m)
+
+
+def test_road_lines_lie_on_the_surface(barbican, exported):
+    (file,) = (exported / "lines").glob("*.gpkg")
+    roads = geopandas.read_file(file, layer="roads")
+    assert set(roads["name"]) == set(STREETS)
+    places = shapely.get_coordinates(roads.geometry, include_z=True)
+    assert len(places) > 800
+    # The ends lie on the limit of the tiles or of the survey.
+    heights = true_heights(barbican, places[:, :2])
+    known = np.isfinite(heights)
+    assert known.mean() > 0.99
+    np.testing.assert_allclose(places[known, 2], heights[known], rtol=0, atol=1e-4)
+
+
+def test_map_tiles_have_the_heights_of_the_surfaces(barbican, exported):
+    (file,) = (exported / "pmtiles").glob("*.pmtiles")
+    plan = Transformer.from_crs("EPSG:3857", "EPSG:27700", always_xy=True)
+    with file.open("rb") as stream:
+        archive = MmapSource(stream)
+        none, finest = Reader(archive).metadata()["no_height_m"], Reader(archive).header()["max_zoom"]
+        side_m = 2 * np.pi * 6378137 / 2**finest
+        compared = 0
+        for (zoom, column, row), data in all_tiles(archive):
+            if zoom < finest:
+                continue
+            red, green, blue = np.moveaxis(np.asarray(Image.open(io.BytesIO(data)), float), -1, 0)
+            height = red * 256 + green + blue / 256 - 32768
+            parts = (np.arange(len(height)) + 0.5) / len(height)
+            x, y = np.meshgrid((column + parts) * side_m, (row + parts) * side_m)
+            half = side_m * 2**finest / 2
+            places = np.column_stack(plan.transform((x - half).ravel(), (half - y).ravel()))
+            known = height.ravel() != none
+            error = height.ravel()[known] - true_heights(barbican, places[known])
+            assert np.nanmax(np.abs(error)) <= FORMATS["pmtiles"].precision_m
+            compared += known.sum()
+    assert compared > 500 * 600
