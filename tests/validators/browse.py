@@ -3,9 +3,10 @@
 Usage: browse.py < JSON with url, program, width, height, dark and steps
 
 A step has one key: ``eval`` (JavaScript), ``wait`` (until JavaScript is true), ``move``, ``click``, ``drag``
-or ``tap`` (pixels), ``press`` (selector of what is clicked), ``key``, ``shot`` (x, y, width and height; gives
-a PNG in base64). The output has the results, all requests but those of files and data, and all errors of the
-page.
+or ``tap`` (pixels), ``press`` (selector of what is clicked, or selector, x and y in it), ``focus``
+(selector), ``select`` (selector and value), ``key``, ``shot`` (x, y, width and height; gives a PNG in
+base64). The output has the results, all requests but those of files and data, all errors of the page, and
+whether the page is wider than the window.
 """
 
 import base64
@@ -17,38 +18,63 @@ from playwright.sync_api import Page, sync_playwright
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PATIENCE_MS = 120_000
 SETTLED_MS = 400
+DRAWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+WIDE = "document.documentElement.scrollWidth > window.innerWidth"
+
+
+def shot(page: Page, box: list[int]) -> str:
+    """Return a part of the page as PNG in base64."""
+    page.wait_for_timeout(SETTLED_MS)
+    clip = dict(zip(("x", "y", "width", "height"), box, strict=True))
+    return base64.b64encode(page.screenshot(clip=clip)).decode()
+
+
+def drag(page: Page, way: list[int]) -> None:
+    """Drag the mouse from a place to another."""
+    page.mouse.move(*way[:2])
+    page.mouse.down()
+    page.mouse.move(*way[2:], steps=5)
+    page.mouse.up()
+
+
+def press(page: Page, value: str | list) -> None:
+    """Click on an element, in its middle or at a place in it."""
+    selector, *place = [value] if isinstance(value, str) else value
+    position = {"x": place[0], "y": place[1]} if place else None
+    page.locator(selector).first.click(position=position)
+
+
+def select(page: Page, value: list[str]) -> None:
+    """Choose a value of a list, and wait until the page has changed."""
+    selector, chosen = value
+    page.locator(selector).select_option(chosen)
+    page.wait_for_timeout(SETTLED_MS)
+
+
+ASKED = {
+    "eval": lambda page, code: page.evaluate(code),
+    "shot": shot,
+}
+DONE = {
+    "wait": lambda page, code: page.wait_for_function(code),
+    "move": lambda page, place: page.mouse.move(*place),
+    "click": lambda page, place: page.mouse.click(*place),
+    "drag": drag,
+    "tap": lambda page, place: page.touchscreen.tap(*place),
+    "press": press,
+    "focus": lambda page, selector: page.locator(selector).focus(),
+    "select": select,
+    "key": lambda page, name: page.keyboard.press(name),
+}
 
 
 def take(page: Page, step: dict) -> object:
     """Take one step; return what it gives."""
     ((kind, value),) = step.items()
-    if kind == "eval":
-        return page.evaluate(value)
-    if kind == "shot":
-        page.wait_for_timeout(SETTLED_MS)
-        x, y, width, height = value
-        clip = {"x": x, "y": y, "width": width, "height": height}
-        return base64.b64encode(page.screenshot(clip=clip)).decode()
-    if kind == "wait":
-        page.wait_for_function(value, timeout=PATIENCE_MS)
-    elif kind == "move":
-        page.mouse.move(*value)
-        page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    elif kind == "click":
-        page.mouse.click(*value)
-    elif kind == "drag":
-        page.mouse.move(*value[:2])
-        page.mouse.down()
-        page.mouse.move(*value[2:], steps=5)
-        page.mouse.up()
-    elif kind == "tap":
-        page.touchscreen.tap(*value)
-    elif kind == "press":
-        page.locator(value).first.click(timeout=PATIENCE_MS)
-    elif kind == "key":
-        page.keyboard.press(value)
-    else:
-        raise ValueError(f"unknown step {kind}")
+    if kind in ASKED:
+        return ASKED[kind](page, value)
+    DONE[kind](page, value)
+    page.evaluate(DRAWN)
     return None
 
 
@@ -63,14 +89,17 @@ def main() -> None:
             color_scheme="dark" if wanted.get("dark") else "light",
             has_touch=wanted["width"] < 600,
         )
+        page.set_default_timeout(PATIENCE_MS)
         page.on("request", lambda request: requests.append(request.url))
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda line: errors.append(line.text) if line.type == "error" else None)
-        page.goto(wanted["url"], timeout=PATIENCE_MS)
+        page.goto(wanted["url"])
+        page.evaluate(DRAWN)
         results = [take(page, step) for step in wanted["steps"]]
+        wide = page.evaluate(WIDE)
         browser.close()
     others = [url for url in requests if not url.startswith(("file:", "data:"))]
-    json.dump({"results": results, "requests": others, "errors": errors}, sys.stdout)
+    json.dump({"results": results, "requests": others, "errors": errors, "wide": wide}, sys.stdout)
 
 
 main()

@@ -2,9 +2,6 @@
 
 import base64
 import io
-import json
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,11 +16,10 @@ from flexroad.pipeline.export.viewer import DONE, FAILED, PENDING, built_files, 
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.export import viewer
-from tests import validators
+from tests.validators.pages import browse, visit
 
 pytestmark = pytest.mark.slow
 
-SCRIPT = Path(validators.__file__).with_name("browse.py")
 SETTLED = "() => { const now = FLEXROAD.inspect(); return now.loaded.length > 0 && now.loading === 0 }"
 MIDDLE = [200, 90, 420, 450]
 """A part of the default page without its panels: x, y, width and height (pixels)."""
@@ -45,29 +41,6 @@ def run(tmp_path_factory):
 def page(run, tmp_path_factory):
     out = tmp_path_factory.mktemp("built")
     return write_viewer(Run.open(run.path), out, SerialExecutor()).page
-
-
-def visit(page, *steps, fragment="", width=1000, height=640):
-    """What steps on a page gave, with its requests and errors."""
-    wanted = {
-        "url": page.absolute().as_uri() + fragment,
-        "program": str(validators.browser()),
-        "width": width,
-        "height": height,
-        "steps": steps,
-    }
-    command = [validators.python(), SCRIPT]
-    done = subprocess.run(command, input=json.dumps(wanted), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def browse(page, *steps, **options):
-    """What steps on a page gave; fails on a request or an error of the page."""
-    answer = visit(page, *steps, **options)
-    assert answer["requests"] == []
-    assert answer["errors"] == []
-    return answer["results"]
 
 
 def picture(png):

@@ -2,46 +2,27 @@
 
 import base64
 import io
-import json
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from flexroad.pipeline.report.browser.page import html_page
-from tests import validators
 from tests.made_report import failed_row, made_content, made_row, made_run, many_rows
+from tests.validators.pages import visit
 
 pytestmark = pytest.mark.slow
 
-BROWSE = Path(validators.__file__).with_name("browse_report.py")
 EVIL = "<script>document.title='evil'</script><b>x</b>"
-SELECTED = {"js": "document.querySelector('#tile h3')?.textContent ?? ''"}
-PIXELS = {"js": "document.getElementById('map').toDataURL('image/png')"}
+SELECTED = {"eval": "document.querySelector('#tile h3')?.textContent ?? ''"}
+PIXELS = {"eval": "document.getElementById('map').toDataURL('image/png')"}
 MOST_BYTES = 15_000_000
 MANY = [f"{588000 + 250 * (i % 100)}_{5519000 + 250 * (i // 100)}" for i in range(10_000)]
 
 
-def browse(file, *steps, width=1400, scheme="light", place=""):
+def shown(file, *steps, width=1400, scheme="light", place=""):
     """Return the results of the steps on a page; it has no error, requests nothing and fits the window."""
-    setting = {
-        "browser": str(validators.browser()),
-        "width": width,
-        "scheme": scheme,
-        "hash": place,
-        "steps": steps,
-    }
-    done = subprocess.run(
-        [validators.python(), BROWSE, file],
-        input=json.dumps(setting),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
+    said = visit(file, *steps, fragment=place, width=width, height=900, dark=scheme == "dark")
     assert said["requests"] == []
     assert said["errors"] == []
     assert not said["wide"]
@@ -81,23 +62,23 @@ def large(tmp_path_factory, made_survey):
 def test_click_and_arrow_keys_select_tiles_and_markup_is_text(small):
     # The map is square and its tiles are 2 x 2 around the middle.
     middle = "(c => [c.clientWidth / 2, c.clientHeight / 2])(document.getElementById('map'))"
-    ((x, y),) = browse(small, {"js": middle})
-    results = browse(
+    ((x, y),) = shown(small, {"eval": middle})
+    results = shown(
         small,
         SELECTED,
-        {"click": "#map", "at": [x - 60, y + 60]},
+        {"press": ["#map", x - 60, y + 60]},
         SELECTED,
-        {"press": "ArrowRight"},
+        {"key": "ArrowRight"},
         SELECTED,
-        {"js": "document.getElementById('tile').textContent"},
-        {"js": "document.querySelector('#tile .links a').getAttribute('href')"},
-        {"press": "ArrowUp"},
+        {"eval": "document.getElementById('tile').textContent"},
+        {"eval": "document.querySelector('#tile .links a').getAttribute('href')"},
+        {"key": "ArrowUp"},
         SELECTED,
-        {"press": "ArrowLeft"},
-        {"js": "document.querySelector('#tile .error').textContent"},
-        {"press": "Escape"},
+        {"key": "ArrowLeft"},
+        {"eval": "document.querySelector('#tile .error').textContent"},
+        {"key": "Escape"},
         SELECTED,
-        {"js": "[document.title, location.hash]"},
+        {"eval": "[document.title, location.hash]"},
     )
     before, _, south_west, _, south_east, details, link, _, north_east, _, error, _, after, ends = results
     assert (before, south_west, south_east, north_east, after) == ("", "a", EVIL, "d", "")
@@ -109,16 +90,16 @@ def test_click_and_arrow_keys_select_tiles_and_markup_is_text(small):
 
 def test_address_and_list_select_tiles(small):
     press = "[...document.querySelectorAll('.look button[data-tile]')].at(-1).click()"
-    assert browse(small, SELECTED, place="#tile=c")[0] == "c"
-    assert browse(small, {"js": press}, SELECTED) == [None, "a"]
+    assert shown(small, SELECTED, place="#tile=c")[0] == "c"
+    assert shown(small, {"eval": press}, SELECTED) == [None, "a"]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_colour_by_column_and_legend_change_the_pixels(small, scheme):
-    by = {"select": "#colour-by", "value": "error_estimate_m"}
-    hide = {"js": "document.querySelector('#legend button').click()"}
-    states, _, estimates, _, _, hidden = browse(
-        small, PIXELS, by, PIXELS, {"select": "#colour-by", "value": "state"}, hide, PIXELS, scheme=scheme
+    by = {"select": ["#colour-by", "error_estimate_m"]}
+    hide = {"eval": "document.querySelector('#legend button').click()"}
+    states, _, estimates, _, _, hidden = shown(
+        small, PIXELS, by, PIXELS, {"select": ["#colour-by", "state"]}, hide, PIXELS, scheme=scheme
     )
     shapes = {pixels(picture).shape for picture in (states, estimates, hidden)}
     assert len(shapes) == 1
@@ -135,12 +116,12 @@ def test_colour_by_column_and_legend_change_the_pixels(small, scheme):
 
 
 def test_tables_sort_by_click_and_key(small):
-    first = {"js": "[...document.querySelectorAll('#tile-list tbody tr')].map(r => r.cells[0].textContent)"}
+    first = {"eval": "[...document.querySelectorAll('#tile-list tbody tr')].map(r => r.cells[0].textContent)"}
     column = "#tile-list th:nth-child(5) button"
-    opened = {"js": "document.getElementById('all-tiles').open = true"}
-    _, _, highest, _, lowest, _, _, by_name = browse(
-        small, opened, {"click": column}, first, {"press": "Enter"}, first,
-        {"focus": "#tile-list th:first-child button"}, {"press": "Enter"}, first,
+    opened = {"eval": "document.getElementById('all-tiles').open = true"}
+    _, _, highest, _, lowest, _, _, by_name = shown(
+        small, opened, {"press": column}, first, {"key": "Enter"}, first,
+        {"focus": "#tile-list th:first-child button"}, {"key": "Enter"}, first,
     )  # fmt: skip
     # Road error: a 0.5, the other 0.1; the others have none and stay at the end.
     assert highest == ["a", EVIL, "c", "d"]
@@ -150,21 +131,21 @@ def test_tables_sort_by_click_and_key(small):
 
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "dark"), (390, "light"), (390, "dark")])
 def test_page_fits_windows_of_all_sizes(small, width, scheme):
-    heading = browse(small, {"js": "document.querySelector('h2').textContent"}, width=width, scheme=scheme)
+    heading = shown(small, {"eval": "document.querySelector('h2').textContent"}, width=width, scheme=scheme)
     assert heading == ["Did it work?"]
 
 
 def test_ten_thousand_tiles_open_and_are_found(large):
     assert large.stat().st_size < MOST_BYTES
-    shown = {"js": "document.querySelectorAll('#tile-list tbody tr').length"}
-    found = {"js": "document.querySelector('#tile-list tbody tr').cells[0].textContent"}
+    rows = {"eval": "document.querySelectorAll('#tile-list tbody tr').length"}
+    found = {"eval": "document.querySelector('#tile-list tbody tr').cells[0].textContent"}
     search = {
-        "js": f"(i => {{ i.value = '{MANY[4321]}'; i.dispatchEvent(new Event('input')); }})"
+        "eval": f"(i => {{ i.value = '{MANY[4321]}'; i.dispatchEvent(new Event('input')); }})"
         "(document.querySelector('#tile-list input'))"
     }
-    opened = {"js": "document.getElementById('all-tiles').open = true"}
-    wait = {"press": "Shift"}
-    results = browse(large, SELECTED, opened, wait, shown, search, found, PIXELS, place=f"#tile={MANY[5000]}")
+    opened = {"eval": "document.getElementById('all-tiles').open = true"}
+    wait = {"key": "Shift"}
+    results = shown(large, SELECTED, opened, wait, rows, search, found, PIXELS, place=f"#tile={MANY[5000]}")
     assert results[0] == MANY[5000]
     assert results[3] == 100
     assert results[5] == MANY[4321]
@@ -176,8 +157,8 @@ def test_failed_tiles_only_and_one_tile_open(tmp_path, made_survey):
         run = made_run(tmp_path / f"RUN{number}", made_survey / "catalog.parquet", ids)
         file = tmp_path / f"{number}.html"
         file.write_text(html_page(run, made_content(run, [failed_row(name, "load: x: y") for name in ids])))
-        answer, _, selected = browse(
-            file, {"js": "document.querySelector('.answer').textContent"}, {"focus": "#map"}, SELECTED
+        answer, _, selected = shown(
+            file, {"eval": "document.querySelector('.answer').textContent"}, {"focus": "#map"}, SELECTED
         )
         assert answer.startswith("No: no tile is done")
         assert selected == ""
