@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import stat
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.source import FinishedTile
+from flexroad.pipeline.export.source import FinishedTile, OfTile, layer_state
 from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.texture import TileTexture, tile_texture
 from flexroad.tasks.export.glb import Texture
@@ -32,30 +31,6 @@ def check_photos(tiles: Iterable[Tile]) -> None:
         )
 
 
-def photo_state(tile: FinishedTile) -> str:
-    """Return the files of a tile's photo with their sizes and versions; empty if it has none."""
-    layer = tile.tile.layer("dop")
-    reaching = layer.reaching(tile.tile.grid.bounds) if layer else None
-    return str([(str(path), stat(path)) for path in tile.tile.paths(reaching)]) if reaching else ""
-
-
-@dataclass(frozen=True, eq=False)
-class OfTile:
-    """What has the id and the name of a finished tile; sent to a worker."""
-
-    tile: FinishedTile
-
-    @property
-    def id(self) -> str:
-        """Id of the tile."""
-        return self.tile.id
-
-    @property
-    def label(self) -> str:
-        """Its name in messages."""
-        return self.tile.label
-
-
 @dataclass(frozen=True, eq=False)
 class Photographed(OfTile):
     """A finished tile whose files have its photo."""
@@ -63,7 +38,7 @@ class Photographed(OfTile):
     @property
     def fingerprint(self) -> str:
         """Name of its files by what they are made of."""
-        return f"{self.tile.fingerprint} {photo_state(self.tile)}"
+        return f"{self.tile.fingerprint} {layer_state(self.tile.tile, 'dop')}"
 
 
 def texture_of(tile: FinishedTile) -> TileTexture:

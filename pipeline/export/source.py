@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
-from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.paths import Location, stat
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.states import (
     COMPUTED_AGAIN,
@@ -140,6 +140,30 @@ class FinishedTile:
             return self._evaluator(name)
         except StageError as error:
             raise ConfigError(f"{self.label}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class OfTile:
+    """What has the id and the name of a finished tile; sent to a worker."""
+
+    tile: FinishedTile
+
+    @property
+    def id(self) -> str:
+        """Id of the tile."""
+        return self.tile.id
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return self.tile.label
+
+
+def layer_state(tile: Tile, name: str) -> str:
+    """Return the files of a tile's layer with their sizes and versions; empty if the tile has none."""
+    layer = tile.layer(name)
+    reaching = layer.reaching(tile.grid.bounds) if layer else None
+    return str([(str(path), stat(path)) for path in tile.paths(reaching)]) if reaching else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,9 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export import coarse
 from flexroad.pipeline.export.coarse import LEVELS, Branch, Place, branch_piece
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.photo import OfTile, aerial_of, photo_state, texture_of
+from flexroad.pipeline.export.photo import aerial_of, texture_of
 from flexroad.pipeline.export.pieces import Piece, Row, write_pieces
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import FinishedTile, OfTile, Source, layer_state
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.pipeline.worker.texture import TileTexture
@@ -50,7 +50,7 @@ class Leaf(OfTile):
     @property
     def fingerprint(self) -> str:
         """Name of its files by what they are made of."""
-        photo = photo_state(self.tile) if self.photo else ""
+        photo = layer_state(self.tile.tile, "dop") if self.photo else ""
         return f"{self.tile.fingerprint} {self.tile.state.fingerprint} {self.own} {photo}"
 
 

@@ -20,7 +20,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import write_pieces
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.pipeline.export.states import RunPlace, tile_states
-from flexroad.pipeline.export.viewer_tile import Look, piece
+from flexroad.pipeline.export.viewer_tile import Look, Shown, piece
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
 from flexroad.tasks.export import glb, viewer
@@ -144,11 +144,11 @@ def _remove_page(out: Location) -> None:
     remove(page)
 
 
-def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[FinishedTile]:
+def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[Shown]:
     place = RunPlace.of(run)
     for tile, state in tile_states(run, done, variant):
         if state:
-            yield FinishedTile(tile, variant, state, place)
+            yield Shown(FinishedTile(tile, variant, state, place))
 
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:

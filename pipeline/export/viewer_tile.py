@@ -12,7 +12,7 @@ from flexroad.catalog.crs import transformer
 from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.pieces import Piece
-from flexroad.pipeline.export.source import FinishedTile
+from flexroad.pipeline.export.source import OfTile, layer_state
 from flexroad.pipeline.worker.texture import tile_photo
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import glb, viewer
@@ -43,8 +43,20 @@ class Look:
     """Selection of the road lines."""
 
 
-def piece(tile: FinishedTile, look: Look) -> Piece:
+@dataclass(frozen=True, eq=False)
+class Shown(OfTile):
+    """A finished tile with its photo and road lines."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of its script by what it is made of."""
+        layers = (layer_state(self.tile.tile, name) for name in ("dop", "roads"))
+        return " ".join((self.tile.state.nodes["assess"], *layers))
+
+
+def piece(item: Shown, look: Look) -> Piece:
     """Return the script of a tile; its row has its picture, and names what could not be read."""
+    tile = item.tile
     source, notes = tile.tile, list[str]()
     photo = _photo(source, look.photo_px, notes)
     quality, surface = tile.quality, tile.surface

@@ -3,10 +3,11 @@
 Usage: browse.py < JSON with url, program, width, height, dark and steps
 
 A step has one key: ``eval`` (JavaScript), ``wait`` (until JavaScript is true), ``move``, ``click``, ``drag``
-or ``tap`` (pixels), ``press`` (selector of what is clicked, or selector, x and y in it), ``focus``
-(selector), ``select`` (selector and value), ``key``, ``shot`` (x, y, width and height; gives a PNG in
-base64). The output has the results, all requests but those of files and data, all errors of the page, and
-whether the page is wider than the window.
+or ``tap`` (pixels), ``pinch`` (middle, and distance of two fingers from it before and after; pixels),
+``press`` (selector of what is clicked, or selector, x and y in it), ``focus`` (selector), ``select``
+(selector and value), ``key``, ``shot`` (x, y, width and height; gives a PNG in base64). The output has the
+results, all requests but those of files and data, all errors of the page, and whether the page is wider than
+the window.
 """
 
 import base64
@@ -37,6 +38,21 @@ def drag(page: Page, way: list[int]) -> None:
     page.mouse.up()
 
 
+def pinch(page: Page, way: list[int]) -> None:
+    """Move two fingers, beside each other, away from a place or towards it."""
+    x, y, before, after = way
+    browser = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *apart: float) -> None:
+        fingers = [{"x": x + side * away, "y": y, "id": side + 1} for away in apart for side in (-1, 1)]
+        browser.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+    touch("touchStart", before)
+    for step in range(1, 6):
+        touch("touchMove", before + (after - before) * step / 5)
+    touch("touchEnd")
+
+
 def press(page: Page, value: str | list) -> None:
     """Click on an element, in its middle or at a place in it."""
     selector, *place = [value] if isinstance(value, str) else value
@@ -61,6 +77,7 @@ DONE = {
     "click": lambda page, place: page.mouse.click(*place),
     "drag": drag,
     "tap": lambda page, place: page.touchscreen.tap(*place),
+    "pinch": pinch,
     "press": press,
     "focus": lambda page, selector: page.locator(selector).focus(),
     "select": select,

@@ -3,11 +3,17 @@
 import base64
 import http.client
 import json
+import os
+import re
+import signal
+import subprocess
+import sys
 import threading
 import zlib
 
 import numpy as np
 import pytest
+import rasterio
 from pyproj import Transformer
 
 from flexroad.catalog import Catalog
@@ -143,6 +149,36 @@ def test_missing_sources_are_noted_and_the_mesh_is_shown(city, tmp_path):
     assert len(written.notes) == 1
     assert written.notes[0].startswith(f"tile {tile.id}: no photo: ")
     assert handed_over(tmp_path / "tiles" / f"{tile.id}.js")[1]["glb"]
+    assert write_viewer(run, tmp_path, SerialExecutor(), [tile.id]).notes == ()
+
+
+def test_changed_photo_changes_the_script_of_its_tile_alone(city, tmp_path):
+    run = Run.open(city)
+    tile, other = run.catalog.tiles[:2]
+    write_viewer(run, tmp_path, SerialExecutor())
+    scripts = [tmp_path / "tiles" / f"{each.id}.js" for each in (tile, other)]
+    before = [script.read_bytes() for script in scripts]
+    file = tile.paths(tile.layer("dop"))[0]
+    kept = file.read_bytes(), file.stat().st_mtime_ns
+    try:
+        with rasterio.open(file, "r+") as photo:
+            photo.write(255 - photo.read())
+        write_viewer(Run.open(city), tmp_path, SerialExecutor())
+    finally:
+        file.write_bytes(kept[0])
+        os.utime(file, ns=(kept[1], kept[1]))
+    changed = [script.read_bytes() != old for script, old in zip(scripts, before, strict=True)]
+    assert changed == [True, False]
+
+
+def test_smaller_selection_removes_the_scripts_of_the_others(city, tmp_path):
+    run = Run.open(city)
+    write_viewer(run, tmp_path, SerialExecutor())
+    assert len(list((tmp_path / "tiles").iterdir())) == 2
+    chosen = run.catalog.tiles[0].id
+    write_viewer(run, tmp_path, SerialExecutor(), [chosen])
+    assert [file.stem for file in (tmp_path / "tiles").iterdir()] == [chosen]
+    assert handed_over(tmp_path / "run.js")[0]["tiles"]["id"] == [chosen]
 
 
 def test_command_writes_into_the_run_and_names_the_page(city, flexroad):
@@ -188,3 +224,17 @@ def test_server_gives_files_of_the_folder_to_this_computer_alone(folder):
             web.shutdown()
             thread.join()
     (folder.parent / "secret.txt").unlink()
+
+
+@pytest.mark.slow
+def test_served_folder_is_given_until_ctrl_c(city, tmp_path):
+    flexroad = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
+    command = [*flexroad, "view", str(city), "-o", str(tmp_path / "page"), "--serve"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.readline()
+        port = re.search(r"http://127.0.0.1:(\d+)/", process.stdout.readline())[1]
+        assert answer(int(port), "/") == 200
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (0, "stopped\n")
+    assert "Traceback" not in err

@@ -271,6 +271,20 @@ def test_phone_shows_settings_and_readout_by_taps(run, page):
     assert results[6] == 390
 
 
+def test_phone_zooms_by_two_fingers_on_the_map_and_in_a_tile(run, page):
+    phone = {"width": 390, "height": 844}
+    steps = [{"eval": f"{INSPECT}.box"}, {"pinch": [195, 420, 50, 100]}, {"eval": INSPECT}]
+    before, _, after = browse(page, *steps, **phone)
+    assert after["view"] == "map"
+    assert after["box"]["scale"] == pytest.approx(2 * before["scale"], rel=0.02)
+    away = {"eval": "(([x, y, z, e, n, h]) => Math.hypot(x - e, y - n, z - h))(FLEXROAD.inspect().camera)"}
+    link = f"#tile={run.catalog.tiles[0].id}"
+    _, far, _, near = browse(
+        page, {"wait": SETTLED}, away, {"pinch": [195, 420, 50, 100]}, away, fragment=link, **phone
+    )
+    assert near < 0.8 * far
+
+
 def test_ten_thousand_tiles_are_drawn_and_coloured_by_a_measure(tmp_path):
     ids = [f"tile {i}" for i in range(10_000)]
     page = made(tmp_path, ids, [FAILED if i % 10 == 0 else DONE for i in range(10_000)])
