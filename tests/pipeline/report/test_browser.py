@@ -97,7 +97,7 @@ def test_address_and_list_select_tiles(small):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_colour_by_column_and_legend_change_the_pixels(small, scheme):
     by = {"select": ["#colour-by", "error_estimate_m"]}
-    hide = {"eval": "document.querySelector('#legend button').click()"}
+    hide = {"press": "#legend button"}
     states, _, estimates, _, _, hidden = shown(
         small, PIXELS, by, PIXELS, {"select": ["#colour-by", "state"]}, hide, PIXELS, scheme=scheme
     )
