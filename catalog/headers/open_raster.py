@@ -57,6 +57,8 @@ ERRORS = (RasterioError, OSError, UnicodeDecodeError)
 """What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 MAX_DEPTH = 4
 """Largest depth of VRTs that name VRTs."""
+BLOCK_CACHE_BYTES = 64 * 2**20
+"""Blocks of files that stay open which GDAL keeps in memory; its own default grows with the machine."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
 """GDAL's option for local files: its file system on the web opens nothing."""
 
@@ -88,6 +90,29 @@ def open_raster(path: Location, allowed: AllowedFolders | None = None) -> Iterat
     with env, rasterio.open(str(path), driver=driver) as dataset:
         _require_no_link(dataset)
         yield dataset
+
+
+def open_alone(path: Path) -> Any | None:
+    """Open a source raster on disk that needs no other file, None if it has side-car files or is a VRT.
+
+    The dataset can be kept open, as it needs none of GDAL's options when it is read.
+
+    Raises
+    ------
+    Refused, RasterioError, OSError, UnicodeDecodeError
+        As of `open_raster`.
+    """
+    driver = _driver(path)
+    if driver == "VRT" or _side_cars(path):
+        return None
+    with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_CACHEMAX=BLOCK_CACHE_BYTES, **OFFLINE):
+        dataset = rasterio.open(str(path), driver=driver)
+    try:
+        _require_no_link(dataset)
+    except Refused:
+        dataset.close()
+        raise
+    return dataset
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from rasterio.windows import Window
 
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
@@ -117,7 +118,7 @@ def read_window(
     TaskError
         If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
     """
-    with opened(path, name, allowed) as src:
+    with opened(path, name, allowed, kept_raster) as src:
         fault = heights_fault(src) if heights else None
         if fault:
             raise TaskError(f"{name} {fault}", str(path))
@@ -133,14 +134,19 @@ def read_window(
 
 
 @contextmanager
-def opened(path: Location, name: str, allowed: AllowedFolders | None = None) -> Iterator[Any]:
+def opened(
+    path: Location,
+    name: str,
+    allowed: AllowedFolders | None = None,
+    by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]] = open_raster,
+) -> Iterator[Any]:
     """Open a raster; errors inside the block become `Unreadable` or, for a file in a bucket, `TaskError`.
 
     For a file in a bucket the cause may be the file or the storage. So the tile fails and can be run again;
     the file is not left out.
     """
     try:
-        with open_raster(path, allowed) as src:
+        with by(path, allowed) as src:
             yield src
     except FileNotFoundError as error:
         raise _missing(path, name) from error

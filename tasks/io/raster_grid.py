@@ -90,8 +90,9 @@ class RasterGrid:
     def reached(self, grid: Grid) -> Bools:
         """Return the cells of a grid whose centres lie within the bounds, ``(H, W)``."""
         west, south, east, north = self.bounds
-        x, y = np.meshgrid(grid.eastings, grid.northings)
+        x, y = grid.eastings[None, :], grid.northings[:, None]
         if self.crs:
+            x, y = np.broadcast_arrays(x, y)
             x, y = transformer(grid.crs, self.crs).transform(x, y)
         inside: Bools = (south < y) & (y < north) & (west < x) & (x < east)
         return inside
