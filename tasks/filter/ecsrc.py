@@ -23,7 +23,7 @@ from flexroad.tasks.filter.kit.union_find import (
     init,
     least_cells,
 )
-from flexroad.tasks.types import Floats, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 VERSION = 1
 
@@ -71,25 +71,29 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
         return RoadClusters(data.grid, points.astype(np.int32))
     cell, roots = data.grid.cell, init(points)
     heights = np.ascontiguousarray(data.dsm)
-    _join(heights, roots, forward_offsets(1.5), options.theta_z_m)
-    _join(heights, roots, forward_offsets(options.theta_xy_m / cell), options.theta_z_m)
+    _join(heights, roots, points, forward_offsets(1.5), options.theta_z_m)
+    # Of any two clusters one is not the largest, so no search starts in the largest, which has most points.
+    largest = np.bincount(compress(roots)[points.ravel()], minlength=1).argmax()
+    starts, far = (
+        points & (roots.reshape(points.shape) != largest),
+        forward_offsets(options.theta_xy_m / cell),
+    )
+    _join(heights, roots, starts, np.concatenate([far, -far]), options.theta_z_m)
     least = least_cells(options.min_area_m2, cell)
     labels = clean(points, compress(roots).reshape(points.shape), least, options.keep_largest)
     return RoadClusters(data.grid, labels)
 
 
 @compiled()
-def _join(heights: Floats, roots: Roots, steps: NDArray[np.int64], theta_z: float) -> None:
-    """Unite the sets of any two points one of the steps apart and within ``theta_z`` in height."""
+def _join(heights: Floats, roots: Roots, starts: Bools, steps: NDArray[np.int64], theta_z: float) -> None:
+    """Unite the sets of a start and a point if they are a step apart and within ``theta_z`` in height."""
     rows, cols = heights.shape
-    for i in range(roots.size):
-        if roots[i] < 0:
-            continue
+    for i in np.flatnonzero(starts):
         r, c = i // cols, i % cols
-        a = find(roots, i)
+        a = find(roots, int(i))
         for k in range(steps.shape[0]):
             row, col = r + steps[k, 0], c + steps[k, 1]
-            if row >= rows or col < 0 or col >= cols:
+            if row < 0 or row >= rows or col < 0 or col >= cols:
                 continue
             j = row * cols + col
             if roots[j] < 0 or roots[j] == a or abs(heights[r, c] - heights[row, col]) > theta_z:

@@ -25,10 +25,10 @@ from flexroad.tasks.filter.kit.union_find import (
     Roots,
     clean,
     compress,
-    find,
-    forward_offsets,
     init,
     least_cells,
+    members_of,
+    unite,
 )
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
@@ -135,26 +135,39 @@ def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
     return ~mask & _within(street[parts], width)
 
 
+@compiled()
 def _within(cells: Bools, width: float) -> Bools:
     """Return the cells at most ``width`` cells away from one of the given cells, ``(H, W)``."""
-    rows, reach = len(cells), min(math.floor(width), len(cells) - 1)
-    aside, near = _columns_away(cells), np.zeros_like(cells)
+    rows, cols = cells.shape
+    aside, near, reach = _columns_away(cells), np.zeros((rows, cols), np.bool_), min(int(width), rows - 1)
     for down in range(-reach, reach + 1):
-        first, last = max(down, 0), min(rows + down, rows)
-        near[first:last] |= aside[first - down : last - down] <= math.floor(math.sqrt(width**2 - down**2))
+        wide = int(math.sqrt(width**2 - down**2))
+        for r in range(max(down, 0), min(rows + down, rows)):
+            for c in range(cols):
+                near[r, c] |= aside[r - down, c] <= wide
     return near
 
 
+@compiled()
 def _columns_away(cells: Bools) -> NDArray[np.int32]:
     """Return the number of columns to the nearest of the given cells in the same row, ``(H, W)``.
 
     In rows without a given cell it is larger than any distance in the grid.
     """
     rows, cols = cells.shape
-    col, nowhere = np.arange(cols, dtype=np.int32), np.int32(rows + cols)
-    before = np.maximum.accumulate(np.where(cells, col, -nowhere), axis=1)
-    after = np.minimum.accumulate(np.where(cells, col, cols + nowhere)[:, ::-1], axis=1)[:, ::-1]
-    return np.minimum(col - before, after - col)
+    away = np.empty((rows, cols), np.int32)
+    for r in range(rows):
+        last = -(rows + cols)
+        for c in range(cols):
+            if cells[r, c]:
+                last = c
+            away[r, c] = c - last
+        last = cols + rows + cols
+        for c in range(cols - 1, -1, -1):
+            if cells[r, c]:
+                last = c
+            away[r, c] = min(away[r, c], last - c)
+    return away
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:
@@ -171,12 +184,15 @@ def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArra
 def _on_ground(data: TileData, clusters: NDArray[np.int32], options: Options) -> Bools:
     """Return the cells of clusters that are on the ground or large for their height, ``(H, W)``."""
     clustered = clusters >= 0
-    roots, member, size = np.unique(clusters[clustered], return_inverse=True, return_counts=True)
+    member, size = members_of(clusters[clustered], clusters.size)
     height = np.abs(data.dsm - data.dtm)[clustered]
-    on_terrain = np.bincount(member, height <= options.theta_z_m, len(roots)) >= GROUND_SHARE * size
-    needed = options.raised_m2_per_m * _medians(height, member, len(roots))
+    accepted = np.bincount(member, height <= options.theta_z_m, len(size)) >= GROUND_SHARE * size
+    raised = ~accepted
+    above = raised[member]
+    needed = options.raised_m2_per_m * _medians(height[above], member[above], len(size))
+    accepted[raised] = (size * data.grid.cell**2 >= needed)[raised]
     ground = np.zeros_like(clustered)
-    ground[clustered] = (on_terrain | (size * data.grid.cell**2 >= needed))[member]
+    ground[clustered] = accepted[member]
     return ground
 
 
@@ -205,52 +221,67 @@ def _merged(members: Bools, gap: float, heights: Floats, slope: Floats, theta: f
     Sets merge across a gap if any two of their edge cells are at most ``gap`` cells apart and agree in height
     to ``theta`` along the slope.
     """
-    forest, near = init(members), forward_offsets(1.5)
-    _join(forest, members, members, near, heights, slope, math.inf)
+    forest = init(members)
+    _join_neighbours(forest, members)
     # Of any two sets one is not the largest, so no search starts in the largest, which has most cells.
     edges = _edges(members)
     largest = np.bincount(compress(forest)[members.ravel()], minlength=1).argmax()
     others = edges & (forest.reshape(members.shape) != largest)
-    far = forward_offsets(gap)
-    _join(forest, others, edges, np.concatenate([far, -far]), heights, slope, theta)
+    _join_across(forest, others, edges, gap, heights, slope, theta)
     return compress(forest).reshape(members.shape)
 
 
+@compiled()
 def _edges(members: Bools) -> Bools:
     """Return the members that have a neighbour outside; the nearest cells of two clusters are among them."""
-    edges: Bools = members & ~scipy.ndimage.binary_erosion(members, np.ones((3, 3)))
+    rows, cols = members.shape
+    edges = members.copy()
+    for r in range(1, rows - 1):
+        for c in range(1, cols - 1):
+            if members[r, c]:
+                edges[r, c] = not members[r - 1 : r + 2, c - 1 : c + 2].all()
     return edges
 
 
 @compiled()
-def _join(
-    roots: Roots,
-    starts: Bools,
-    ends: Bools,
-    steps: NDArray[np.int64],
-    heights: Floats,
-    slope: Floats,
-    theta: float,
+def _join_neighbours(roots: Roots, members: Bools) -> None:
+    """Unite the sets of members that are one of the eight neighbours of each other."""
+    rows, cols = members.shape
+    for r in range(rows):
+        for c in range(cols):
+            if not members[r, c]:
+                continue
+            if c + 1 < cols and members[r, c + 1]:
+                unite(roots, r * cols + c, r * cols + c + 1)
+            for col in range(max(c - 1, 0), min(c + 2, cols)):
+                if r + 1 < rows and members[r + 1, col]:
+                    unite(roots, r * cols + c, (r + 1) * cols + col)
+
+
+@compiled()
+def _join_across(
+    roots: Roots, starts: Bools, ends: Bools, gap: float, heights: Floats, slope: Floats, theta: float
 ) -> None:
-    """Unite sets where an end is a step from a start and within ``theta`` in height along the slope."""
+    """Unite sets if an end is ``gap`` cells from a start and within ``theta`` in height along the slope."""
     rows, cols = starts.shape
+    reach = int(gap + 1e-9)
+    # The columns of the ends, row by row, and the number of ends before each cell.
+    at, before = np.flatnonzero(ends) % cols, np.zeros(rows * cols + 1, np.int32)
+    before[1:] = np.cumsum(ends)
     for i in np.flatnonzero(starts):
         r, c = i // cols, i % cols
-        a = find(roots, int(i))
-        for down, across in steps:
-            row, col = r + down, c + across
-            if row < 0 or row >= rows or col < 0 or col >= cols or not ends[row, col]:
-                continue
-            j = row * cols + col
-            if roots[j] == a:
-                continue
-            fall, drift = slope[r, c, 0] + slope[row, col, 0], slope[r, c, 1] + slope[row, col, 1]
-            up = (down * fall + across * drift) / 2
-            if abs(heights[row, col] - heights[r, c] - up) > theta:
-                continue
-            b = find(roots, j)
-            a, b = min(a, b), max(a, b)
-            roots[b] = a
+        for row in range(max(r - reach, 0), min(r + reach + 1, rows)):
+            down = row - r
+            wide = int(math.sqrt(gap**2 + 1e-9 - down**2))
+            first, last = row * cols + max(c - wide, 0), row * cols + min(c + wide + 1, cols)
+            for col in at[before[first] : before[last]]:
+                j, across = row * cols + col, col - c
+                if roots[j] == roots[i]:
+                    continue
+                fall, drift = slope[r, c, 0] + slope[row, col, 0], slope[r, c, 1] + slope[row, col, 1]
+                up = (down * fall + across * drift) / 2
+                if abs(heights[row, col] - heights[r, c] - up) <= theta:
+                    unite(roots, int(i), j)
 
 
 @compiled()

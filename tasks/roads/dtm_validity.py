@@ -124,10 +124,17 @@ def _sums(
     """
     reach = len(bell) // 2
     sums, nearest = np.zeros((len(cells), 10)), np.full(len(cells), np.inf)
-    for k in range(len(cells)):
+    # Cells in one column, one below the other, have most of their rows in common.
+    row_sums, done_for = np.empty((len(valid), 7)), np.full(len(valid), -1)
+    for k in np.argsort(cells[:, 1], kind="mergesort"):
         row, col = cells[k]
         for i in range(max(row - reach, 0), min(row + reach + 1, len(valid))):
-            n, c, cc, z, cz, zz, beside = _row_sums(heights, valid, i, col, bell, cell, datum)
+            if done_for[i] != col:
+                row_sums[i] = _row_sums(heights, valid, i, col, bell, cell, datum)
+                done_for[i] = col
+            n, c, cc, z, cz, zz, beside = row_sums[i]
+            if n == 0.0:
+                continue
             w, r = bell[i - row + reach], (i - row) * cell
             terms = (n, r * n, c, r * r * n, r * c, cc, z, r * z, cz, zz)
             for j in range(10):

@@ -71,6 +71,8 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
     n, spread = side * side, side * (reach * (reach + 1) * side / 3)
     for r in range(reach, rows - reach):
         for c in range(reach, cols - reach):
+            if not points[r, c]:
+                continue
             whole, z, zz, rz, cz = True, 0.0, 0.0, 0.0, 0.0
             for i in range(-reach, reach + 1):
                 for j in range(-reach, reach + 1):
@@ -90,15 +92,20 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
 def _trend(slopes: Floats, smooth: Bools, around: int) -> Floats:
     """Return the mean slope of the smooth patches around each of them, ``(H, W, 2)``."""
     rows, cols = smooth.shape
-    trend = np.zeros((rows, cols, 2))
+    trend, beside = np.zeros((rows, cols, 2)), np.zeros((rows, cols, 3))
+    # First the sums of 1 and both slopes over columns, then the sums of these over rows.
     for r in range(rows):
         for c in range(cols):
-            if not smooth[r, c]:
-                continue
-            n, down, across = 0, 0.0, 0.0
-            for i in range(max(r - around, 0), min(r + around + 1, rows)):
+            if smooth[r, c]:
                 for j in range(max(c - around, 0), min(c + around + 1, cols)):
-                    if smooth[i, j]:
-                        n, down, across = n + 1, down + slopes[i, j, 0], across + slopes[i, j, 1]
-            trend[r, c] = down / n, across / n
+                    beside[r, j, 0] += 1
+                    beside[r, j, 1] += slopes[r, c, 0]
+                    beside[r, j, 2] += slopes[r, c, 1]
+    for r in range(rows):
+        for c in range(cols):
+            if smooth[r, c]:
+                n, down, across = 0.0, 0.0, 0.0
+                for i in range(max(r - around, 0), min(r + around + 1, rows)):
+                    n, down, across = n + beside[i, c, 0], down + beside[i, c, 1], across + beside[i, c, 2]
+                trend[r, c] = down / n, across / n
     return trend

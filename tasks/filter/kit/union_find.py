@@ -46,6 +46,13 @@ def find(roots: Roots, i: int) -> int:
 
 
 @compiled()
+def unite(roots: Roots, i: int, j: int) -> None:
+    """Unite the clusters of two cells."""
+    a, b = find(roots, i), find(roots, j)
+    roots[max(a, b)] = min(a, b)
+
+
+@compiled()
 def compress(roots: Roots) -> Roots:
     """Make the root of every member its parent, in place."""
     # A parent has a lower index than its children, so its own parent is already the root.
@@ -55,13 +62,28 @@ def compress(roots: Roots) -> Roots:
     return roots
 
 
+def members_of(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Return the number of each cell's cluster, in ascending order of roots, and the cells of each cluster.
+
+    Parameters
+    ----------
+    roots : (n,) array of int
+        The root of each cell, a flat index.
+    cells : int
+        Number of cells of the grid.
+    """
+    sizes = np.bincount(roots, minlength=cells)
+    number = np.cumsum(sizes > 0) - 1
+    return number[roots], sizes[sizes > 0]
+
+
 def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArray[np.int32]:
     """Label the ``keep`` largest of the clusters of at least ``least`` cells (`cleanClusters`).
 
     Of clusters of equal size the one whose first cell comes first is kept.
     """
     # Roots ascend like first cells, so both ranks below break ties by first cell.
-    _, member, sizes = np.unique(roots[points], return_inverse=True, return_counts=True)
+    member, sizes = members_of(roots[points], roots.size)
     largest = np.argsort(-sizes, kind="stable")[:keep]
     kept = np.sort(largest[sizes[largest] >= least])
     number = np.zeros(len(sizes), np.int32)
