@@ -57,7 +57,7 @@ ERRORS = (RasterioError, OSError, UnicodeDecodeError)
 """What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 MAX_DEPTH = 4
 """Largest depth of VRTs that name VRTs."""
-BLOCK_CACHE_BYTES = 64 * 2**20
+BLOCK_CACHE_BYTES = 16 * 2**20
 """Blocks of files that stay open which GDAL keeps in memory; its own default grows with the machine."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
 """GDAL's option for local files: its file system on the web opens nothing."""

@@ -212,8 +212,11 @@ def error_estimate(
     by_scan = np.where(kept, np.maximum(np.abs(off_dsm), scatter), np.nan)
     inferred = classes == Support.INFERRED
     by_dtm = np.where(inferred, np.nan, np.abs(off_dtm))
-    away = scipy.ndimage.distance_transform_edt(inferred) * cell
-    return np.where(inferred, AGREE_M + rise(away), np.fmin(by_scan, by_dtm))
+    estimate = np.fmin(by_scan, by_dtm)
+    if inferred.any():
+        away = scipy.ndimage.distance_transform_edt(inferred) * cell
+        estimate[inferred] = AGREE_M + rise(away[inferred])
+    return estimate
 
 
 def _scatter(values: Floats, valid: Bools, size: int) -> Floats:

@@ -15,7 +15,12 @@ def beyond_extent(data: TileData) -> Bools:
     inside, as in water or deep shade, is not beyond the survey: meshes bridge it.
     """
     void = np.isnan(data.dsm) & np.isnan(data.dtm)
-    labels, _ = scipy.ndimage.label(void)
-    edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    beyond: Bools = np.isin(labels, edge[edge > 0])
-    return beyond
+    if not any(side.any() for side in (void[0], void[-1], void[:, 0], void[:, -1])):
+        return np.zeros(void.shape, np.bool_)
+    labels, count = scipy.ndimage.label(void)
+    beyond = np.zeros(count + 1, np.bool_)
+    for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        beyond[side] = True
+    beyond[0] = False
+    outside: Bools = beyond[labels]
+    return outside
