@@ -81,8 +81,13 @@ class _Mosaic:
     notes: tuple[str, ...]
     broken: tuple[Unreadable, ...]
     """The errors of missing and broken files."""
-    reached: Bools
-    """Cells within the bounds of a file that was read, ``(H, W)``."""
+
+    def reached(self, grid: Grid) -> Bools:
+        """Return the cells of a grid within the bounds of a file that was read, ``(H, W)``."""
+        cells = np.zeros(grid.shape, np.bool_)
+        for patch in self.patches:
+            cells |= patch.lattice.reached(grid)
+        return cells
 
 
 def load(tile: Tile, options: Options) -> TileData:
@@ -216,10 +221,9 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
     """
     from rasterio.enums import Resampling
 
-    from flexroad.tasks.io.raster import Unreadable, joined, resample_to
+    from flexroad.tasks.io.raster import Unreadable, fill_from, joined
 
     values = np.full(grid.shape, np.nan)
-    reached = np.zeros(grid.shape, bool)
     warped: list[RasterWindow] = []
     broken: list[Unreadable] = []
     heights = layer.name in HEIGHTS
@@ -234,7 +238,6 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
             continue
         if patch is None:
             continue
-        reached |= patch.lattice.reached(grid)
         if heights:
             patch, absurd = _metres(_with_unit(patch, layer))
             absurd_cells += absurd
@@ -242,23 +245,23 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
         if patch.lattice.crs:
             warped.append(patch)
             continue
-        np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
+        fill_from(patch, grid, values, resampling)
         if not np.isnan(values).any():
             break
     # After the files in the tile's CRS, which lose nothing.
     for patch in joined(warped):
-        np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
+        fill_from(patch, grid, values, resampling)
     notes = _notes(layer, patches, grid)
     notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
     if absurd_cells:
         notes.append(absurd_note(layer.name, absurd_cells))
-    return _Mosaic(values, tuple(patches), tuple(notes), tuple(broken), reached)
+    return _Mosaic(values, tuple(patches), tuple(notes), tuple(broken))
 
 
 def _check_read(tile: Tile, layer: Layer, mosaic: _Mosaic, core: tuple[slice, slice], grid: Grid) -> None:
     """Raise an error if a layer is missing on the tile itself, or a file that it needs is broken."""
     # A tile also lists files around it: a broken file fails only the tiles that need it.
-    if mosaic.broken and not mosaic.reached[core].all():
+    if mosaic.broken and not mosaic.reached(grid)[core].all():
         raise TaskError(str(mosaic.broken[0]), mosaic.broken[0].file)
     if not mosaic.patches:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)

@@ -14,11 +14,13 @@ AGAIN = "give it its georeference with gdal_translate -a_ullr"
 
 def georeference_fault(dataset: Any) -> str | None:
     """Return why the position of an open raster is no place, to follow its name; None if it is one."""
-    west, east_step, north, north_step = (getattr(dataset.transform, key) for key in "cafe")
-    if not all(math.isfinite(number) for number in dataset.transform[:6]):
+    # A dataset makes its transform anew each time.
+    transform = dataset.transform
+    east_step, _, west, _, north_step, north = transform[:6]
+    if not all(map(math.isfinite, transform[:6])):
         cells = f"cells of {east_step:g} x {north_step:g}"
         return f"has the origin {west:g}, {north:g} and {cells}, which is no place; {AGAIN}"
-    if not dataset.transform.determinant:
+    if not transform.determinant:
         return f"has cells of {east_step:g} x {north_step:g}; {AGAIN}"
     corners = (west, north, west + dataset.width * east_step, north + dataset.height * north_step)
     if max(map(abs, corners)) > FARTHEST:

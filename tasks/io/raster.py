@@ -171,14 +171,12 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
     Cells that coincide are copied. Others are resampled: source cells without a value have no weight, and
     a cell whose centre lies in such a cell gets no value, so that voids keep their size.
     """
-    values = np.full(grid.shape, np.nan)
     lattice = patch.lattice
     if lattice.crs:
         return _warped(patch, grid, resampling)
-    if lattice.fits(grid):
-        row = round((grid.north - lattice.north) / grid.cell)
-        col = round((lattice.west - grid.west) / grid.cell)
-        values[row : row + lattice.height, col : col + lattice.width] = patch.values
+    values = np.full(grid.shape, np.nan)
+    if cells := _coinciding(lattice, grid):
+        values[cells] = patch.values
         return values
     reproject(
         patch.values,
@@ -196,6 +194,24 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
         YSCALE=lattice.dy / grid.cell,
     )
     return values
+
+
+def fill_from(patch: RasterWindow, grid: Grid, values: Floats, resampling: Resampling) -> None:
+    """Fill the cells of a grid that have no value, ``(H, W)``, from a patch, in place; see `resample_to`."""
+    if cells := _coinciding(patch.lattice, grid):
+        part = values[cells]
+        np.copyto(part, patch.values, where=np.isnan(part))
+    else:
+        np.copyto(values, resample_to(patch, grid, resampling), where=np.isnan(values))
+
+
+def _coinciding(lattice: RasterGrid, grid: Grid) -> tuple[slice, slice] | None:
+    """Return the cells of a grid that a part of a file covers, None if their cells do not coincide."""
+    if not lattice.fits(grid):
+        return None
+    row = round((grid.north - lattice.north) / grid.cell)
+    col = round((lattice.west - grid.west) / grid.cell)
+    return slice(row, row + lattice.height), slice(col, col + lattice.width)
 
 
 def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
@@ -298,7 +314,8 @@ def place(
     TaskError
         If the file is rotated, overlaps the grid in another CRS, or its position is unknown.
     """
-    if src.transform.is_identity:
+    transform = src.transform
+    if transform.is_identity:
         if src.shape == core.shape:
             return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
         raise TaskError(
@@ -309,9 +326,9 @@ def place(
     fault = georeference_fault(src)
     if fault:
         raise TaskError(f"{name} {fault}", str(path))
-    if src.transform.b or src.transform.d:
+    if transform.b or transform.d:
         raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
-    lattice = RasterGrid.of(src.transform, src.width, src.height)
+    lattice = RasterGrid.of(transform, src.width, src.height)
     file_crs = src.crs.to_wkt() if src.crs else crs
     if file_crs is None:
         raise TaskError(f"{name} has no CRS; build the catalog again with --crs", str(path))
@@ -338,6 +355,8 @@ def _values(
 ) -> Floats:
     """Return the cells of a window, ``step`` x ``step`` of them as one; rows from the north."""
     tall, wide = ([part for part in _whole_and_rest(part, step) if part] for part in slices)
+    if len(tall) == len(wide) == 1:
+        return _part(src, lattice, step, tall[0], wide[0], resampling)
     return np.block([[_part(src, lattice, step, rows, cols, resampling) for cols in wide] for rows in tall])
 
 
