@@ -26,7 +26,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.lines import apart_from, divided, ends_at_border, points_and_segments
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
-from flexroad.tasks.meshing.triangulate import Faces, constrained
+from flexroad.tasks.meshing.triangulate import Faces, constrained, middles
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,
@@ -38,10 +38,12 @@ from flexroad.tasks.spline.mesh_border import (
 )
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
 
-VERSION = 2
+VERSION = 3
 
 DECIMALS = 6
 """Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
+FEW = 0.1
+"""Share of the points below which it takes longer to find the squares of a lattice than to do without."""
 SNAP_M = 1e-3
 """The last line of a lattice is moved onto the border if it is closer to it than this (m)."""
 
@@ -108,8 +110,7 @@ def sample(
     points, faces = _regular(surface, origin, local, step, frame)
     inside = np.ones(len(faces), np.bool_)
     if options.method == "uniform":
-        x, y, _ = points[faces].mean(axis=1).T
-        inside = ~road.outside[road.grid.cells(x + origin[0], y + origin[1])]
+        inside = ~road.outside[road.grid.cells(*(middles(points, faces) + origin).T)]
         if frame:
             inside |= joined(points, faces, frame, local, road.core.cell)
     return _mesh(points, faces[inside], road, mask)
@@ -182,9 +183,11 @@ def _dynamic(
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
     z = surface.height(*(plan + road.core.origin).T)
     points, number = _without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
-    faces = constrained(points, number[len(free) + len(border) + segments])
+    known = {options.road_m: len(fine), options.terrain_m: len(coarse)}
+    lattices = [(local[:2], step) for step, count in known.items() if count > FEW * len(points)]
+    faces = constrained(points, number[len(free) + len(border) + segments], lattices)
     if limit:
-        faces = faces[limit.covers(points[faces].mean(axis=1))]
+        faces = faces[limit.covers(middles(points, faces))]
     return _mesh(points, faces, road, mask, outline)
 
 
@@ -268,16 +271,16 @@ def _mesh(
 ) -> Mesh:
     """Return the mesh of the faces that have heights, without unused vertices."""
     east, north = road.core.origin
-    faces = faces[np.isfinite(points[:, 2])[faces].all(axis=1)]
+    known = np.isfinite(points[:, 2])
+    faces = faces if known.all() else faces[known[faces].all(axis=1)]
     if not len(faces):
         raise TaskError("the surface has no height where the tile has data; check the layers of the tile")
-    middles = points[faces].mean(axis=1)
-    cells = road.grid.cells(middles[:, 0] + east, middles[:, 1] + north)
+    places = middles(points, faces)
     used = np.zeros(len(points), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     vertices = points[used]
     datum = float(np.floor(vertices[:, 2].min()))
     vertices[:, 2] -= datum
-    is_road = outline.contains(middles) if outline else mask[cells]
+    is_road = outline.contains(places) if outline else mask[road.grid.cells(*(places + road.core.origin).T)]
     return Mesh(road.core.crs, (east, north, datum), vertices, number[faces], is_road)

@@ -12,6 +12,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs, raster
+from flexroad.tasks.meshing.triangulate import delaunay
 from flexroad.tasks.metrics import evaluate, mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape
@@ -71,7 +72,8 @@ def main() -> None:
         time_ms = best(lambda s=surface, o=options: sample.sample(s, road, clusters, o))
         line(f"sample {method}", len(mesh.faces), time_ms)
     plan = meshes["dynamic"].vertices
-    ours = best(lambda: sample._delaunay(plan))
+    lattices = [((plan[:, 0].min(), plan[:, 1].min()), 1.0)]
+    ours = best(lambda: delaunay(plan, lattices))
     line("Delaunay", len(meshes["dynamic"].faces), ours, "scipy     ", best(lambda: Delaunay(plan[:, :2])))
     for name, mesh in meshes.items():
         for nearest in (False, True):

@@ -68,9 +68,9 @@ def test_ecsrc_output_is_pinned_to_version(clusters):
 @pytest.mark.parametrize(
     ("method", "golden"),
     [
-        ("dynamic", (2, 3378, (295500, 5629420, 149.0), "76897d34c3ba24f2")),
-        ("uniform", (2, 14062, (295500, 5629420, 149.0), "42a4d38a9f74eb42")),
-        ("corners", (2, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
+        ("dynamic", (3, 3378, (295500, 5629420, 149.0), "992fc8f8cc3179ab")),
+        ("uniform", (3, 14062, (295500, 5629420, 149.0), "42a4d38a9f74eb42")),
+        ("corners", (3, 2, (295500, 5629420, 149.0), "49388a377f0cc530")),
     ],
 )
 def test_sample_output_is_pinned_to_version(tile, clusters, method, golden):
@@ -89,7 +89,7 @@ def test_sample_output_with_lines_is_pinned_to_version(clusters):
     made = RoadMask(GRID, GRID, mask, outside, areas=encoded(streets, GRID))
     mesh = sample.sample(Hills(), made, clusters, sample.Options())
     shape = digest(np.round(mesh.vertices[:, :2] * 1e4), mesh.faces, mesh.road)
-    assert (sample.VERSION, len(mesh.faces), shape) == (2, 1328, "e4f52d534b2d6d1c")
+    assert (sample.VERSION, len(mesh.faces), shape) == (3, 1328, "0ecd1d2c60adabe6")
 
 
 def test_evaluate_output_is_pinned_to_version(tile, clusters):
