@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+import rasterio
 from pyproj import CRS
 from rasterio.enums import ColorInterp
 from rasterio.io import MemoryFile
+from rio_cogeo import cog_validate
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
@@ -93,3 +95,13 @@ def test_encode_height_wrong_shape_raises():
 
 def test_encode_height_equal_arrays_give_equal_bytes():
     assert cog.encode_height(plane(GRID), GRID) == cog.encode_height(plane(GRID), GRID)
+
+
+@pytest.mark.parametrize(("size", "block"), [(250, 256), (256, 256), (40, 48), (600, 512)])
+def test_encode_block_is_as_large_as_a_small_raster(size, block, tmp_path):
+    grid = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, size, 30)
+    file = tmp_path / "height.tif"
+    file.write_bytes(cog.encode_height(np.zeros(grid.shape), grid))
+    assert cog_validate(file, strict=True) == (True, [], [])
+    with rasterio.open(file) as raster:
+        assert raster.block_shapes == [(block, block)]
