@@ -3,26 +3,29 @@
 glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
 and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
 An orthophoto is embedded as one JPEG image that both nodes share.
+
+The file is put together here: trimesh takes four times as long for the same arrays, most of it to compare
+them with each other, and as long as a whole tile to be imported.
 """
 
 from __future__ import annotations
 
 import io
+import json
+import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.meshing.parts import texture_coordinates
+from flexroad.tasks.meshing.normals import vertex_normals
+from flexroad.tasks.meshing.parts import part, texture_coordinates
 from flexroad.tasks.meshing.relief import Sheet
-from flexroad.tasks.types import Bools, Floats, Mesh, Orthophoto
+from flexroad.tasks.types import Floats, Mesh, Orthophoto
 
-if TYPE_CHECKING:
-    import trimesh
-
-VERSION = 1
+VERSION = 2
 NAME = ".glb"
 MEDIA_TYPE = "model/gltf-binary"
 
@@ -34,6 +37,10 @@ ROAD_SRGB, TERRAIN_SRGB = (58, 58, 64), (196, 190, 174)
 
 SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 """Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border takes no colour of the opposite one."""
+UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+"""Twelve of the sixteen figures of a matrix by columns; the place follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,20 +96,19 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture 
         ``terrain`` (a class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs
         give equal bytes.
     """
-    import trimesh
-
-    whole = trimesh.Trimesh(_y_up(mesh.vertices), mesh.faces, process=False)
-    scene = trimesh.Scene(metadata=_georeference(mesh, run_origin))
+    normals = vertex_normals(mesh.vertices, mesh.faces)
     uv = texture_coordinates(mesh, texture.bounds) if texture else None
-    shift = _y_up(np.subtract(mesh.origin, run_origin))
-    scene.graph.update(frame_to="tile", matrix=trimesh.transformations.translation_matrix(shift))
+    file = _File()
+    shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()
+    tile = file.add("nodes", {"name": "tile", "children": [], "matrix": [*IDENTITY, *shift, 1.0]})
+    image = file.add_image(texture.jpeg) if texture else None
     for name, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
         if faces.any():
-            part = _part(whole, faces, _material(name, colour, textured=texture is not None), uv)
-            scene.add_geometry(part, node_name=name, geom_name=name, parent_node_name="tile")
-    embed = _Embedded(texture.jpeg).options if texture else {}
-    encoded: bytes = scene.export(file_type="glb", include_normals=True, **embed)
-    return encoded
+            used, corners = part(mesh, faces)
+            vertices = _Vertices(mesh.vertices[used], normals[used], None if uv is None else uv[used])
+            node = file.add_mesh(vertices, corners, _material(name, colour, image))
+            file.tree["nodes"][tile]["children"].append(node)
+    return file.encoded(tile, _georeference(mesh, run_origin))
 
 
 def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> bytes:
@@ -125,22 +131,13 @@ def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> b
         One node, ``ground``. Axes: x east, y up, z south; metres. The skirt has the colours and normals of
         the edge above it, so that it does not show.
     """
-    import trimesh
-
-    top = trimesh.Trimesh(_y_up(local[: sheet.top.max() + 1]), sheet.faces[: sheet.count], process=False)
+    top = vertex_normals(local[: sheet.top.max() + 1], sheet.faces[: sheet.count])
     west, south, east, north = bounds
     uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
-    ground = trimesh.Trimesh(
-        _y_up(local),
-        sheet.faces,
-        vertex_normals=top.vertex_normals[sheet.top],
-        visual=trimesh.visual.TextureVisuals(uv=uv, material=_material("ground", (), textured=True)),
-        process=False,
-    )
-    scene = trimesh.Scene()
-    scene.add_geometry(ground, node_name="ground", geom_name="ground")
-    encoded: bytes = scene.export(file_type="glb", include_normals=True, **_Embedded(image).options)
-    return encoded
+    file = _File()
+    material = _material("ground", (), file.add_image(image))
+    node = file.add_mesh(_Vertices(local, top[sheet.top], uv), sheet.faces, material)
+    return file.encoded(node)
 
 
 def _y_up(points: Floats) -> Floats:
@@ -158,50 +155,105 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
     }
 
 
-def _material(name: str, colour: tuple[int, ...], textured: bool) -> trimesh.visual.material.PBRMaterial:
-    import trimesh
-
-    look = {"roughnessFactor": 1.0} if textured else {"baseColorFactor": colour, "roughnessFactor": 0.95}
-    return trimesh.visual.material.PBRMaterial(name=name, metallicFactor=0.0, **look)
-
-
-def _part(
-    whole: trimesh.Trimesh, faces: Bools, material: trimesh.visual.material.PBRMaterial, uv: Floats | None
-) -> trimesh.Trimesh:
-    """Return the faces of one class with the whole mesh's vertex normals, so that shading shows no seam."""
-    import trimesh
-
-    used, corners = np.unique(whole.faces[faces], return_inverse=True)
-    return trimesh.Trimesh(
-        whole.vertices[used],
-        corners.reshape(-1, 3),
-        vertex_normals=whole.vertex_normals[used],
-        # trimesh's v is upward and is turned into glTF's, which is downward, when it is written.
-        visual=trimesh.visual.TextureVisuals(uv=None if uv is None else uv[used], material=material),
-        process=False,
-    )
+def _material(name: str, colour: tuple[int, ...], texture: int | None) -> dict[str, Any]:
+    """Return the look of a part: an image, or a colour in linear light, 0 to 255."""
+    look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.95}
+    if texture is None:
+        look["baseColorFactor"] = [value / 255 for value in colour]
+    else:
+        look |= {"roughnessFactor": 1.0, "baseColorTexture": {"index": texture}}
+    return {"name": name, "pbrMetallicRoughness": look}
 
 
-@dataclass(frozen=True)
-class _Embedded:
-    """The image of all materials, added to trimesh's file: trimesh itself would encode it again."""
+@dataclass(frozen=True, eq=False)
+class _Vertices:
+    """The vertices of a part in east, north and up."""
 
-    jpeg: bytes
+    places: Floats
+    """``(V, 3)`` (m)."""
+    normals: Floats
+    """``(V, 3)``."""
+    uv: Floats | None
+    """Places in the image, ``(V, 2)``: from west to east and from south to north."""
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """The options of trimesh's exporter that add the image."""
-        return {"buffer_postprocessor": self._add_bytes, "tree_postprocessor": self._add_texture}
 
-    def _add_bytes(self, buffers: dict[str, bytes], _: dict[str, Any]) -> None:
-        padding = -len(self.jpeg) % 4
-        buffers["image"] = self.jpeg + bytes(padding)
+class _File:
+    """A binary glTF file in the making: the tree of its JSON, and the pieces of its buffer."""
 
-    def _add_texture(self, tree: dict[str, Any]) -> None:
-        views = tree["bufferViews"]
-        views[-1]["byteLength"] = len(self.jpeg)
-        tree["images"] = [{"name": "orthophoto", "bufferView": len(views) - 1, "mimeType": "image/jpeg"}]
-        tree["samplers"] = [SAMPLER]
-        tree["textures"] = [{"source": 0, "sampler": 0}]
-        for material in tree["materials"]:
-            material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    def __init__(self) -> None:
+        self.tree: dict[str, list[dict[str, Any]]] = {}
+        self.pieces: list[bytes] = []
+        self.size = 0
+        """Bytes of the buffer."""
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Add an entry to one of the tree's lists; return its index."""
+        entries = self.tree.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def add_image(self, jpeg: bytes) -> int:
+        """Add an image; return the index of its texture."""
+        view = self._add_view(jpeg)
+        image = self.add("images", {"name": "orthophoto", "bufferView": view, "mimeType": "image/jpeg"})
+        return self.add("textures", {"source": image, "sampler": self.add("samplers", SAMPLER)})
+
+    def add_mesh(
+        self, vertices: _Vertices, faces: NDArray[np.int32] | NDArray[np.intp], material: dict[str, Any]
+    ) -> int:
+        """Add a mesh, named like its material; return the index of its node."""
+        attributes = {
+            "POSITION": self._add_array(_y_up(vertices.places), "VEC3"),
+            "NORMAL": self._add_array(_y_up(vertices.normals), "VEC3"),
+        }
+        if vertices.uv is not None:
+            # glTF counts from the top of the image.
+            from_top = np.column_stack([vertices.uv[:, 0], 1.0 - vertices.uv[:, 1]])
+            attributes["TEXCOORD_0"] = self._add_array(from_top, "VEC2")
+        primitive = {
+            "attributes": attributes,
+            "indices": self._add_indices(faces, len(vertices.places)),
+            "material": self.add("materials", material),
+        }
+        name = material["name"]
+        return self.add(
+            "nodes", {"name": name, "mesh": self.add("meshes", {"name": name, "primitives": [primitive]})}
+        )
+
+    def encoded(self, root: int, extras: dict[str, object] | None = None) -> bytes:
+        """Return the file whose scene has one root node; ``extras`` is what else the scene tells."""
+        scene = {"nodes": [root]} | ({"extras": extras} if extras else {})
+        head = {"asset": {"version": "2.0", "generator": "FlexRoad"}, "scene": 0, "scenes": [scene]}
+        tree = head | self.tree | {"buffers": [{"byteLength": self.size}]}
+        text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", self.size, b"BIN\0")]
+        length = 12 + sum(map(len, chunks)) + self.size
+        return b"".join([struct.pack("<4sII", b"glTF", 2, length), *chunks, *self.pieces])
+
+    def _add_array(self, values: Floats, kind: str) -> int:
+        """Add one value per vertex as float32; return the index of the accessor."""
+        array = values.astype("<f4")
+        accessor = {
+            "bufferView": self._add_view(array.tobytes(), ARRAY_BUFFER),
+            "componentType": FLOAT, "count": len(array), "type": kind,
+            "min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist(),
+        }  # fmt: skip
+        return self.add("accessors", accessor)
+
+    def _add_indices(self, faces: NDArray[np.int32] | NDArray[np.intp], count: int) -> int:
+        """Add the corners of faces, indices into ``count`` vertices; return the index of the accessor."""
+        # The largest number of a type has another meaning in graphics.
+        short = count < 2**16
+        view = self._add_view(faces.astype("<u2" if short else "<u4").tobytes(), ELEMENT_ARRAY_BUFFER)
+        kind = UNSIGNED_SHORT if short else UNSIGNED_INT
+        accessor = {"bufferView": view, "componentType": kind, "count": faces.size, "type": "SCALAR"}
+        return self.add("accessors", accessor)
+
+    def _add_view(self, data: bytes, target: int | None = None) -> int:
+        """Add bytes to the buffer, each piece from a multiple of 4 on; return the index of the view."""
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(data)}
+        padding = bytes(-len(data) % 4)
+        self.pieces += [data, padding]
+        self.size += len(data) + len(padding)
+        return self.add("bufferViews", view | ({"target": target} if target else {}))

@@ -28,8 +28,11 @@ def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
     corners : ndarray of int, (k, 3)
         Indices into ``used``.
     """
-    used, corners = np.unique(mesh.faces[faces], return_inverse=True)
-    return used.astype(np.intp), corners.reshape(-1, 3).astype(np.intp)
+    chosen = mesh.faces[faces]
+    is_used = np.zeros(len(mesh.vertices), np.bool_)
+    is_used[chosen] = True
+    number = np.cumsum(is_used) - 1
+    return np.flatnonzero(is_used), number[chosen]
 
 
 def texture_coordinates(mesh: Mesh, bounds: Bounds) -> Floats:

@@ -1,0 +1,65 @@
+"""Normals of the vertices of a mesh."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Floats
+
+SMALLEST_ANGLE = 1e-8
+"""Faces with a smaller angle (radians) are lines and have no normal."""
+
+
+def vertex_normals(points: Floats, faces: NDArray[np.int32]) -> Floats:
+    """Return unit normals, ``(V, 3)``: the mean of those of the faces around, by their angle at the vertex.
+
+    The weights are those of Thürmer and Wüthrich (1998), Computing vertex normals from polygonal facets.
+
+    Parameters
+    ----------
+    points : ndarray, (V, 3)
+        A vertex without faces, or with lines only, has the normal (0, 0, 1).
+    faces : ndarray of int32, (F, 3)
+        Counter-clockwise seen from the side of their normals.
+    """
+    normals = np.zeros((len(points), 3))
+    _add(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int32), normals)
+    _to_units(normals)
+    return normals
+
+
+@compiled()
+def _add(points: Floats, faces: NDArray[np.int32], normals: Floats) -> None:
+    """Add the normal of each face, times its angle, to those of its vertices."""
+    for a, b, c in faces:
+        ux, uy, uz = (points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2])
+        vx, vy, vz = (points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2])
+        wx, wy, wz = vx - ux, vy - uy, vz - uz
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        area = math.sqrt(nx * nx + ny * ny + nz * nz)
+        # Twice the area is the sine of an angle times the sides beside it.
+        at_a = math.atan2(area, ux * vx + uy * vy + uz * vz)
+        at_b = math.atan2(area, -(ux * wx + uy * wy + uz * wz))
+        at_c = math.pi - at_a - at_b
+        if min(at_a, at_b, at_c) < SMALLEST_ANGLE:
+            continue
+        for vertex, angle in ((a, at_a), (b, at_b), (c, at_c)):
+            normals[vertex, 0] += angle * nx / area
+            normals[vertex, 1] += angle * ny / area
+            normals[vertex, 2] += angle * nz / area
+
+
+@compiled()
+def _to_units(normals: Floats) -> None:
+    """Scale vectors, ``(V, 3)``, to length 1; one of length 0 becomes (0, 0, 1)."""
+    for i in range(normals.shape[0]):
+        x, y, z = normals[i]
+        length = math.sqrt(x * x + y * y + z * z)
+        if length > 0.0:
+            normals[i] /= length
+        else:
+            normals[i, 2] = 1.0
