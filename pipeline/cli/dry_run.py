@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from flexroad.catalog import Tile
 from flexroad.catalog.text import count
+from flexroad.pipeline.execute.adaptive import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -19,8 +21,10 @@ from flexroad.pipeline.store.artefacts import ArtefactStore
 STORED, TO_DO, DONE = "stored", "to do", "done"
 
 
-def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False) -> Iterator[str]:
+def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | None = None) -> Iterator[str]:
     """Yield one line per tile with the reason why it is computed, then the totals, then what would fail.
+
+    After the number of tiles follows whether worker processes would be started.
 
     In the totals, a node of the graph is ``done`` if its tile is up to date, ``stored`` if its result is in
     the store, else ``to do``. Nodes that are never stored (the rasters that `load` reads) are computed again
@@ -34,15 +38,20 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False) -> Iterator[str
         The selected tiles.
     verbose : bool
         Whether each tile also has a line per node.
+    workers : int, optional
+        Largest number of worker processes; by default that of the configuration.
     """
     artefacts, totals, reasons = ArtefactStore(run.store), Counter[tuple[str, str]](), Counter[Kind]()
     todo: list[Tile] = []
+    times: list[float] = []
     counted: set[str] = set()
     for status in peek_statuses(run, tiles):
         graph, why = status.graph, reason(run, status)
         yield f"{graph.tile.id}: {why.line}"
         reasons[why.kind] += 1
         done = why.kind == "up to date"
+        if status.last_record and status.last_record.state == "done":
+            times.append(status.last_record.seconds)
         todo += [] if done else [graph.tile]
         states: dict[str, str] = {}
         for name, node in graph.nodes.items():
@@ -56,6 +65,9 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False) -> Iterator[str
             yield from _nodes(graph, states)
     numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
     yield f"{count(reasons.total(), 'tile')}: {numbers}"
+    if todo and not run.config.cluster.needs_workers:
+        tile_s = statistics.median(times) if times else None
+        yield f"  {decision(len(todo), tile_s, workers_of(workers or run.config.cluster.workers))}"
     for stage in (*STAGE_NAMES, BORDER):
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
         if counts:

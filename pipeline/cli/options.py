@@ -65,6 +65,16 @@ Workers = Annotated[
     int | None,
     typer.Option(min=1, metavar="N", help="Worker processes; default: one per core.", rich_help_panel=WORK),
 ]
+MostWorkers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=1,
+        metavar="N",
+        help="At most N worker processes; default: one per core.",
+        rich_help_panel=WORK,
+    ),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="A running Dask scheduler: tcp://host:8786.", rich_help_panel=WORK),
@@ -72,6 +82,15 @@ Scheduler = Annotated[
 Executor = Annotated[
     Literal["dask", "serial"],
     typer.Option(help="dask: worker processes; serial: one process, for debugging.", rich_help_panel=WORK),
+]
+RunExecutor = Annotated[
+    Literal["auto", "dask", "serial"],
+    typer.Option(
+        "--executor",
+        help="auto: worker processes if they save more time than their start takes; dask: always; "
+        "serial: never.",
+        rich_help_panel=WORK,
+    ),
 ]
 Dashboard = Annotated[
     bool,

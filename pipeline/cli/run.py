@@ -72,8 +72,8 @@ def run(
     bbox: options.Box = None,
     area: options.Area = None,
     area_layer: options.AreaLayer = None,
-    executor: options.Executor = "dask",
-    workers: options.Workers = None,
+    executor: options.RunExecutor = "auto",
+    workers: options.MostWorkers = None,
     scheduler: options.Scheduler = None,
     dashboard: options.Dashboard = False,
     on_failure: options.OnFailure = None,
@@ -120,18 +120,18 @@ def run(
         chosen = load_config(config, settings or ())
         whole, selected = read_catalog(chosen)
         planned = Run.planned(path, chosen, of_run(whole, selected), root, checksum)
-        for line in plan(planned, selected.tiles, verbose):
+        for line in plan(planned, selected.tiles, verbose, workers):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         chosen = load_config(config, settings or ())
         with _named(f"reading {catalog}"):
             whole, selected = read_catalog(chosen)
-        with _locked(path, create=True):
+        with _locked(path, create=True) as died:
             with _named(f"preparing {out}"):
                 opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
-            make_executor = partial(_executor, executor, workers, scheduler, chosen.cluster, dashboard)
+            make_executor = partial(_executor, executor, died, workers, scheduler, chosen.cluster, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
     _exit(outcome)
 
@@ -156,8 +156,8 @@ def rerun(
     ] = None,
     allow: options.Allow = None,
     verify: options.Verify = False,
-    executor: options.Executor = "dask",
-    workers: options.Workers = None,
+    executor: options.RunExecutor = "auto",
+    workers: options.MostWorkers = None,
     scheduler: options.Scheduler = None,
     dashboard: options.Dashboard = False,
     on_failure: options.OnFailure = None,
@@ -181,12 +181,13 @@ def rerun(
         force = frozenset(steps[steps.index(from_stage) :]) if from_stage else frozenset()
         # The control points of a border are part of the fit.
         force |= {BORDER} if "fit" in force else frozenset()
-        with _locked(location):
+        with _locked(location) as died:
             with _named(f"reading {path}"):
                 opened = Run.open(location, allow or ())
                 check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
-            make_executor = partial(_executor, executor, workers, scheduler, opened.config.cluster, dashboard)
+            cluster = opened.config.cluster
+            make_executor = partial(_executor, executor, died, workers, scheduler, cluster, dashboard)
             _run_tiles(opened, make_executor, only, force, verify, outcome)
     _exit(outcome)
 
@@ -204,11 +205,20 @@ def _named(work: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _locked(path: Location, create: bool = False) -> Iterator[None]:
-    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty."""
+def _locked(path: Location, create: bool = False) -> Iterator[bool]:
+    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty.
+
+    Yields whether the process that held the lock before has died: one of the tiles may have ended it.
+    """
     from flexroad.pipeline.run.lock import run_lock
 
     made: list[Path] = []
+    taken_over: list[str] = []
+
+    def notify(line: str) -> None:
+        taken_over.append(line)
+        warn(line, "note")
+
     try:
         if create and isinstance(path, Path):
             made = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -217,8 +227,8 @@ def _locked(path: Location, create: bool = False) -> Iterator[None]:
         _remove_empty(made)
         raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
     try:
-        with run_lock(path, lambda line: warn(line, "note")):
-            yield
+        with run_lock(path, notify):
+            yield bool(taken_over)
     except BaseException:
         _remove_empty(made)
         raise
@@ -233,17 +243,21 @@ def _remove_empty(folders: Sequence[Path]) -> None:
 
 def _executor(
     name: str,
+    died: bool,
     workers: int | None,
     scheduler: str | None,
     cluster: Cluster,
     dashboard: bool,
     say: Callable[[str], None],
 ) -> Executor:
-    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+    from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, SerialExecutor
 
     if name == "serial":
         return SerialExecutor()
-    return DaskExecutor(workers, scheduler, cluster, dashboard, say)
+    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say)
+    if name == "dask" or died or scheduler or dashboard or cluster.needs_workers:
+        return parallel
+    return AdaptiveExecutor(workers or cluster.workers, parallel, say)
 
 
 def _run_tiles(

@@ -11,6 +11,9 @@ from pydantic import ByteSize, Field
 
 from flexroad.tasks.options import Options
 
+DEFAULT_TIMEOUT_S = 3600
+"""Time limit of a tile if the configuration gives none."""
+
 
 class Cluster(Options):
     """The workers that process the tiles; `--workers` and `--scheduler` override it for one command."""
@@ -21,20 +24,24 @@ class Cluster(Options):
         "(pip install 'flexroad[slurm]' or 'flexroad[kubernetes]')",
     )
     workers: int | None = Field(
-        None, ge=1, le=100_000, description="worker processes of one thread; local: by default one per core"
+        None,
+        ge=1,
+        le=100_000,
+        description="most worker processes, of one thread; local: by default one per core",
     )
     memory: ByteSize | None = Field(
         None,
         ge=100 * 1024**2,
-        description="memory of each worker, as 4 GiB; by default an equal share of this machine's memory, "
-        "on slurm and kubernetes 4 GiB; a tile that needs more is stopped and becomes a failed row",
+        description="memory of each worker, as 4 GiB; a value starts workers for any tile; by default an "
+        "equal share of this machine's memory, on slurm and kubernetes 4 GiB; a tile that needs more is "
+        "stopped and becomes a failed row",
     )
     tile_timeout_s: float = Field(
-        3600,
+        DEFAULT_TIMEOUT_S,
         ge=1,
         le=604_800,
         description="longest time for one tile (s): a worker that takes longer is stopped, the tile is tried "
-        "once more alone, and is then a failed row; not with the serial executor",
+        "once more alone, and is then a failed row; only on workers: another value starts them for any tile",
     )
     patience_s: float = Field(
         60, ge=0, le=86_400, description="waiting time for a new worker when all workers are lost (s)"
@@ -60,3 +67,9 @@ class Cluster(Options):
     )
     image: str | None = Field(None, min_length=1, description="kubernetes: image of scheduler and workers")
     namespace: str | None = Field(None, min_length=1, description="kubernetes: namespace of the pods")
+
+    @property
+    def needs_workers(self) -> bool:
+        """Whether tiles run on workers only: on other machines, or within limits of memory and time."""
+        limited = self.memory is not None or self.tile_timeout_s != DEFAULT_TIMEOUT_S
+        return limited or self.kind != "local"

@@ -1,11 +1,14 @@
-"""Executors: run jobs one after the other or on Dask. The only package that imports Dask.
+"""Executors: run jobs one after the other, on Dask, or on Dask only if that pays.
+
+The only package that imports Dask.
 
 One Dask task is one tile. Its graph is computed inside a single process, so that no raster is sent between
 processes (``docs/decisions.md`` has the measurement against one task per stage).
 """
 
+from flexroad.pipeline.execute.adaptive import AdaptiveExecutor, Jobs
 from flexroad.pipeline.execute.dask import DaskExecutor
 from flexroad.pipeline.execute.executor import Executor
 from flexroad.pipeline.execute.serial import SerialExecutor
 
-__all__ = ["DaskExecutor", "Executor", "SerialExecutor"]
+__all__ = ["AdaptiveExecutor", "DaskExecutor", "Executor", "Jobs", "SerialExecutor"]

@@ -6,6 +6,7 @@
     stage  one stage of a tile, with its start time: seconds, bytes written, peak memory (MB), host, pid,
            nodes computed and reused
     tile   a processed tile: status, seconds, notes, failures
+    work   whether the tiles run on worker processes, and why
     end    end of the run: its summary, seconds
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import statistics
 import time
 from array import array
 from collections import Counter
@@ -14,7 +15,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import exists, flush_names, parse_location
 from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.execute import Executor, Jobs
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.event_log import EventLog
@@ -36,6 +37,8 @@ class Plan:
 
     todo: array[int]
     """Indices in the catalog of the tiles to process."""
+    tile_s: float | None
+    """Median computing time of the tiles that were done before (s), None if there are none."""
     new: int
     changed: int
     vanished: int
@@ -78,7 +81,10 @@ def run_tiles(
         plan = None
         try:
             plan = plan_run(run, database, only, force, watch, verify)
-            with contextlib.closing(_results(run, executor, database, _jobs(run, plan, force))) as results:
+            jobs = Jobs(
+                _jobs(run, plan, force), len(plan.todo), plan.tile_s, lambda line: log.note("work", text=line)
+            )
+            with contextlib.closing(_results(run, executor, database, jobs)) as results:
                 for result in results:
                     database.record(result.entry)
                     log.tile(result)
@@ -105,7 +111,7 @@ def plan_run(
     ConfigError
         If each of several tiles lacks a file.
     """
-    todo, states, new, changed = array("L"), list[TileState](), 0, 0
+    todo, states, new, changed, times = array("L"), list[TileState](), 0, 0, array("f")
     incomplete, last_incomplete = 0, None
     for position, status in enumerate(tile_statuses(run, database, from_markers=verify)):
         if own_files_missing(status.graph):
@@ -113,6 +119,8 @@ def plan_run(
         selected = only(run.catalog.tiles[position])
         if selected and verify and status.done and not run.folder(status.graph.tile.id).verified():
             status = replace(status, up_to_date=False)
+        if status.last_record and status.last_record.state == "done":
+            times.append(status.last_record.seconds)
         new += status.last_record is None
         changed += status.last_record is not None and not status.up_to_date
         state: TileState = "done" if status.done else "failed" if status.failed else "pending"
@@ -130,7 +138,7 @@ def plan_run(
     database.flush()
     ids = (tile.id for tile in run.catalog.tiles)
     vanished = database.set_states(zip(ids, states, strict=True))
-    return Plan(todo, new, changed, vanished)
+    return Plan(todo, statistics.median(times) if times else None, new, changed, vanished)
 
 
 def _all_incomplete(run: Run, graph: TileGraph) -> str:
@@ -156,7 +164,7 @@ def _jobs(run: Run, plan: Plan, force: frozenset[str]) -> Iterator[TileJob]:
 
 
 def _results(
-    run: Run, executor: Executor, database: RunDatabase, jobs: Iterator[TileJob]
+    run: Run, executor: Executor, database: RunDatabase, jobs: Jobs[TileJob]
 ) -> Generator[TileResult, None, None]:
     """Yield the results of the jobs; at the end record tiles that were finished but whose result was lost."""
     in_progress: set[str] = set()
@@ -166,7 +174,8 @@ def _results(
             in_progress.add(job.graph.tile.id)
             yield job
 
-    results = executor.map(process_tile, submitted(), _lost, partial(check_writable, run.store))
+    tracked = replace(jobs, source=submitted())
+    results = executor.map(process_tile, tracked, _lost, partial(check_writable, run.store))
     try:
         for result in results:
             in_progress.remove(result.tile_id)

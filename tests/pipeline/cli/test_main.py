@@ -44,7 +44,7 @@ def finished(words, tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_run_with_worker_processes_equals_serial_run(words, finished, tmp_path):
-    said = process(*words, "--out", tmp_path / "run", "--workers", 2).expected(0)
+    said = process(*words, "--out", tmp_path / "run", "--executor", "dask", "--workers", 2).expected(0)
     assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said.out
     tables = [read_metrics(run).drop(columns="seconds") for run in (finished, tmp_path / "run")]
     pd.testing.assert_frame_equal(*tables, check_exact=True)

@@ -148,6 +148,8 @@ def test_run_workers_cannot_start_exits_with_one_line(config, made_survey, night
         "-c",
         "from flexroad.pipeline.cli.main import main; main()",
         "run",
+        "--executor",
+        "dask",
         "--workers",
         "2",
     ]

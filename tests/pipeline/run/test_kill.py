@@ -48,7 +48,19 @@ def undisturbed(folder) -> pd.DataFrame:
 def command(folder, out) -> list[str]:
     words = ["--config", folder / "slow.yaml", "--catalog", folder / "survey" / "catalog.parquet"]
     call = "from flexroad.pipeline.cli.main import main; main()"
-    return [sys.executable, "-c", call, "run", *map(str, words), "--out", str(out), "--workers", "2"]
+    return [
+        sys.executable,
+        "-c",
+        call,
+        "run",
+        *map(str, words),
+        "--out",
+        str(out),
+        "--executor",
+        "dask",
+        "--workers",
+        "2",
+    ]
 
 
 def markers(out) -> list:

@@ -307,7 +307,7 @@ def test_commands_accept_s3_addresses(survey, bucket, tmp_path, local, flexroad)
     config = tmp_path / "light.yaml"
     config.write_text(yaml.safe_dump(LIGHT, sort_keys=False))
     home = str(bucket / "run")
-    words = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--workers", "1"]
+    words = ["run", "--config", str(config), "--catalog", str(survey), "--out", home, "--executor", "dask"]
     flexroad(*words)
     assert_same(Run.open(bucket / "run"), local)
     assert "4 done" in flexroad("status", home)
