@@ -17,6 +17,7 @@ import numpy as np
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.config.methods import methods
+from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
@@ -32,14 +33,14 @@ def encode(value: Any, seconds: Mapping[str, float]) -> bytes:
     for field in fields(value):
         item = getattr(value, field.name)
         if isinstance(item, np.ndarray):
-            arrays[field.name] = item
+            # Points are a quarter smaller by columns: many have the same x or y.
+            points = item.dtype.kind == "f" and item.shape[1:] == (3,)
+            arrays[field.name] = np.asfortranarray(item) if points else item
         else:
             plain[field.name] = {"grid": asdict(item)} if isinstance(item, Grid) else item
     header = {"type": type(value).__name__, "seconds": dict(seconds), "fields": plain}
-    buffer = io.BytesIO()
     arrays[HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez_compressed(buffer, **arrays)
-    payload = buffer.getvalue()
+    payload = npz(arrays)
     return payload + hashlib.sha256(payload).digest()
 
 
@@ -55,7 +56,7 @@ def decode(data: bytes) -> tuple[Any, dict[str, float]]:
     if hashlib.sha256(payload).digest() != checksum:
         raise ValueError("the checksum does not match the data")
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+        arrays = {name: np.asarray(archive[name], order="C") for name in archive.files}
     header = json.loads(arrays.pop(HEADER).tobytes())
     plain = {name: _plain(item) for name, item in header["fields"].items()}
     return _types()[header["type"]](**plain, **arrays), header["seconds"]

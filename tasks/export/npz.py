@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 1
@@ -31,21 +32,20 @@ def encode(surface: NurbsSurface) -> bytes:
     m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
     with row 0 in the south. No pickled objects; float64.
     """
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        version=np.int64(VERSION),
-        crs=np.array(surface.crs),
-        bounds=np.asarray(surface.bounds, np.float64),
-        degree=np.asarray(surface.degree, np.int64),
-        knots_u=surface.knots_u,
-        knots_v=surface.knots_v,
-        A=surface.A,
-        W=surface.W,
-        datum=np.float64(surface.datum),
-        origin=np.asarray(surface.origin, np.float64),
+    return npz(
+        {
+            "version": np.int64(VERSION),
+            "crs": np.array(surface.crs),
+            "bounds": np.asarray(surface.bounds, np.float64),
+            "degree": np.asarray(surface.degree, np.int64),
+            "knots_u": surface.knots_u,
+            "knots_v": surface.knots_v,
+            "A": surface.A,
+            "W": surface.W,
+            "datum": np.float64(surface.datum),
+            "origin": np.asarray(surface.origin, np.float64),
+        }
     )
-    return buffer.getvalue()
 
 
 def decode(source: bytes | Path | str) -> NurbsSurface:
@@ -58,8 +58,10 @@ def decode(source: bytes | Path | str) -> NurbsSurface:
     """
     name = "these bytes" if isinstance(source, bytes) else str(source)
     try:
-        with np.load(io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False) as npz:
-            arrays = {key: npz[key] for key in npz.files}
+        with np.load(
+            io.BytesIO(source) if isinstance(source, bytes) else source, allow_pickle=False
+        ) as archive:
+            arrays = {key: archive[key] for key in archive.files}
         version = int(arrays["version"])
         if version > VERSION:
             message = (

@@ -23,7 +23,11 @@ CONFIG = {
 
 def same(a, b) -> bool:
     if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+        return (
+            a.dtype == b.dtype
+            and b.flags.c_contiguous
+            and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+        )
     if isinstance(a, float):
         return type(b) is float and (a == b or (a != a and b != b))
     return type(a) is type(b) and a == b
