@@ -30,6 +30,7 @@ from flexroad.tasks.filter.kit.union_find import (
     members_of,
     unite,
 )
+from flexroad.tasks.roads.columns import columns_of
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
@@ -117,7 +118,7 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     consistency = ground_consistency(data.dsm, data.dtm, ground, points & ~ground, reach, theta)
     level = np.abs(data.dsm - data.dtm) <= theta
     kept = ground | (consistency == CONSISTENT) | (points & ~ground & (consistency == NO_NEIGHBOURS) & level)
-    labels = _labels(kept, cell, options)
+    labels = _labels(data.dsm, kept, patches, cell, options)
     dtm_invalid = invalid_dtm(data, road, labels > 0) | _verge(road.mask, labels > 0, options.verge_m / cell)
     return RoadClusters(data.grid, labels, dtm_invalid)
 
@@ -208,10 +209,9 @@ def _medians(values: Floats, member: NDArray[np.intp], count: int) -> Floats:
     return medians
 
 
-def _labels(kept: Bools, cell: float, options: Options) -> NDArray[np.int32]:
+def _labels(dsm: Floats, kept: Bools, patches: Patches, cell: float, options: Options) -> NDArray[np.int32]:
     """Label the clusters of the kept cells by gaps alone; heights were checked before."""
-    level, slope = np.zeros(kept.shape), np.zeros((*kept.shape, 2))
-    roots = _merged(kept, options.theta_xy_m / cell, level, slope, math.inf)
+    roots = _merged(kept, options.theta_xy_m / cell, dsm, patches.trend, math.inf)
     return clean(kept, roots, least_cells(options.min_area_m2, cell), options.keep_largest)
 
 
@@ -265,16 +265,14 @@ def _join_across(
     """Unite sets if an end is ``gap`` cells from a start and within ``theta`` in height along the slope."""
     rows, cols = starts.shape
     reach = int(gap + 1e-9)
-    # The columns of the ends, row by row, and the number of ends before each cell.
-    at, before = np.flatnonzero(ends) % cols, np.zeros(rows * cols + 1, np.int32)
-    before[1:] = np.cumsum(ends)
+    columns, before = columns_of(ends)
     for i in np.flatnonzero(starts):
         r, c = i // cols, i % cols
         for row in range(max(r - reach, 0), min(r + reach + 1, rows)):
             down = row - r
             wide = int(math.sqrt(gap**2 + 1e-9 - down**2))
             first, last = row * cols + max(c - wide, 0), row * cols + min(c + wide + 1, cols)
-            for col in at[before[first] : before[last]]:
+            for col in columns[before[first] : before[last]]:
                 j, across = row * cols + col, col - c
                 if roots[j] == roots[i]:
                     continue

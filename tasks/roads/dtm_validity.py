@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.roads.columns import columns_of
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 AGREE_M = 0.3
@@ -126,11 +127,12 @@ def _sums(
     sums, nearest = np.zeros((len(cells), 10)), np.full(len(cells), np.inf)
     # Cells in one column, one below the other, have most of their rows in common.
     row_sums, done_for = np.empty((len(valid), 7)), np.full(len(valid), -1)
+    columns, before = columns_of(valid)
     for k in np.argsort(cells[:, 1], kind="mergesort"):
         row, col = cells[k]
         for i in range(max(row - reach, 0), min(row + reach + 1, len(valid))):
             if done_for[i] != col:
-                row_sums[i] = _row_sums(heights, valid, i, col, bell, cell, datum)
+                row_sums[i] = _row_sums(heights, columns, before, i, col, bell, cell, datum)
                 done_for[i] = col
             n, c, cc, z, cz, zz, beside = row_sums[i]
             if n == 0.0:
@@ -145,15 +147,22 @@ def _sums(
 
 @compiled()
 def _row_sums(
-    heights: Floats, valid: Bools, row: int, col: int, bell: Floats, cell: float, datum: float
+    heights: Floats,
+    columns: NDArray[np.intp],
+    before: NDArray[np.int32],
+    row: int,
+    col: int,
+    bell: Floats,
+    cell: float,
+    datum: float,
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return the weighted sums of 1, c, cc, z, cz and zz in one row, and the columns to the nearest cell."""
-    reach = len(bell) // 2
+    reach, wide = len(bell) // 2, heights.shape[1]
     n, c, cc, z, cz, zz, beside = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
-    for j in range(max(col - reach, 0), min(col + reach + 1, valid.shape[1])):
-        if valid[row, j]:
-            w, x, up = bell[j - col + reach], (j - col) * cell, heights[row, j] - datum
-            n, c, cc = n + w, c + w * x, cc + w * x * x
-            z, cz, zz = z + w * up, cz + w * x * up, zz + w * up * up
-            beside = min(beside, abs(j - col))
+    first, last = row * wide + max(col - reach, 0), row * wide + min(col + reach + 1, wide)
+    for j in columns[before[first] : before[last]]:
+        w, x, up = bell[j - col + reach], (j - col) * cell, heights[row, j] - datum
+        n, c, cc = n + w, c + w * x, cc + w * x * x
+        z, cz, zz = z + w * up, cz + w * x * up, zz + w * up * up
+        beside = min(beside, abs(j - col))
     return n, c, cc, z, cz, zz, beside

@@ -56,10 +56,8 @@ def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float
     """
     reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
     slopes, smooth = _planes(heights, points, reach, roughness_m**2)
-    trend = _trend(slopes, smooth, max(1, math.floor(STREET_M / cell + 1e-9)))
-    down, across = np.moveaxis(slopes - trend, 2, 0)
-    centres = smooth & (down**2 + across**2 <= (bend * cell) ** 2)
-    return Patches(centres, trend, reach)
+    around = max(1, math.floor(STREET_M / cell + 1e-9))
+    return Patches(*_along_street(slopes, smooth, around, (bend * cell) ** 2), reach)
 
 
 @compiled()
@@ -89,10 +87,14 @@ def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple
 
 
 @compiled()
-def _trend(slopes: Floats, smooth: Bools, around: int) -> Floats:
-    """Return the mean slope of the smooth patches around each of them, ``(H, W, 2)``."""
+def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) -> tuple[Bools, Floats]:
+    """Return the smooth patches with the street's slope, ``(H, W)``, and that slope, ``(H, W, 2)``.
+
+    The street's slope is the mean of the smooth patches ``around`` a patch. The square of the difference to
+    it is at most ``largest``.
+    """
     rows, cols = smooth.shape
-    trend, beside = np.zeros((rows, cols, 2)), np.zeros((rows, cols, 3))
+    trend, beside, centres = np.zeros((rows, cols, 2)), np.zeros((rows, cols, 3)), smooth.copy()
     # First the sums of 1 and both slopes over columns, then the sums of these over rows.
     for r in range(rows):
         for c in range(cols):
@@ -107,5 +109,8 @@ def _trend(slopes: Floats, smooth: Bools, around: int) -> Floats:
                 n, down, across = 0.0, 0.0, 0.0
                 for i in range(max(r - around, 0), min(r + around + 1, rows)):
                     n, down, across = n + beside[i, c, 0], down + beside[i, c, 1], across + beside[i, c, 2]
-                trend[r, c] = down / n, across / n
-    return trend
+                down, across = down / n, across / n
+                trend[r, c] = down, across
+                bend = (slopes[r, c, 0] - down) ** 2 + (slopes[r, c, 1] - across) ** 2
+                centres[r, c] = bend <= largest
+    return centres, trend
