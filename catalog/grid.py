@@ -26,7 +26,7 @@ def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
     return min(a[2], b[2]) - max(a[0], b[0]) > tolerance and min(a[3], b[3]) - max(a[1], b[1]) > tolerance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Grid:
     """A north-up lattice of square cells.
 

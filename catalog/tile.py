@@ -29,7 +29,7 @@ TOUCH_M = 0.001
 """Files that overlap ground by no more than this (m) only touch it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Layer:
     """One layer of a tile and its files."""
 
@@ -100,7 +100,7 @@ class Layer:
         return replace(self, files=files, extents=tuple(self.extents[number] for number in chosen))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Tile:
     """A square of ground and its layers."""
 

@@ -15,7 +15,7 @@ import errno
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -142,52 +142,48 @@ def stat(where: Location) -> FileStat | None:
 def listing(folder: Location) -> dict[str, FileStat]:
     """Return all files below a folder by their relative names; empty if the folder does not exist.
 
-    In a bucket this is one (paged) list request.
+    In a bucket this is one (paged) list request. `entries` gives those of a large folder one by one.
     """
-    if isinstance(folder, Path):
-        return dict(_scan(folder, ""))
-    with named(folder):
-        return _files(folder, folder.fs.find(folder.path, detail=True))
+    return dict(entries(folder))
 
 
-@dataclass(frozen=True)
-class StatCache:
-    """Sizes and versions of files, read once each; in a bucket, with one list request per folder.
+def entries(folder: Location) -> Iterator[tuple[str, FileStat]]:
+    """Yield relative name and stat of all files below a folder; none if it does not exist.
 
-    Create one per pass over a catalog: ``stat_of = StatCache(); stat_of(path)`` returns the same as
-    ``stat(path)``. Later changes of a file are not noticed.
+    In a bucket, files come in the order of their names, in pages of a thousand: memory does not grow with
+    their number.
+
+    Raises
+    ------
+    OSError
+        If the storage does not answer.
     """
-
-    _files: dict[Location, FileStat | None] = field(default_factory=dict)
-    _folders: dict[str, dict[str, FileStat]] = field(default_factory=dict)
-
-    def __call__(self, where: Location) -> FileStat | None:
-        """Return a file's size and version, or None if it does not exist.
-
-        Raises
-        ------
-        OSError
-            If the storage does not answer.
-        """
-        if not isinstance(where, Path):
-            # UPath's `parent` and `name` would take as long as all the rest.
-            folder, _, name = where.path.rpartition("/")
-            if folder not in self._folders:
-                self._folders[folder] = _listed(where.parent)
-            return self._folders[folder].get(name)
-        if where not in self._files:
-            self._files[where] = stat(where)
-        return self._files[where]
+    return _scan(folder, "") if isinstance(folder, Path) else _pages(folder, {})
 
 
-def _listed(folder: UPath) -> dict[str, FileStat]:
-    """Return the files in a folder of a bucket, without those in subfolders."""
-    try:
-        with named(folder):
-            entries = {entry["name"]: entry for entry in folder.fs.ls(folder.path, detail=True)}
-    except FileNotFoundError:
-        return {}
-    return _files(folder, entries)
+def entries_of(folder: UPath) -> Iterator[tuple[str, FileStat]]:
+    """Yield the files of a folder of a bucket as `entries` does, without those in subfolders."""
+    return _pages(folder, {"Delimiter": "/"})
+
+
+def _pages(folder: UPath, options: dict[str, str]) -> Iterator[tuple[str, FileStat]]:
+    bucket, _, key = folder.path.partition("/")
+    prefix = f"{key.rstrip('/')}/" if key.strip("/") else ""
+    request = {"Bucket": bucket, "Prefix": prefix, **options}
+    while True:
+        try:
+            with named(folder):
+                page = folder.fs.call_s3("list_objects_v2", **request)
+        except FileNotFoundError:
+            return
+        for entry in page.get("Contents", ()):
+            name = entry["Key"][len(prefix) :]
+            # Some programs make empty objects with the names of folders.
+            if name and not name.endswith("/"):
+                yield name, FileStat(int(entry["Size"]), str(entry["ETag"]).strip('"'))
+        if not page.get("IsTruncated"):
+            return
+        request["ContinuationToken"] = page["NextContinuationToken"]
 
 
 def sidecars(where: UPath) -> set[str]:

@@ -13,7 +13,8 @@ from flexroad.catalog.cover import height_share
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.open_raster import open_raster
 from flexroad.catalog.headers.rasters import quiet, some
-from flexroad.catalog.storage.paths import Location, StatCache
+from flexroad.catalog.storage.listed_files import StatCache
+from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import count
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config

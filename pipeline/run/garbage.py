@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.storage.paths import Location, absolute, exists, listing, remove
+from flexroad.catalog.storage.paths import Location, absolute, entries, exists, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -194,9 +194,9 @@ def _folders(parent: Location) -> Iterator[tuple[Location, dict[str, int]]]:
         for name in names:
             yield parent / name, {file: stat.size for file, stat in listing(parent / name).items()}
         return
-    folders: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for path, stat in listing(parent).items():
-        folder, slash, file = path.partition("/")
-        if slash:
-            folders[folder][file] = stat.size
-    yield from ((parent / name, files) for name, files in folders.items())
+    parts = ((name.partition("/"), file.size) for name, file in entries(parent))
+    # The files of a folder follow each other.
+    for folder, files in groupby(parts, key=lambda part: part[0][0]):
+        below = {name: size for (_, slash, name), size in files if slash}
+        if below:
+            yield parent / folder, below

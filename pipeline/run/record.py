@@ -28,9 +28,9 @@ import yaml
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.allowlist import needed
+from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
     Location,
-    StatCache,
     absolute,
     exists,
     flush_names,

@@ -7,16 +7,18 @@ is read only if it differs from the one in the database.
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property, partial
 from itertools import repeat
+from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import FileStat, Location, is_remote, listing, read
+from flexroad.catalog.storage.listed_files import ListedFiles
+from flexroad.catalog.storage.paths import FileStat, Location, entries, listing, read
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
@@ -80,15 +82,14 @@ class Folders:
     def __call__(self, tile_id: str) -> dict[str, FileStat]:
         """Return the files of a tile by name."""
         folder = TileProducts.of(self.run, tile_id).path
-        return self._listed.get(folder.name, {}) if is_remote(self.run) else listing(folder)
+        return listing(folder) if isinstance(folder, Path) else self._listed.files(folder.name)
 
     @cached_property
-    def _listed(self) -> dict[str, dict[str, FileStat]]:
-        folders: defaultdict[str, dict[str, FileStat]] = defaultdict(dict)
-        for name, stat in listing(self.run / "tiles").items():
-            folder, _, file = name.partition("/")
-            folders[folder][file] = stat
-        return dict(folders)
+    def _listed(self) -> ListedFiles:
+        listed = ListedFiles()
+        parts = ((name.partition("/"), file) for name, file in entries(self.run / "tiles"))
+        listed.add((folder, name, file) for (folder, _, name), file in parts)
+        return listed
 
 
 def peek_statuses(run: Run, tiles: Iterable[Tile]) -> Iterator[TileStatus]:
