@@ -24,9 +24,10 @@ from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.lines import apart_from, divided, ends_at_border, points_and_segments
+from flexroad.tasks.meshing.parts import middles
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
-from flexroad.tasks.meshing.triangulate import Faces, constrained, middles
+from flexroad.tasks.meshing.triangulate import Faces, constrained
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,

@@ -237,7 +237,7 @@ class _File:
         accessor = {
             "bufferView": self._add_view(array.tobytes(), ARRAY_BUFFER),
             "componentType": FLOAT, "count": len(array), "type": kind,
-            "min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist(),
+            "min": [float(axis.min()) for axis in array.T], "max": [float(axis.max()) for axis in array.T],
         }  # fmt: skip
         return self.add("accessors", accessor)
 

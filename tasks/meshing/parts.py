@@ -35,6 +35,14 @@ def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
     return np.flatnonzero(is_used), number[chosen]
 
 
+def middles(points: Floats, faces: NDArray[np.int32]) -> Floats:
+    """Return the centroids of faces in plan, ``(F, 2)``."""
+    a, b, c = faces.T
+    # Three short sums are several times faster than one of numpy over an axis of three.
+    axes = np.ascontiguousarray(points[:, :2].T)
+    return np.stack([(axis[a] + axis[b] + axis[c]) / 3.0 for axis in axes], axis=1)
+
+
 def texture_coordinates(mesh: Mesh, bounds: Bounds) -> Floats:
     """Return the places of a mesh's vertices in an image seen from above, ``(V, 2)``.
 

@@ -12,6 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks.meshing.parts import middles
 from flexroad.tasks.roads.dtm_validity import AGREE_M, without_invalid_dtm
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
 
@@ -58,6 +59,5 @@ def of_faces(classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh) -> NDArray[
 
     Faces at the limit of the survey are inferred where the cell lies beyond it.
     """
-    x, y = (mesh.vertices[:, axis][mesh.faces].mean(axis=1) + mesh.origin[axis] for axis in (0, 1))
-    kinds = classes[road.core.cells(x, y)]
+    kinds = classes[road.core.cells(*(middles(mesh.vertices, mesh.faces) + mesh.origin[:2]).T)]
     return np.where(kinds == Support.NONE, np.uint8(Support.INFERRED), kinds)
