@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import shapely
 
 from flexroad.catalog.storage.scratch import ScratchFolder
 
 Item = dict[str, Any]
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 MAX_ROWS = 10_000_000
 MAX_UNPACKED = 8 * 2**30
 """Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
@@ -72,13 +74,27 @@ def _top(row: Item) -> Item:
 
 
 def _values(table: Any) -> list[Item]:
+    dates = [name for name in table.column_names if str(table[name].type).startswith("timestamp")]
     try:
-        rows: list[Item] = table.to_pylist()
+        rows: list[Item] = table.drop_columns(dates).to_pylist()
+        for name in dates:
+            for row, date in zip(rows, _dates(table[name]), strict=True):
+                row[name] = date
     except Exception:
         # Dates out of range, or text that is not UTF-8: only the entries that have them are lost.
         columns = {name: table[name] for name in table.column_names}
         return [{name: _value(columns[name], n) for name in columns} for n in range(table.num_rows)]
     return rows
+
+
+def _dates(column: Any) -> Iterator[datetime | None]:
+    """Yield the dates of a column of timestamps. pyarrow would import pandas for them, which is slow."""
+    import pyarrow as pa
+
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
+    for chunk in column.chunks:
+        for number in chunk.view(pa.int64()).to_pylist():
+            yield None if number is None else EPOCH + timedelta(microseconds=number * 10**6 // per_second)
 
 
 def _value(column: Any, number: int) -> Any:
@@ -93,7 +109,8 @@ def _add_extents(rows: list[Item], assets: Any) -> None:
     for field in assets.type:
         column = assets.field(field.name).field("flexroad:extents")
         try:
-            ends, edges = column.offsets.to_numpy().tolist(), column.values.to_numpy()
+            # `to_numpy` would import pandas.
+            ends, edges = column.offsets.to_pylist(), np.from_dlpack(column.values)
             found = [edges[a:b] if a < b else None for a, b in pairwise(ends)]
         except Exception:
             # Not lists of numbers, or with gaps.

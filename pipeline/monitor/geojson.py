@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from flexroad.catalog import Tile
+from flexroad.catalog.crs import transformer
 from flexroad.catalog.storage.paths import Location, write
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import open_database, recorded
@@ -31,13 +33,22 @@ def write_states(run: Run, where: Location) -> None:
     OSError
         If the file cannot be written.
     """
-    from geopandas import GeoDataFrame
+    from shapely import to_geojson
 
     variant = run.config.export.variants[0]
     with open_database(run) as database:
         rows = [_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)]
-    table = GeoDataFrame(rows, columns=COLUMNS, dtype=object, geometry=outlines(run.catalog.tiles))
-    write(where, table.set_index("id", drop=False).to_json().encode(), run.config.cluster.flush)
+    features = [
+        {
+            "id": row["id"],
+            "type": "Feature",
+            "properties": {name: row.get(name) for name in COLUMNS},
+            "geometry": json.loads(outline) if outline else None,
+        }
+        for row, outline in zip(rows, to_geojson(outlines(run.catalog.tiles)), strict=True)
+    ]
+    collection = {"type": "FeatureCollection", "features": features}
+    write(where, json.dumps(collection).encode(), run.config.cluster.flush)
 
 
 def outlines(tiles: Sequence[Tile]) -> Any:
@@ -46,14 +57,14 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     Polygons are anticlockwise; coordinates are rounded to 1e-7 degrees (about 1 cm). Tiles of one CRS are
     transformed together. Tiles without a known position (`Tile.fault`) have None.
     """
-    from geopandas import GeoSeries
     from shapely import box, is_valid, transform
 
     shapes = np.array([None if tile.fault else box(*tile.grid.bounds) for tile in tiles], object)
     crs_of_tile = np.array([tile.grid.crs for tile in tiles], object)
     for crs in set(crs_of_tile[shapes != None]):  # noqa: E711 (of each shape)
         selected = crs_of_tile == crs
-        shapes[selected] = GeoSeries(shapes[selected], crs=crs).to_crs("EPSG:4326")
+        convert = transformer(crs, "EPSG:4326").transform
+        shapes[selected] = transform(shapes[selected], convert, interleaved=False)
     # Beyond the range of a CRS coordinates are infinite.
     return np.where(is_valid(shapes), transform(shapes, lambda degrees: degrees.round(7)), None)
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import islice
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.storage.paths import Location, exists, read
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import Failure, MetricsRow
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
 """Tables of a run, and before its last execution."""
@@ -56,13 +59,31 @@ COLUMNS: dict[str, str] = {
     "suspect_m2": "float64",
     "flags": "str",
 }
-"""Columns of metrics.parquet and their types, in the table's order."""
+"""Columns of metrics.parquet and their types in pandas, in the table's order."""
+IN_ARROW = {"str": "large_string", "float64": "float64", "Int64": "int64"}
+"""Type in Arrow by type in pandas."""
 
 
-def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
-    """Return the rows as a table with the columns of metrics.parquet."""
-    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
-    return frame.astype(COLUMNS)
+def _schema() -> Any:
+    """Return the schema of metrics.parquet, with the types in pandas.
+
+    It is made without pandas, which would take a quarter of the start of a run.
+    """
+    import pyarrow as pa
+
+    described = [
+        {
+            "name": name,
+            "field_name": name,
+            "pandas_type": "object" if kind == "str" else IN_ARROW[kind],
+            "numpy_type": kind,
+            "metadata": None,
+        }
+        for name, kind in COLUMNS.items()
+    ]
+    about = {"index_columns": [], "column_indexes": [], "columns": described, "pandas_version": "3.0.0"}
+    names = ((name, pa.type_for_alias(IN_ARROW[kind])) for name, kind in COLUMNS.items())
+    return pa.schema(names, {"pandas": json.dumps(about)})
 
 
 def write_tables(
@@ -77,21 +98,35 @@ def write_tables(
     OSError
         If they cannot be written, for example on a full disk.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = pa.Table.from_pandas(metrics_frame([]), preserve_index=False).schema
+    schema = _schema()
     with (
         atomic_file(run / METRICS, flushed) as path,
         pq.ParquetWriter(path, schema, write_page_checksum=True) as table,
     ):
         for chunk in _chunks(rows):
-            table.write_table(pa.Table.from_pandas(metrics_frame(chunk), schema, preserve_index=False))
+            table.write_table(_table(chunk, schema))
     names = [field.name for field in fields(Failure) if field.name != "trace"]
     with atomic_file(run / "failures.csv", flushed) as path, path.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(names)
         lines.writerows([getattr(failure, name) for name in names] for failure in failures)
+
+
+def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
+    """Return rows as a table: by way of JSON, because pyarrow imports pandas to read Python objects."""
+    import pyarrow as pa
+    import pyarrow.json
+
+    lines = "\n".join(json.dumps(row, allow_nan=False) for row in rows).encode()
+    table = pyarrow.json.read_json(
+        pa.BufferReader(lines),
+        # Reader threads may still be alive when a short process ends, and would abort it.
+        pyarrow.json.ReadOptions(use_threads=False, block_size=len(lines) + 1),
+        pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
+    )
+    return table.cast(schema)
 
 
 def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
