@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from flexroad.catalog.storage.paths import Location, absolute, read
+from flexroad.catalog.storage.paths import Location, read
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.ground import Ground, RunName, TileName
+from flexroad.pipeline.export.ground import Ground, GroundTile
 from flexroad.pipeline.export.network import Network, network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import (
@@ -46,7 +46,6 @@ VERSION = 1
 class Work:
     """What all roads of an export have in common."""
 
-    run: RunName
     frame: LocalFrame
     vertical: str | None
     left_hand: bool = False
@@ -56,8 +55,7 @@ class Work:
     @classmethod
     def of(cls, source: Source, roads: Network, **more: Any) -> Work:
         """Return the work of an export."""
-        run = RunName(str(absolute(source.run.path)), source.variant, source.run.allowed)
-        return cls(run, roads.frame, source.vertical, **more)
+        return cls(roads.frame, source.vertical, **more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,7 @@ class RouteUnit:
     number: int
     """From 1."""
     route: Route
-    tiles: tuple[TileName, ...]
+    tiles: tuple[GroundTile, ...]
 
     @property
     def id(self) -> str:
@@ -90,7 +88,7 @@ class RouteUnit:
 
     def height(self, work: Work) -> HeightAt:
         """Return the surface in the local frame."""
-        ground = Ground(work.run, self.tiles)
+        ground = Ground(self.tiles)
 
         def height(x: Floats, y: Floats) -> Floats:
             return ground.height(*work.frame.to_run(x, y))
@@ -105,14 +103,14 @@ class RouteUnit:
 def units(roads: Network, tiles: Iterable[FinishedTile]) -> Iterator[RouteUnit]:
     """Yield each route as soon as its last tile has passed."""
     waiting: defaultdict[int, list[int]] = defaultdict(list)
-    names: dict[int, TileName] = {}
+    passed: dict[int, GroundTile] = {}
     for number, touched in enumerate(roads.tiles):
         if len(touched):
             waiting[int(touched[-1])].append(number)
     for index, tile in enumerate(tiles):
-        names[index] = TileName.of(tile)
+        passed[index] = GroundTile.of(tile)
         for number in waiting.pop(index, ()):
-            touching = tuple(names[int(k)] for k in roads.tiles[number])
+            touching = tuple(passed[int(k)] for k in roads.tiles[number])
             yield RouteUnit(number + 1, roads.routes[number], touching)
 
 

@@ -103,7 +103,7 @@ def _mean(values: Any) -> float | None:
 
 def _arrays(along: Stations, unit: RouteUnit, work: Work) -> dict[str, Any]:
     easting, northing = work.frame.to_run(along.x, along.y)
-    error, support = Ground(work.run, unit.tiles).error(*work.frame.to_run(along.middle_x, along.middle_y))
+    error, support = Ground(unit.tiles).error(*work.frame.to_run(along.middle_x, along.middle_y))
     return {
         "points": np.column_stack([easting, northing, along.z]),
         "support": support,
