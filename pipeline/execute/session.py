@@ -19,7 +19,7 @@ from functools import partial
 from itertools import count, islice
 from typing import Generic
 
-from dask.utils import format_bytes
+from dask.utils import format_bytes, key_split
 from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerError
@@ -30,6 +30,8 @@ from flexroad.pipeline.execute.executor import J, R
 from flexroad.pipeline.execute.scheduler import task_function
 from flexroad.pipeline.execute.workers import work
 
+FORGET_KEYS_EVERY = 1000
+"""Number of jobs after which Dask's cache of key names is cleared: it has 0.4 KB for each job."""
 TICK_S = 1.0
 """Interval between checks of the scheduler and the workers (s)."""
 
@@ -138,12 +140,15 @@ class Session(Generic[J, R]):
 
     def _submit(self, flight: InFlight[J]) -> None:
         name = getattr(flight.job, "key", self.function.__name__.strip("_"))
+        number = next(self.numbers)
+        if number % FORGET_KEYS_EVERY == 0:
+            key_split.cache_clear()
         # Numbered: Dask would return the old error for a key that failed. Not pure: a job writes files.
         future = self.client.submit(
             self.run_task,
             dumps((partial(work, limit_s=self.limit_s), self.function, flight.job)),
             self.check,
-            key=f"{name}-{self.check}-{next(self.numbers)}",
+            key=f"{name}-{self.check}-{number}",
             pure=False,
             workers=[flight.reserved_worker] if flight.reserved_worker else None,
         )
