@@ -25,12 +25,11 @@ from typing import Any
 import numpy as np
 import rasterio
 
+from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.benchmark.scenes import write_scenes
 
 HERE = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("measure_stages.py")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-ONE_THREAD = dict.fromkeys(THREADS, "1")
 CONFIGS = ("nightly", "paper")
 SEED = 11
 ROW = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg", "triangles", "error_estimate_m")

@@ -17,7 +17,9 @@ from typing import Any
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker import profiling
 from flexroad.pipeline.worker.tile import process_tile
 
@@ -25,8 +27,7 @@ VARIANT = "flexroad"
 
 
 def main(catalog: Path, config: str, folder: Path) -> None:
-    # Stages measure themselves by this clock: CPU time, because other programs may use the machine.
-    profiling.perf_counter = time.process_time
+    by_cpu_time()
     tiles = Catalog.read(catalog).tiles
     alone = one_variant(config)
     for number, _ in enumerate(sys.stdin):
@@ -36,6 +37,11 @@ def main(catalog: Path, config: str, folder: Path) -> None:
             shutil.rmtree(folder / tile.id, ignore_errors=True)
             measured.append(measure(folder / tile.id, alone, Catalog((tile,))))
         print(json.dumps({"round": number, "tiles": measured}), flush=True)
+
+
+def by_cpu_time() -> None:
+    """Let stages measure themselves by CPU time, because other programs may use the machine."""
+    profiling.perf_counter = time.process_time
 
 
 def one_variant(name: str) -> Config:
@@ -52,7 +58,9 @@ def measure(folder: Path, config: Config, catalog: Catalog) -> dict[str, Any]:
     total = time.process_time() - start
     if result.failures:
         raise SystemExit(f"tile {result.tile_id}: {result.failures[0].line}")
-    seconds = dict(result.seconds)
+    seconds = {**borders(run), **result.seconds}
+    if seconds.keys() >= {"corners", "edges"}:
+        del seconds[BORDER]
     # Reading and writing of the store, the item, and the graph.
     seconds["rest"] = total - sum(seconds.values())
     products = sorted(path for path in (folder / "tiles").glob("*/*") if path.suffix != ".json")
@@ -63,8 +71,23 @@ def measure(folder: Path, config: Config, catalog: Catalog) -> dict[str, Any]:
         "peak_mb": result.peak_mb,
         "row": {name: value for name, value in result.rows[0].items() if isinstance(value, int | float)},
         "products": {path.name: path.stat().st_size for path in products},
+        "stored": sum(path.stat().st_size for path in (folder / "store").rglob("*.npz")),
         "height": str(next((path for path in products if path.name.endswith("_height.tif")), "")),
     }
+
+
+def borders(run: Run) -> dict[str, float]:
+    """Return the CPU time of the four corners and of the four edges of a run's tile (s), from its store."""
+    graph, store = run.graph(run.catalog.tiles[0]), ArtefactStore(run.store)
+    parts = {"corners": 0.0, "edges": 0.0}
+    nodes = [node for node in graph.nodes.values() if node.stage == BORDER]
+    for node in nodes:
+        stored = store.get(node)
+        if stored is None:
+            return {}
+        # An edge takes the corners at its ends.
+        parts["edges" if node.inputs else "corners"] += stored[1][BORDER]
+    return parts if nodes else {}
 
 
 if __name__ == "__main__":
