@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all viewer validators fuzz lint bench container clean
+.PHONY: help setup reproduce run rerun test test-all viewer validators fuzz lint bench speed container clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -112,8 +112,11 @@ lint: $(STAMP) ## Check style and types
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP) ## Print the benchmarks' tables
-	@for bench in tests/bench/bench_*.py; do echo "== $$bench"; PYTHONPATH=. $(BIN)/python $$bench || exit 1; done
+bench: $(STAMP) ## Print the stages beside their floors, peers and starts; one other benchmark: make bench BENCH=scale
+	@$(BIN)/python -m tests.bench $(BENCH)
+
+speed: $(STAMP) ## Measure the tables and the plot of docs/speed.md anew
+	@PYTHONPATH=. $(BIN)/python tests/bench/speed_page.py
 
 # The extras of pyproject.toml in the image, and where PyTorch's build for CPUs comes from.
 BUILDER ?= podman

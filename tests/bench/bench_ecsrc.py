@@ -1,14 +1,12 @@
 """ECSRC compared with Algorithm 1 written with Python sets, on a 250 x 250 tile with 20% road."""
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.filter.ecsrc import Options, ecsrc
 from flexroad.tasks.types import RoadMask, TileData
+from tests.bench.timing import cpu_s
 from tests.tasks.filter import ecsrc_oracle as oracle
 
 SIZE, SHARE = 250, 0.2
@@ -25,16 +23,6 @@ def case(relief_m: float) -> tuple[TileData, RoadMask]:
     return TileData("bench", grid, grid, dsm, dsm), RoadMask(grid, grid, mask, np.zeros_like(mask))
 
 
-def best(function: Callable[[], object], repeats: int) -> float:
-    """Return the shortest time of several calls (s)."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def main() -> None:
     options = Options()
     print(f"{'relief':>8} {'sets':>10} {'FlexRoad':>10} {'ratio':>7}  labels")
@@ -42,8 +30,8 @@ def main() -> None:
         data, road = case(relief_m)
         labels = ecsrc(data, road, options).labels
         expected = oracle.labels(road.mask, data.dsm, 1.0, options)
-        slow = best(lambda data=data, road=road: oracle.labels(road.mask, data.dsm, 1.0, options), 2)
-        fast = best(lambda data=data, road=road: ecsrc(data, road, options), 20)
+        slow = cpu_s(lambda data=data, road=road: oracle.labels(road.mask, data.dsm, 1.0, options), 2)
+        fast = cpu_s(lambda data=data, road=road: ecsrc(data, road, options), 20)
         same = "equal" if np.array_equal(labels, expected) else "DIFFERENT"
         print(f"{relief_m:6.1f} m {1e3 * slow:7.0f} ms {1e3 * fast:7.1f} ms {slow / fast:7.0f}  {same}")
 

@@ -9,7 +9,6 @@ import os
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -21,6 +20,7 @@ from flexroad.tasks.spline.objective import NEIGHBOURS, Objective
 from flexroad.tasks.spline.space import Space, start_heights
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, basis_matrix
 from flexroad.tasks.types import RoadClusters, TileData
+from tests.bench.timing import cpu_s, one_cpu_s
 
 SIZE, ITERATIONS, SAMPLED = 250, 200, 2
 OPTIONS = nurbs.Options(iterations=ITERATIONS, stop_tolerance=0)
@@ -140,16 +140,6 @@ class PointByPoint(Dense):
         return span - p, values
 
 
-def best(function: Callable[[], object], repeats: int) -> float:
-    """Return the shortest of some runs (s)."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def main() -> None:
     """Print the table; exit with an error if the three results differ or the fit is too slow."""
     data, clusters = case()
@@ -171,11 +161,11 @@ def main() -> None:
         return lambda: adam.minimise(loss, start, limit, adam.Schedule(0.1, iterations, 0, 20))
 
     run(objective, 1)()
-    ours = best(lambda: nurbs.fit(data, clusters, OPTIONS), 7)
+    ours = cpu_s(lambda: nurbs.fit(data, clusters, OPTIONS), 7)
     # n iterations take n + 1 evaluations in both cases.
-    slow = best(run(by_point, SAMPLED - 1), 1) / SAMPLED * (ITERATIONS + 1)
-    dense_s = best(run(dense, ITERATIONS), 3)
-    torch = best(lambda: nurbs.fit(data, clusters, OPTIONS.model_copy(update={"engine": "torch"})), 3)
+    slow = one_cpu_s(run(by_point, SAMPLED - 1)) / SAMPLED * (ITERATIONS + 1)
+    dense_s = cpu_s(run(dense, ITERATIONS), 3)
+    torch = cpu_s(lambda: nurbs.fit(data, clusters, OPTIONS.model_copy(update={"engine": "torch"})), 3)
     print(f"{SIZE} x {SIZE} cells, 35 x 35 control points, {ITERATIONS} iterations, one thread")
     print(f"{'method':<34}{'s':>10}{'ratio':>10}{'required':>10}")
     for name, seconds, required in (

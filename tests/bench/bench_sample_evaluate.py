@@ -1,6 +1,5 @@
 """Sampling and evaluation of one 250 x 250 tile, compared with general libraries for parts of them."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -18,19 +17,13 @@ from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.synthetic.scene import make_scene
 from flexroad.tasks.types import Mesh, RoadMask, TileData
+from tests.bench.timing import cpu_s
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
 
 
 def best(function: Callable[[], object], repeats: int = 7) -> float:
-    """Return the shortest time of several calls (ms); the first call is not timed."""
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return 1e3 * min(times)
+    return 1e3 * cpu_s(function, repeats)
 
 
 def line(label: str, faces: int, ours: float, peer: str = "", theirs: float = 0.0) -> None:

@@ -11,7 +11,6 @@ import os
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +22,7 @@ from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.space import start_heights
 from flexroad.tasks.spline.thin_plate import BendingEnergy, bending_energy
 from flexroad.tasks.types import Floats, RoadClusters, TileData
+from tests.bench.timing import cpu_s
 
 SIZE, ITERATIONS, ROUNDS = 250, 200, 5
 STIFFNESS_M3, TERRAIN = 100.0, 0.02
@@ -48,16 +48,6 @@ def with_bending(objective: Objective, bending: BendingEnergy) -> Callable[[Floa
         return value + energy, gradient
 
     return loss
-
-
-def best(function: Callable[[], object]) -> float:
-    """Return the shortest CPU time of several calls (ms); CPU time, because the machine may be busy."""
-    times = []
-    for _ in range(ROUNDS):
-        start = time.process_time()
-        function()
-        times.append(time.process_time() - start)
-    return 1e3 * min(times)
 
 
 def compare(points: int, smoothness: str) -> float:
@@ -87,7 +77,7 @@ def compare(points: int, smoothness: str) -> float:
             f"{smoothness}, {points}: the solver stopped at {solution.losses[-1]:.6f}, above Adam"
         )
     slow, fast, whole = (
-        best(f)
+        1e3 * cpu_s(f, ROUNDS)
         for f in (
             lambda: adam.minimise(loss, variables, limit, schedule),
             lambda: solve(steps),

@@ -13,9 +13,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+from flexroad.pipeline import ONE_THREAD
+
 ROUNDS = 7
 FLEXROAD = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 def cpu_s(command: list[str]) -> float:
