@@ -39,7 +39,7 @@ from flexroad.tasks.spline.mesh_border import (
 )
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
 
-VERSION = 3
+VERSION = 4
 
 DECIMALS = 6
 """Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
@@ -194,13 +194,24 @@ def _dynamic(
 
 def _without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return points by northing, then easting, each place once, and the new numbers of the given ones."""
-    order = np.lexsort((points[:, 0], points[:, 1]))
+    order = _by_northing(points)
     ordered = points[order]
     first = np.ones(len(points), bool)
     first[1:] = (ordered[1:, :2] != ordered[:-1, :2]).any(axis=1)
     number = np.empty(len(points), np.intp)
     number[order] = np.cumsum(first) - 1
     return ordered[first], number
+
+
+def _by_northing(points: Floats) -> NDArray[np.intp]:
+    """Return the order of points by northing, then easting."""
+    x, y = np.ascontiguousarray(points[:, :2].T)
+    # A stable sort of one number is fast, as the points come in a few ordered parts. Rounding makes it wrong
+    # where two points on nearly the same northing are nearly at the same place.
+    order = np.argsort(y * 2.0 ** np.ceil(np.log2(np.abs(x).max() + 1.0) + 1.0) + x, kind="stable")
+    x, y = x[order], y[order]
+    ordered = (y[:-1] < y[1:]) | ((y[:-1] == y[1:]) & (x[:-1] <= x[1:]))
+    return order if ordered.all() else np.lexsort((points[:, 0], points[:, 1]))
 
 
 def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | None:

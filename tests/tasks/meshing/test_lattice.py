@@ -38,18 +38,31 @@ def deepest_in_circle(points, faces) -> float:
 def test_full_lattice_is_cut_from_north_west_to_south_east():
     points = nodes(4, 6, 0.3)
     found = squares(points, (0.0, 0.0), 0.3)
-    assert found.complete[:3, :5].all()
-    assert found.complete.sum() == 15
-    corners = np.sort(found.faces, axis=1).tolist()
-    assert corners[:2] == [[0, 1, 6], [1, 6, 7]]
+    assert found.full[:3, :5].all()
+    assert found.full.sum() == 15
+    faces = {frozenset(face) for face in found.faces.tolist()}
+    assert {frozenset([0, 1, 6]), frozenset([1, 6, 7])} < faces
+    assert len(found.faces) == len(faces) == 30
     assert sorted(found.inner.tolist()) == [7, 8, 9, 10, 13, 14, 15, 16]
+
+
+@pytest.mark.parametrize("lacking", [0, 4, 20, 24])
+def test_square_without_a_corner_is_one_face_and_needs_no_point_opposite(lacking):
+    points = np.delete(nodes(5, 5, 1.0), lacking, axis=0)
+    found = squares(points, (0.0, 0.0), 1.0)
+    assert len(found.faces) == 15 * 2 + 1
+    assert doubled_areas(points, found.faces).min() == 1.0
+    assert len(found.inner) == 9
+    assert found.contains(points[found.faces].mean(axis=1)).all()
+    x, y = nodes(5, 5, 1.0)[lacking]
+    assert not found.contains(np.array([[x + np.sign(2 - x) / 3, y + np.sign(2 - y) / 3]])).any()
 
 
 def test_square_beside_a_point_off_the_lattice_is_left_to_the_search():
     points = np.vstack([nodes(8, 8, 1.0), [[3.4, 3.5]]])
-    complete = squares(points, (0.0, 0.0), 1.0).complete[:7, :7]
-    assert not complete[2:5, 2:5].any()
-    assert complete.sum() == 49 - 9
+    full = squares(points, (0.0, 0.0), 1.0).full[:7, :7]
+    assert not full[2:5, 2:5].any()
+    assert full.sum() == 49 - 9
 
 
 def test_second_point_near_a_node_is_kept():
