@@ -71,7 +71,7 @@ def test_second_point_near_a_node_is_kept():
     assert set(np.unique(faces)) == set(range(len(points)))
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=40)
 @given(
     seed=st.integers(0, 2**31),
     step=st.sampled_from([1.0, 0.5, 0.3]),
