@@ -119,16 +119,21 @@ def _ply(
 def _cog(
     graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
 ) -> dict[Kind, bytes]:
+    import rasterio
+
     core, road, surface = graph.tile.grid, evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
     kept = evaluate(nodes["ecsrc"]).mask[window]
-    return {
-        HEIGHT: cog.encode_height(heights, core, reference.vertical),
-        ROAD: cog.encode_mask(kept, core),
-        SUPPORT: cog.encode_support(evaluate(nodes["assess"]).support, core),
-    }
+    support = evaluate(nodes["assess"]).support
+    # Without a common one, GDAL's environment is set up and cleared for each call.
+    with rasterio.Env():
+        return {
+            HEIGHT: cog.encode_height(heights, core, reference.vertical),
+            ROAD: cog.encode_mask(kept, core),
+            SUPPORT: cog.encode_support(support, core),
+        }
 
 
 def _npz(
