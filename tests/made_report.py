@@ -72,7 +72,14 @@ def made_content(run, rows, states=None) -> Content:
     return Content(
         title=f"FlexRoad: made over {len(states)} tiles",
         state="",
-        counts=Summary(len(states), number("done"), number("failed"), 0, number("pending")),
+        counts=Summary(
+            len(states),
+            number("done"),
+            number("failed"),
+            0,
+            number("pending"),
+            without_roads=int(done["flags"].str.contains("no-road").sum()),
+        ),
         states=states,
         rows=frame,
         variant="flexroad",

@@ -9,6 +9,7 @@ import typer
 
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.stdio import echo, echo_document
+from flexroad.pipeline.errors import ConfigError
 
 Output = Annotated[
     Path,
@@ -56,6 +57,9 @@ def report(
     from flexroad.pipeline.report import write_report
     from flexroad.pipeline.run.record import Run
 
+    if form != "html" and (compared or viewer):
+        given = "--compare" if compared else "--viewer"
+        raise ConfigError(f"{given} is for --format html only; add that, or leave out {given}")
     others = (None if other is None else parse_location(other) for other in (viewer, compared))
     written = write_report(Run.open(path, allow or ()), form, StepProgress(Console(stderr=True)), *others)
     if form != "html":

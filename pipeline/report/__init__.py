@@ -49,7 +49,7 @@ def write_report(
     Raises
     ------
     ConfigError
-        If a run has no rows yet, or ``viewer`` has no page.
+        If ``compared`` has no rows, or ``viewer`` has no page.
     """
     address = _viewer_address(run, viewer) if form == "html" else ""
     before = _before(run, compared) if form == "html" else None
@@ -68,7 +68,7 @@ def write_report(
 def _before(run: Run, compared: Location | None) -> tuple[str, pd.DataFrame] | None:
     """Return name and rows of the run to compare with, None if there is none."""
     if compared is not None:
-        return compared.name, read_metrics(compared)
+        return compared.name, read_metrics(Run.open(compared, run.allowed).path)
     if not exists(run.path / PREVIOUS):
         return None
     return LAST, read_metrics(run.path, PREVIOUS)

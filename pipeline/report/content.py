@@ -7,15 +7,17 @@ from dataclasses import dataclass
 import pandas as pd
 import yaml
 
+from flexroad.catalog.storage.paths import exists
 from flexroad.catalog.text import count
 from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
+from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, summary, untracked
+from flexroad.pipeline.run.status import Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.database import TileState
-from flexroad.pipeline.store.tables import read_metrics
+from flexroad.pipeline.store.tables import METRICS, metrics_frame, read_metrics
 
 FIGURES = {
     "l2_road_m": "L2 road (m)",
@@ -80,17 +82,19 @@ class Content:
     config: str
     tiles: tuple[str, ...]
     """Ids of the finished tiles, in the order of the catalog."""
+    running: bool = False
+    """Whether another process is computing tiles of the run."""
 
 
 def gather(run: Run, track: Track = untracked) -> Content:
-    """Collect the tables of a run.
+    """Collect the tables of a run; of one that is not finished, those of the tiles so far.
 
     Raises
     ------
     ConfigError
-        If the run has no rows yet.
+        If metrics.parquet is damaged.
     """
-    rows = read_metrics(run.path)
+    rows = _rows(run)
     done = rows[rows.status == "done"]
     states: dict[str, TileState] = {}
     counts = summary(run, track, states.__setitem__)
@@ -121,7 +125,17 @@ def gather(run: Run, track: Track = untracked) -> Content:
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),
         tiles=tuple(dict.fromkeys(done.tile_id)),
+        running=bool((holder := owner(run.path)) and exit_reason(holder) is None),
     )
+
+
+def _rows(run: Run) -> pd.DataFrame:
+    """Return the rows of metrics.parquet, which the end of a run writes; before, those of its tiles."""
+    if exists(run.path / METRICS):
+        return read_metrics(run.path)
+    with open_database(run) as database:
+        records = [record for _, _, record in recorded(run, database) if record]
+    return metrics_frame([row for record in records for row in record.rows])
 
 
 def _state(counts: Summary) -> str:

@@ -129,6 +129,14 @@ def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
     return table.cast(schema)
 
 
+def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
+    """Return the rows as a table with the columns of metrics.parquet."""
+    import pandas as pd
+
+    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
+    return frame.astype(COLUMNS)
+
+
 def _chunks(rows: Iterable[MetricsRow]) -> Iterator[list[MetricsRow]]:
     remaining = iter(rows)
     while chunk := list(islice(remaining, CHUNK)):

@@ -18,6 +18,7 @@ const NAMES = {
   dark: ["#4d86a8", "#b9792b", "#5f9440", "#7d62a0", "#b2504f", "#a39b3a", "#777d85", "#3f8f85"],
 };
 const BARS = 18;
+const NO_CHANGE = 0.01; // Ends of a scale of differences if all are 0.
 
 const darkMedia = window.matchMedia("(prefers-color-scheme: dark)");
 let printing = false;
@@ -110,9 +111,9 @@ function numberScale(column) {
   const { values, unit, label } = column;
   const sorted = values.filter((v) => v !== null).sort((a, b) => a - b);
   const at = (share) => sorted[Math.round(share * (sorted.length - 1))];
-  const signed = at(0) < 0 && at(1) > 0;
+  const signed = column.signed || (at(0) < 0 && at(1) > 0);
   let low = at(0.02), high = at(0.98);
-  if (signed) { high = Math.max(-low, high); low = -high; }
+  if (signed) { high = Math.max(-low, high) || NO_CHANGE; low = -high; }
   if (!(high > low)) { low -= Math.abs(low) * 0.05 || 0.5; high += Math.abs(high) * 0.05 || 0.5; }
   const colourAt = (v) => mix((signed ? SIGNED : RAMPS)[tone()], (v - low) / (high - low));
   return {

@@ -12,6 +12,9 @@ from flexroad.pipeline.report.browser.tiles import LABELS, TileTable
 
 FIGURES = ("error_estimate_m", "l2_road_m", "l2_terrain_m", "mad_road_deg", "triangles", "seconds")
 """Figures that are compared; smaller is better for all of them."""
+NONE = "–"
+NOISE = ("seconds",)
+"""Figures that differ each time: neither better nor worse."""
 SAME = 1e-6
 """Relative difference up to which a figure counts as the same: other processors round otherwise."""
 
@@ -63,12 +66,12 @@ def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> 
         rows.append(
             {
                 "figure, mean over tiles": f"{label} ({unit})" if unit else label,
-                "before": then.mean(),
-                "now": now.mean(),
-                "change": f"{now.mean() - then.mean():+.3g}",
-                "better": int((~same & (now < then)).sum()),
-                "same": int(same.sum()),
-                "worse": int((~same & (now > then)).sum()),
+                "before": _number(then.mean()),
+                "now": _number(now.mean()),
+                "change": "0" if same.all() else f"{now.mean() - then.mean():+.3g}",
+                "better": NONE if figure in NOISE else int((~same & (now < then)).sum()),
+                "same": NONE if figure in NOISE else int(same.sum()),
+                "worse": NONE if figure in NOISE else int((~same & (now > then)).sum()),
             }
         )
     change = (table.frame.error_estimate_m - old.error_estimate_m).astype("float64")
@@ -84,9 +87,15 @@ def compare(table: TileTable, before: pd.DataFrame, variant: str, name: str) -> 
     return Comparison(_line(table, own, name), pd.DataFrame(rows), worse, change)
 
 
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def _line(table: TileTable, before: pd.DataFrame, name: str) -> str:
     then = set(before.tile_id)
     now = {tile.id for tile in table.finished}
+    if not now & then:
+        return f"Nothing can be compared with {name}: no tile is done in both."
     parts = [f"{count(len(now & then), 'tile')} done in both runs"]
     if more := len(now - then):
         parts.append(f"{more} done only now")

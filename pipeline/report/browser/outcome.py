@@ -80,9 +80,9 @@ def statements(content: Content, table: TileTable, failed: Mapping[str, str], ru
     return [
         *_last_run(content, run),
         *_failures(table.counts["failed"], failed, run),
-        *_pending(table.counts["pending"], run),
+        *_pending(table.counts["pending"], run, content.running),
         *_flagged(table),
-        *_without_roads(table.counts["no-road"]),
+        *_without_roads(content.counts.without_roads),
         *_surfaces(content),
         *_changes(content),
     ]
@@ -115,8 +115,10 @@ def _kind(error: str) -> str:
     return re.sub(r"\S*[\d/\\]\S*", "", error)
 
 
-def _pending(number: int, run: str) -> Iterator[Statement]:
-    if number:
+def _pending(number: int, run: str, running: bool) -> Iterator[Statement]:
+    if number and running:
+        yield Statement("pending", f"{_have(number)} no result yet; the run is in progress.")
+    elif number:
         text = f"{_have(number)} no result for the current files and options:"
         yield Statement("pending", text, f"flexroad rerun {run}")
 
@@ -134,7 +136,8 @@ def _flagged(table: TileTable) -> Iterator[Statement]:
     told = ", ".join(f"{name} {n:,}" for name, n in names.most_common())
     yield Statement(
         "flagged",
-        f"{count(number, 'done tile')} should be looked at, by their flags: {told}. Below is where.",
+        f"{count(number, 'done tile')} should be looked at, by {'its' if number == 1 else 'their'} flags: "
+        f"{told}. Below is where.",
     )
 
 

@@ -123,7 +123,7 @@ def html_page(
         ranked_by=ranked_by,
         meaning=quality.MEANING.replace("`", ""),
         viewer=viewer,
-        view_command=f"flexroad view {shlex.quote(str(run.path))} -o {shlex.quote(str(run.path / 'view'))}",
+        view_command=f"flexroad view {shlex.quote(str(run.path))}",
         sections=[one for one in sections(content) if one[0] not in (MAIN, WORST_ESTIMATES)],
         tiles=[(numbers[name], tile) for name, tile in pictures.items() if name not in first],
     )  # fmt: skip

@@ -20,7 +20,7 @@ class Meaning:
     words: str
     """What is wrong, with ``{value}`` and ``{limit}``."""
     remedy: str
-    """What to do; "there" is the flag's place."""
+    """What to do, with ``{there}`` where the flag's place belongs."""
     percent: bool = False
     """Whether value and limit are shares, which are shown in percent."""
 
@@ -28,37 +28,37 @@ class Meaning:
 MEANINGS = {
     "error-estimate": Meaning(
         "the surface is {value} m off DSM and DTM on average (limit {limit} m)",
-        "compare DSM and DTM there: one of them is wrong or older",
+        "compare DSM and DTM{there}: one of them is wrong or older",
     ),
     "patch": Meaning(
         "{value} m² of road in one piece are far from both DSM and DTM (limit {limit} m²)",
-        "look for a bridge, a tree or a gap in the data there",
+        "look for a bridge, a tree or a gap in the data{there}",
     ),
     "spike": Meaning(
         "the surface bends more than a road can ({value} 1/m, limit {limit} 1/m)",
-        "look at the mask there: it may reach over a wall, a roof or a bank",
+        "look at the mask{there}: it may reach over a wall, a roof or a bank",
     ),
     "edge-step": Meaning(
         "the surface steps by {value} m at the road's edge (limit {limit} m)",
-        "look at the mask there: it may be wider than the road, or shifted",
+        "look at the mask{there}: it may be wider than the road, or shifted",
     ),
     "loose": Meaning(
         "5% of the kept road points are more than {value} m from the surface (limit {limit} m)",
-        "look for cars, trees or a second level there that the filter kept",
+        "look for cars, trees or a second level{there} that the filter kept",
     ),
     "off-dtm": Meaning(
         "{value} of the road lie off the DTM (limit {limit})",
-        "a bridge is right; otherwise the DTM is wrong or older there",
+        "a bridge is right; otherwise the DTM is wrong or older{there}",
         percent=True,
     ),
     "inferred": Meaning(
         "{value} of the road have no height in the data (limit {limit})",
-        "fill the gap in the data there, or take the road out of the mask",
+        "fill the gap in the data{there}, or take the road out of the mask",
         percent=True,
     ),
     "dropped": Meaning(
         "the filter dropped {value} of the road mask (limit {limit})",
-        "look whether there is a road there at all, or trees above it",
+        "look whether there is a road{there} at all, or trees above it",
         percent=True,
     ),
     "weights": Meaning(
@@ -119,9 +119,7 @@ def _reason(name: str, row: Mapping[str, Any], options: Options, places: Mapping
     limit = getattr(options, column) if column else None
     words = meaning.words.format(value=_number(value, meaning.percent), limit=_number(limit, meaning.percent))
     place = places.get(name)
-    # "there" needs a place.
-    remedy = meaning.remedy if place else meaning.remedy.replace(" there", "", 1)
-    return Reason(name, words, place, remedy)
+    return Reason(name, words, place, meaning.remedy.format(there=" there" if place else ""))
 
 
 def described(options: Options) -> dict[str, dict[str, Any]]:
@@ -129,7 +127,7 @@ def described(options: Options) -> dict[str, dict[str, Any]]:
     return {
         name: {
             "words": meaning.words,
-            "remedy": meaning.remedy.replace(" there", "", 1),
+            "remedy": meaning.remedy.format(there=""),
             "column": FLAGS.get(name),
             "limit": _number(getattr(options, FLAGS[name]), meaning.percent) if name in FLAGS else None,
             "percent": meaning.percent,

@@ -155,13 +155,20 @@ def map_data(
     failed : Mapping
         The error of each failed tile by id.
     more : Mapping
-        Further columns, as those of `numeric_columns`.
+        Further columns, as those of `numeric_columns`: differences.
     """
     finite = table.bounds[np.isfinite(table.bounds[:, 0])]
     west, south, east, north = (*finite[:, :2].min(0), *finite[:, 2:].max(0)) if len(finite) else (0.0,) * 4
     flag_names = [*FLAGS, NO_ROAD]
     columns: list[dict[str, Any]] = [
-        {"key": key, "label": label, "unit": unit, "values": [_rounded(value) for value in values]}
+        {
+            "key": key,
+            "label": label,
+            "unit": unit,
+            "values": [_rounded(value) for value in values],
+            # A difference has a neutral colour for zero, whatever its values are.
+            "signed": key in more,
+        }
         for key, (label, unit, values) in (numeric_columns(table) | dict(more)).items()
     ]
     for name in NAMES:

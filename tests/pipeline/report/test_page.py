@@ -1,12 +1,16 @@
 """The page's words, data and comparison, without a browser."""
 
 import json
+import re
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from flexroad.catalog import Catalog
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.report import _viewer_address, write_report
 from flexroad.pipeline.report.browser.compare import compare
 from flexroad.pipeline.report.browser.histograms import histograms
@@ -21,7 +25,10 @@ from flexroad.pipeline.report.browser.tiles import (
     map_data,
     tile_table,
 )
-from flexroad.pipeline.store.tables import COLUMNS, metrics_frame
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.store.tables import COLUMNS, METRICS, metrics_frame
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, Options
 from tests.made_report import failed_row, made_content, made_row, made_run
 
@@ -151,13 +158,24 @@ def test_comparison_counts_better_and_worse_tiles(run):
         "Compared with last week: 2 tiles done in both runs, 1 done only now, 1 done only before."
     )
     row = comparison.table.iloc[0]
-    assert (row.before, row.now) == pytest.approx((0.06, 0.16))
+    assert (row.before, row.now, row.change) == ("0.06", "0.16", "+0.1")
     assert (row.better, row.same, row.worse) == (0, 1, 1)
     assert list(comparison.worse.tile) == ["b"]
     np.testing.assert_allclose(comparison.columns["change_m"][2], [0, 0.2, np.nan, np.nan], atol=1e-12)
     other = compare(table, before.assign(variant="other"), "flexroad", "x")
     assert other.table.empty
     assert other.columns == {}
+    assert other.line == "Nothing can be compared with x: no tile is done in both."
+
+
+def test_comparison_with_itself_has_no_change_and_whole_triangles(run):
+    rows = metrics_frame(ROWS)
+    comparison = compare(tile_table(run.catalog.tiles, made_content(run, ROWS)), rows, "flexroad", "itself")
+    assert set(comparison.table.change) == {"0"}
+    table = comparison.table.set_index("figure, mean over tiles")
+    assert table.now["triangles"] == "20,000"
+    assert list(table.loc["computing time (s)", ["better", "same", "worse"]]) == ["–"] * 3
+    assert comparison.worse.empty
 
 
 def test_histogram_has_all_tiles_and_the_threshold():
@@ -190,12 +208,34 @@ def test_page_of_one_tile(tmp_path, made_survey):
     assert 'href="view/index.html#tile=a"' in page
 
 
-def test_report_without_table_or_viewer_names_the_remedy(run, tmp_path):
-    with pytest.raises(ConfigError, match="metrics.parquet does not exist; `flexroad rerun"):
-        write_report(run, "html")
+@pytest.mark.parametrize("flag", MEANINGS)
+def test_remedy_without_a_place_is_a_whole_sentence(flag):
+    (reason,) = reasons({"flags": flag}, Options(), {})
+    (placed,) = reasons({"flags": flag}, Options(), {flag: (1.0, 2.0)})
+    assert "{" not in reason.remedy + placed.remedy
+    assert not re.search(r"\b(if|whether) is\b|  | :", reason.remedy)
+
+
+def test_report_before_the_end_of_the_first_run_has_the_tiles_so_far(made_survey, tmp_path):
+    run = Run.create(
+        tmp_path / "RUN", load_config("production"), Catalog.read(made_survey / "catalog.parquet")
+    )
+    first = run.catalog.tiles[0]
+    run_tiles(run, SerialExecutor(), only=lambda tile: tile == first)
+    (run.path / METRICS).unlink()
+    page = write_report(run, "html").read_text()
+    assert "In part: 1 of 4 tiles are done; 3 are pending." in page
+    assert f"flexroad rerun {run.path}" in page
+    with run_lock(run.path):
+        page = write_report(run, "html").read_text()
+    assert "3 tiles have no result yet; the run is in progress." in page
+    assert f"flexroad rerun {run.path}" not in page
+
+
+def test_report_with_wrong_folders_names_the_remedy(run, tmp_path):
     with pytest.raises(ConfigError, match=r"has no index.html; make it with `flexroad view"):
         write_report(run, "html", viewer=tmp_path)
-    with pytest.raises(ConfigError, match="metrics.parquet does not exist"):
+    with pytest.raises(ConfigError, match="is no run"):
         write_report(run, "html", compared=tmp_path)
     assert not (run.path / "report.html").exists()
 
