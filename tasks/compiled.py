@@ -17,9 +17,10 @@ R = TypeVar("R")
 class Compiled(Generic[P, R]):
     """A function in numba's subset of Python, compiled at its first call."""
 
-    def __init__(self, function: Callable[P, R], error_model: str) -> None:
+    def __init__(self, function: Callable[P, R], error_model: str, fused: bool) -> None:
         self.function = function
         self.error_model = error_model
+        self.fastmath = {"contract", "reassoc", "nsz"} if fused else False
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the compiled function."""
@@ -36,11 +37,11 @@ class Compiled(Generic[P, R]):
         for name in self.function.__code__.co_names:
             if isinstance(names.get(name), Compiled):
                 names[name] = names[name].dispatcher
-        return njit(cache=True, error_model=self.error_model)(self.function)
+        return njit(cache=True, error_model=self.error_model, fastmath=self.fastmath)(self.function)
 
 
 def compiled(
-    error_model: Literal["python", "numpy"] = "python",
+    error_model: Literal["python", "numpy"] = "python", fused: bool = False
 ) -> Callable[[Callable[P, R]], Compiled[P, R]]:
     """Return a decorator that compiles a function with numba when it is first called.
 
@@ -48,9 +49,12 @@ def compiled(
     ----------
     error_model : str
         ``python``: dividing by zero raises an error; ``numpy``: it gives inf or NaN, and loops are faster.
+    fused : bool
+        Whether products and sums may be fused and sums reordered, so that loops use vector instructions. The
+        order is fixed when the function is compiled: equal arguments give equal bits in every call.
     """
 
     def decorate(function: Callable[P, R]) -> Compiled[P, R]:
-        return Compiled(function, error_model)
+        return Compiled(function, error_model, fused)
 
     return decorate

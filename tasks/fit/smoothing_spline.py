@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 3
+VERSION = 4
 
 REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
@@ -238,14 +238,6 @@ def _minimum(
     from flexroad.tasks.spline.objective import objective
     from flexroad.tasks.spline.thin_plate import bending_energy
 
-    n, m = space.points
-    if n > m:
-        # The shorter axis last: the band of the normal equations is then narrower.
-        turn = np.ascontiguousarray
-        return _minimum(
-            space.transposed, turn(heights.T), turn(weight.T), turn(stiffness.T), turn(first.T), turn(held.T),
-            options,
-        ).T  # fmt: skip
     # Divided by the number of cells with a height, like the differences, so that voids do not change the
     # balance.
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)

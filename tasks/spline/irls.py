@@ -3,30 +3,38 @@
 With unit weights the surface is linear in its control heights and the loss is convex. Each step replaces
 every absolute difference by a quadratic function, solves the normal equations, and searches the line to their
 solution for the lowest loss (Huber and Ronchetti, "Robust Statistics", section 7.8).
+
+The normal equations are solved by `tasks.spline.multigrid`, from step to step more precisely: the error of a
+step is corrected by the next ones, which are shorter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.normal_equations import band, factor, gram, hold, pairs, solve
+from flexroad.tasks.spline.multigrid import Multigrid
 from flexroad.tasks.spline.objective import Objective
-from flexroad.tasks.spline.surface import dense
-from flexroad.tasks.spline.thin_plate import BendingEnergy
+from flexroad.tasks.spline.stencil import Lags, add_from_cells, at_cells, gram, line_width, multiply, to_lines
+from flexroad.tasks.spline.surface import Starts
 from flexroad.tasks.types import Bools, Floats
 
 FINAL_M, INITIAL_M = 0.003, 0.03
 """Smaller differences get the weight of this value (m): in the last steps under L1, and in the first step."""
 COOLING = 0.6
 """Factor by which that value falls from step to step."""
-MAX_STEP, STEP_TOLERANCE = 3.0, 0.01
-"""Longest step, and tolerance of its length, as multiples of the step to the quadratic model's minimum."""
+MAX_STEP, SLOPE_TOLERANCE = 3.0, 1e-4
+"""Longest step, as a multiple of the step to the quadratic model's minimum, and largest slope of the loss at
+its end, as a share of that at its start."""
+LOOSE, TIGHT = 5e-4, 1e-5
+"""Tolerances of the normal equations (`Multigrid.solve`): in the first step, and the smallest."""
+MAX_EVALUATIONS = 40
+"""Largest number of evaluations between two points of a line; it takes 0 to 5."""
+STEP_TOLERANCE = 1e-6
+"""Tolerance of the length of a step, as a multiple of the step to the quadratic model's minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,83 +42,82 @@ class HuberObjective:
     """Huber's function of the height differences plus the bending energy, with unit weights."""
 
     objective: Objective
-    """Targets, their factors and the basis; its regulariser is ignored."""
+    """Targets, their factors and the basis, of one degree along both axes; its regulariser is ignored."""
     shape: tuple[int, int]
     """Number of control points along northing and easting, (m, n)."""
     huber_m: float = 0.0
     """Smaller differences d count as ``d^2 / (2 huber_m)``, others as ``|d| - huber_m / 2``; 0 is L1."""
-    bending: BendingEnergy | None = None
-    """Bending energy of the surface; None if the loss has the height differences only."""
+    bending: Floats | None = None
+    """Second derivatives of the bending energy, by `tasks.spline.thin_plate.bending_energy`; None if the loss
+    has the height differences only."""
     held: Bools | None = None
     """Control points that keep their height, ``(m, n)``; None if all are free."""
 
     @cached_property
-    def along_v(self) -> Floats:
-        """Basis functions at the rows, ``(H, m)``."""
-        return dense(self.objective.start_v, self.objective.along_v, self.shape[0])
-
-    @cached_property
-    def along_u(self) -> Floats:
-        """Basis functions at the columns, ``(W, n)``."""
-        return dense(self.objective.start_u, self.objective.along_u.T, self.shape[1])
-
-    @cached_property
-    def pairs(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
-        """Products of overlapping basis functions, along v and along u."""
-        return pairs(self.along_v, self.lags), pairs(self.along_u, self.lags)
-
-    @cached_property
-    def stiffness(self) -> Floats | float:
-        """Second derivatives of the bending energy, laid out as by `normal_equations.gram`; 0 without it."""
-        return self.bending.hessian(self.lags) if self.bending else 0.0
+    def grids(self) -> Multigrid:
+        """The solver of the normal equations, with its memory."""
+        return Multigrid(self.shape, self.degree, self.held)
 
     @property
-    def lags(self) -> int:
-        """One more than the largest distance of two control points that share a cell."""
-        return int(max(len(self.objective.along_u), self.objective.along_v.shape[1]))
+    def degree(self) -> int:
+        """Degree of the basis along both axes."""
+        return int(self.objective.along_v.shape[1]) - 1
+
+    @cached_property
+    def stiffness(self) -> Floats:
+        """Second derivatives of the bending energy; zeros without it."""
+        (m, n), p = self.shape, self.degree
+        nothing = np.zeros((n, p + 1, p + 1, line_width(m, p)))
+        return nothing if self.bending is None else self.bending
+
+    @cached_property
+    def basis(self) -> tuple[Starts, Floats, Starts, Floats]:
+        """First basis functions and their values at the columns, then at the rows."""
+        o = self.objective
+        return o.start_u, np.ascontiguousarray(o.along_u.T), o.start_v, o.along_v
 
     def __call__(self, z: Floats) -> float:
         """Return the loss (m) at control heights ``(m, n)``."""
-        residuals = self.heights(z) - self.objective.target
-        return self.line_loss(z, residuals, np.zeros_like(z), np.zeros_like(residuals))(0.0)
+        lines = to_lines(z, self.degree)
+        differences = self.heights(lines) - self.objective.target
+        total, _ = _along(differences, np.zeros_like(differences), 0.0, self.objective.factor, self.huber_m)
+        return float(total + np.vdot(self.bend(lines), lines) / 2)
 
-    def heights(self, z: Floats) -> Floats:
+    def heights(self, lines: Floats) -> Floats:
         """Return the surface above the datum at the cells, ``(H, W)``, m."""
-        return self.along_v @ z @ self.along_u.T
+        out = np.empty(self.objective.target.shape)
+        at_cells(lines, *self.basis, out)
+        return out
 
-    def quadratic_model(self, z: Floats, residuals: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factored second derivatives and the gradient of the quadratic model near ``z``."""
-        lower = band(gram(weight, *self.pairs, self.lags) + self.stiffness)
-        slope = self.along_v.T @ (weight * residuals) @ self.along_u
-        if self.bending:
-            slope += self.bending(z)[1]
-        if self.held is not None:
-            hold(lower, self.held, self.lags)
-            slope[self.held] = 0.0
-        return factor(lower), slope
+    def bend(self, lines: Floats) -> Floats:
+        """Return the gradient of the bending energy."""
+        out = np.empty_like(lines)
+        multiply(self.stiffness, lines, out, _lags(self.degree))
+        return out
 
-    def line_loss(
-        self, z: Floats, residuals: Floats, step: Floats, change: Floats
-    ) -> Callable[[float], float]:
-        """Return the loss (m) at ``z + t * step`` as a function of t.
+    def model_step(
+        self, bend: Floats, residuals: Floats, floor_m: float, tolerance: float, refresh: bool
+    ) -> tuple[Floats, float]:
+        """Return the step to the minimum of the quadratic model, as lines, and the loss's slope along it.
 
         Parameters
         ----------
-        z, step : ndarray, (m, n)
-            Control heights and their change (m).
-        residuals, change : ndarray, (H, W)
-            Surface minus targets at ``z`` (m), and the change of that by ``step``.
+        bend : ndarray, (n, width)
+            Gradient of the bending energy.
+        residuals : ndarray, (H, W)
+            Surface minus targets (m).
+        floor_m : float
+            Smaller differences get the weight of this one (m).
+        tolerance, refresh : float, bool
+            See `tasks.spline.multigrid.Multigrid.solve`.
         """
-        energy = energy_slope = step_energy = 0.0
-        if self.bending:
-            (energy, slope), (step_energy, _) = self.bending(z), self.bending(step)
-            energy_slope = float(np.vdot(slope, step))
-
-        def loss(t: float) -> float:
-            total = _differences(residuals, change, t, self.objective.factor, self.huber_m)
-            return float(total + energy + t * (energy_slope + t * step_energy))
-
-        return loss
+        weight, pull = np.empty_like(residuals), np.empty_like(residuals)
+        _weigh(residuals, self.objective.factor, floor_m, weight, pull)
+        stencil, slope = self.stiffness.copy(), bend.copy()
+        gram(weight, *self.basis, stencil)
+        add_from_cells(pull, *self.basis, slope)
+        step = self.grids.solve(stencil, -slope, tolerance, refresh)
+        return step, float(np.vdot(slope, step))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,36 +144,107 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
     tolerance : float
         Relative decrease of the loss at which to stop.
     """
-    z, residuals = start, loss.heights(start) - loss.objective.target
-    losses = [loss(start)]
+    lines = loss.grids.lines(start)
+    residuals, bend = loss.heights(lines) - loss.objective.target, loss.bend(lines)
+    losses, precision = [loss(start)], LOOSE
     floor_m = loss.huber_m or FINAL_M
     for number in range(iterations):
         least = INITIAL_M * COOLING**number
-        weight = loss.objective.factor / np.maximum(np.abs(residuals), max(least, floor_m))
-        factored, slope = loss.quadratic_model(z, residuals, weight)
-        step = solve(factored, -slope)
-        change = loss.heights(step)
-        loss_along_step = loss.line_loss(z, residuals, step, change)
-        line_minimum = scipy.optimize.minimize_scalar(
-            loss_along_step, bounds=(0, MAX_STEP), method="bounded", options={"xatol": STEP_TOLERANCE}
-        )
-        if line_minimum.fun < losses[-1]:
-            z, residuals = z + line_minimum.x * step, residuals + line_minimum.x * change
-        losses.append(min(float(line_minimum.fun), losses[-1]))
-        if least <= floor_m and losses[-2] - losses[-1] <= tolerance * losses[-2]:
+        step, slope = loss.model_step(bend, residuals, max(least, floor_m), precision, number == 0)
+        change, step_bend = loss.heights(step), loss.bend(step)
+        line = _Line(
+            residuals, change, loss.objective.factor, loss.huber_m, float(np.vdot(bend, lines)) / 2,
+            float(np.vdot(bend, step)), float(np.vdot(step_bend, step)) / 2,
+        )  # fmt: skip
+        t, lowest = line.minimum(slope)
+        if lowest < losses[-1]:
+            lines, residuals, bend = lines + t * step, residuals + t * change, bend + t * step_bend
+        losses.append(min(lowest, losses[-1]))
+        decrease = losses[-2] - losses[-1]
+        if least <= floor_m and decrease <= tolerance * losses[-2]:
             break
-    return Solution(z, losses)
+        precision = min(LOOSE, max(TIGHT, 0.1 * decrease / losses[-2]))
+    return Solution(loss.grids.points(lines), losses)
 
 
-@compiled(error_model="numpy")
-def _differences(residuals: Floats, change: Floats, t: float, factor: Floats, huber_m: float) -> float:
-    """Return the sum over cells of Huber's function of ``residuals + t * change`` times the factor (m)."""
-    sums = np.zeros(residuals.shape[1])
-    # The part of a difference up to huber_m is squared; under L1 that part is 0.
-    inverse = 0.5 / huber_m if huber_m > 0 else 0.0
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """The loss along a step: of the differences, and of the bending energy, a parabola in t."""
+
+    residuals: Floats
+    change: Floats
+    factor: Floats
+    huber_m: float
+    energy: float
+    energy_slope: float
+    step_energy: float
+
+    def __call__(self, t: float) -> tuple[float, float]:
+        """Return the loss (m) after t times the step, and its derivative by t."""
+        total, slope = _along(self.residuals, self.change, t, self.factor, self.huber_m)
+        total += self.energy + t * (self.energy_slope + t * self.step_energy)
+        return total, slope + self.energy_slope + 2 * t * self.step_energy
+
+    def minimum(self, start_slope: float) -> tuple[float, float]:
+        """Return the t of the lowest loss up to `MAX_STEP`, and that loss: the root of the derivative.
+
+        The derivative never falls, so the root stays between two points (Illinois method).
+        """
+        enough = SLOPE_TOLERANCE * abs(start_slope)
+        low, low_slope, t = 0.0, start_slope, 1.0
+        value, slope = self(t)
+        while slope < -enough and t < MAX_STEP:
+            rise = slope - low_slope
+            ahead = t - slope * (t - low) / rise if rise > 0 else MAX_STEP
+            low, low_slope, t = t, slope, min(ahead, 2 * t, MAX_STEP)
+            value, slope = self(t)
+        high, high_slope = t, slope
+        for _ in range(MAX_EVALUATIONS):
+            if abs(slope) <= enough or high_slope <= 0 or high - low <= STEP_TOLERANCE:
+                break
+            t = low - low_slope * (high - low) / (high_slope - low_slope)
+            value, slope = self(t)
+            if slope < 0:
+                low, low_slope, high_slope = t, slope, high_slope / 2
+            else:
+                high, high_slope, low_slope = t, slope, low_slope / 2
+        return t, value
+
+
+def _lags(degree: int) -> Lags:
+    return (0.0,) * (degree + 1)
+
+
+@compiled(error_model="numpy", fused=True)
+def _weigh(residuals: Floats, factor: Floats, floor_m: float, weight: Floats, pull: Floats) -> None:
+    """Write the weights of the quadratic model, and weight times residual."""
     for r in range(residuals.shape[0]):
         for c in range(residuals.shape[1]):
-            difference = abs(residuals[r, c] + t * change[r, c])
+            weight[r, c] = factor[r, c] / max(abs(residuals[r, c]), floor_m)
+            pull[r, c] = weight[r, c] * residuals[r, c]
+
+
+@compiled(error_model="numpy", fused=True)
+def _along(
+    residuals: Floats, change: Floats, t: float, factor: Floats, huber_m: float
+) -> tuple[float, float]:
+    """Return the sum over cells of Huber's function of ``residuals + t * change`` times the factor (m).
+
+    The second value is its derivative by t.
+    """
+    total, slope = 0.0, 0.0
+    # The part of a difference up to huber_m is squared; under L1 that part is 0.
+    inverse = 0.5 / huber_m if huber_m > 0 else 0.0
+    steepness = 1 / huber_m if huber_m > 0 else np.inf
+    for r in range(residuals.shape[0]):
+        row, row_slope = 0.0, 0.0
+        for c in range(residuals.shape[1]):
+            signed = residuals[r, c] + t * change[r, c]
+            difference = abs(signed)
             within = min(difference, huber_m)
-            sums[c] += factor[r, c] * (difference - within + inverse * within * within)
-    return float(sums.sum())
+            row += factor[r, c] * (difference - within + inverse * within * within)
+            pull = max(-1.0, min(1.0, signed * steepness)) if huber_m > 0 else np.sign(signed)
+            row_slope += factor[r, c] * pull * change[r, c]
+        total += row
+        slope += row_slope
+    return total, slope

@@ -7,57 +7,22 @@ may differ from cell to cell: a road is stiffer than the ground beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
 
-from flexroad.tasks.spline.normal_equations import gram, pairs
 from flexroad.tasks.spline.space import Space
-from flexroad.tasks.spline.surface import basis, dense
+from flexroad.tasks.spline.stencil import gram, line_width
+from flexroad.tasks.spline.surface import Starts, basis, dense
 from flexroad.tasks.types import Floats
 
-Derivatives = tuple[Floats, Floats, Floats]
-"""Basis functions at the cells of one axis, and their first and second derivatives, ``(N, points)`` each."""
+Derivatives = tuple[Starts, tuple[Floats, Floats, Floats]]
+"""First basis function that is not zero at each cell of one axis, ``(N,)``; the functions from it on, and
+their first and second derivatives, ``(N, p + 1)`` each."""
 
 
-@dataclass(frozen=True, eq=False)
-class BendingEnergy:
-    """The bending energy of a thin plate over a raster."""
+def bending_energy(stiffness: Floats, space: Space) -> Floats:
+    """Return the second derivatives of the bending energy by the control heights, as a stencil.
 
-    stiffness: Floats
-    """Weight of the squared curvature in each cell, ``(H, W)``, m3."""
-    along_u: Derivatives
-    """Basis functions at the columns and their derivatives per metre."""
-    along_v: Derivatives
-    """Basis functions at the rows and their derivatives per metre."""
-
-    def __call__(self, z: Floats) -> tuple[float, Floats]:
-        """Return the energy (m) of control heights ``(m, n)``, and its gradient."""
-        loss, gradient = 0.0, np.zeros_like(z)
-        for times, along_v, along_u in self._parts():
-            curvature = along_v @ z @ along_u.T
-            pull = times * self.stiffness * curvature
-            loss += float(np.vdot(pull, curvature))
-            gradient += 2 * along_v.T @ pull @ along_u
-        return loss, gradient
-
-    def hessian(self, lags: int) -> Floats:
-        """Return the second derivatives by the control heights, laid out as by `normal_equations.gram`."""
-        parts = [
-            gram(2 * times * self.stiffness, pairs(along_v, lags), pairs(along_u, lags), lags)
-            for times, along_v, along_u in self._parts()
-        ]
-        return np.asarray(sum(parts))
-
-    def _parts(self) -> Iterator[tuple[float, Floats, Floats]]:
-        yield 1.0, self.along_v[0], self.along_u[2]
-        yield 2.0, self.along_v[1], self.along_u[1]
-        yield 1.0, self.along_v[2], self.along_u[0]
-
-
-def bending_energy(stiffness: Floats, space: Space) -> BendingEnergy:
-    """Return the bending energy over a raster.
+    The energy (m) of control heights z is ``z^T S z / 2``, and ``S z`` is its gradient.
 
     Parameters
     ----------
@@ -65,10 +30,20 @@ def bending_energy(stiffness: Floats, space: Space) -> BendingEnergy:
         Weight of the squared curvature in each cell (m3).
     space : Space
         The splines, of degree 2 at least, with the parameters of the raster's columns and rows.
+
+    Returns
+    -------
+    ndarray, (n, p + 1, p + 1, width)
+        See `tasks.spline.stencil`.
     """
-    along_u = _derivatives(space.knots_u, space.degree[0], space.u, space.unit_m[0])
-    along_v = _derivatives(space.knots_v, space.degree[1], space.v, space.unit_m[1])
-    return BendingEnergy(stiffness, along_u, along_v)
+    start_u, along_u = _derivatives(space.knots_u, space.degree[0], space.u, space.unit_m[0])
+    start_v, along_v = _derivatives(space.knots_v, space.degree[1], space.v, space.unit_m[1])
+    n, m = space.points
+    lags = space.degree[0] + 1
+    stencil = np.zeros((n, lags, lags, line_width(m, lags - 1)))
+    for times, by_u, by_v in ((1.0, 2, 0), (2.0, 1, 1), (1.0, 0, 2)):
+        gram(2 * times * stiffness, start_u, along_u[by_u], start_v, along_v[by_v], stencil)
+    return stencil
 
 
 def _derivatives(knots: Floats, degree: int, u: Floats, unit_m: float) -> Derivatives:
@@ -79,11 +54,14 @@ def _derivatives(knots: Floats, degree: int, u: Floats, unit_m: float) -> Deriva
     """
     points = len(knots) - degree - 1
     coefficients, derivatives = np.eye(points), []
+    first, _, _ = basis(knots, degree, u)
+    support = first[:, None] + np.arange(degree + 1)
     for order in range(3):
         inner, lower = knots[order : len(knots) - order], degree - order
         start, values, _ = basis(inner, lower, u)
-        derivatives.append(dense(start, values, points - order) @ coefficients / unit_m**order)
+        derivative = dense(start, values, points - order) @ coefficients / unit_m**order
+        derivatives.append(np.take_along_axis(derivative, support, axis=1))
         if lower:
             rate = lower / (inner[lower + 1 : -1] - inner[1 : points - order])
             coefficients = rate[:, None] * np.diff(coefficients, axis=0)
-    return derivatives[0], derivatives[1], derivatives[2]
+    return first, (derivatives[0], derivatives[1], derivatives[2])

@@ -2,7 +2,7 @@
 
 Two losses: the height differences alone, and with the bending energy. "to win" is the time until the solver's
 loss is below the lowest loss of all Adam steps, "whole" the time until it stops by itself. Adam uses the
-objective that bench_fit.py measures; the gradient of the bending energy is added with dense products.
+objective that bench_fit.py measures; the gradient of the bending energy is added by the solver's stencil.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from flexroad.tasks.fit import nurbs
 from flexroad.tasks.spline import adam, irls
 from flexroad.tasks.spline.objective import Objective
 from flexroad.tasks.spline.space import start_heights
-from flexroad.tasks.spline.thin_plate import BendingEnergy, bending_energy
+from flexroad.tasks.spline.stencil import from_lines, multiply, to_lines
+from flexroad.tasks.spline.thin_plate import bending_energy
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 from tests.bench.timing import cpu_s
 
@@ -40,12 +41,14 @@ def case() -> tuple[TileData, RoadClusters]:
     return TileData("bench", grid, grid, dsm, dtm), RoadClusters(grid, road.astype(np.int32))
 
 
-def with_bending(objective: Objective, bending: BendingEnergy) -> Callable[[Floats], tuple[float, Floats]]:
+def with_bending(objective: Objective, bending: Floats) -> Callable[[Floats], tuple[float, Floats]]:
     def loss(variables: Floats) -> tuple[float, Floats]:
         value, gradient = objective(variables)
-        energy, energy_gradient = bending(variables[0])
-        gradient[0] += energy_gradient
-        return value + energy, gradient
+        lines = to_lines(variables[0], 3)
+        pull = np.empty_like(lines)
+        multiply(bending, lines, pull, (0.0,) * 4)
+        gradient[0] += from_lines(pull, len(variables[0]), 3)
+        return value + float(np.vdot(pull, lines)) / 2, gradient
 
     return loss
 
@@ -60,7 +63,7 @@ def compare(points: int, smoothness: str) -> float:
     start, shape = heights - datum, (points, points)
     stiffness = STIFFNESS_M3 * np.where(clusters.mask, 1.0, TERRAIN) / clusters.mask.size
     bending = bending_energy(stiffness, space) if smoothness == "bending" else None
-    loss = with_bending(objective, bending) if bending else objective
+    loss = objective if bending is None else with_bending(objective, bending)
     variables, limit = np.stack([start, np.zeros_like(start)]), np.full((2, 1, 1), np.inf)
     schedule = adam.Schedule(options.learning_rate, ITERATIONS, 0, 20)
 

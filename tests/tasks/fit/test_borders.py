@@ -218,6 +218,7 @@ def test_corner_is_fitted_to_ground_at_the_end_of_its_grid():
     assert np.isfinite(border_part(world, border, [], options).control).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 4])
 def test_borders_of_other_degrees_meet(degree):
     world = made_world("rural")

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.tasks.spline.lattice import Lattice
-from flexroad.tasks.spline.normal_equations import band, gram, hold, pairs
 from flexroad.tasks.spline.surface import NurbsSurface, basis, basis_matrix, exact, uniform_knots
 
 
@@ -95,26 +94,3 @@ def test_lattice_part_has_cells_between_its_lines():
     assert space.unit_m == (5.0, 5.0)
     np.testing.assert_allclose(space.u, (np.arange(-20, 50) + 0.5) / 5)
     np.testing.assert_allclose(space.v, (np.arange(30)[::-1] + 0.5) / 5)
-
-
-def test_hold_gives_constrained_minimum():
-    """Against the dense system of the free points alone."""
-    rng = np.random.default_rng(1)
-    lags, (m, n) = 4, (9, 7)
-    knots = uniform_knots(0, m - 3, 3), uniform_knots(0, n - 3, 3)
-    along_v, along_u = (basis_matrix(k, 3, rng.uniform(*k[[3, -4]], 60))[0] for k in knots)
-    weight = rng.random((60, 60))
-    design = np.kron(along_v, along_u)
-    normal = design.T @ (weight.ravel()[:, None] * design)
-    held = rng.random((m, n)) < 0.3
-    right = np.where(held, 0, rng.normal(size=(m, n)))
-    lower = band(gram(weight, pairs(along_v, lags), pairs(along_u, lags), lags))
-    hold(lower, held, lags)
-    free = ~held.ravel()
-    expected = np.zeros(m * n)
-    expected[free] = np.linalg.solve(normal[np.ix_(free, free)], right.ravel()[free])
-    dense = np.zeros((m * n, m * n))
-    for d in range(lower.shape[1]):
-        dense[np.arange(d, m * n), np.arange(m * n - d)] = lower[: m * n - d, d]
-    dense += np.tril(dense, -1).T
-    np.testing.assert_allclose(np.linalg.solve(dense, right.ravel()), expected, atol=1e-8)

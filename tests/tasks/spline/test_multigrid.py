@@ -1,0 +1,73 @@
+"""The solver of the normal equations, and its stencils, against dense matrices."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.spline.multigrid import Multigrid
+from flexroad.tasks.spline.stencil import add_from_cells, at_cells, from_lines, gram, line_width, to_lines
+from flexroad.tasks.spline.surface import basis, dense, uniform_knots
+
+
+def made(m, n, p, cells, seed=0):
+    """Return the stencil of random weights of very different size, the dense matrix, and the basis."""
+    rng = np.random.default_rng(seed)
+    axes = []
+    for points, count in ((n, cells[1]), (m, cells[0])):
+        knots = uniform_knots(0, points - p, p)
+        start, values, _ = basis(knots, p, np.sort(rng.uniform(0, points - p, count)))
+        axes += [start, values]
+    weight = 10 ** rng.uniform(-2, 0, cells)
+    stencil = np.zeros((n, p + 1, p + 1, line_width(m, p)))
+    gram(weight, *axes, stencil)
+    design = np.kron(dense(axes[2], axes[3], m), dense(axes[0], axes[1], n))
+    return stencil, design.T @ (weight.ravel()[:, None] * design), axes, design
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 999), st.integers(2, 3), st.integers(6, 37), st.integers(6, 37), st.floats(0, 0.6))
+def test_solve_equals_dense_solution(seed, p, m, n, held_share):
+    """The free points alone; held points keep their height."""
+    stencil, matrix, *_ = made(m, n, p, (3 * m, 3 * n), seed)
+    rng = np.random.default_rng(seed)
+    held, right = rng.random((m, n)) < held_share, rng.normal(size=(m, n))
+    grids = Multigrid((m, n), p, held)
+    stencil[:, 0, 0, p : p + m] += 1e-3
+    matrix += 1e-3 * np.eye(m * n)
+    solution = grids.points(grids.solve(stencil, grids.lines(right), 1e-10, True))
+    free, expected = ~held.ravel(), np.zeros(m * n)
+    expected[free] = np.linalg.solve(matrix[np.ix_(free, free)], right.ravel()[free])
+    np.testing.assert_allclose(solution.ravel(), expected, atol=1e-4 + 1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_splines_at_cells_equal_dense_products(p):
+    m, n, cells = 17, 16, (40, 35)
+    _, _, axes, design = made(m, n, p, cells)
+    z, pull = (np.random.default_rng(1).normal(size=shape) for shape in ((m, n), cells))
+    heights, sums = np.empty(cells), to_lines(np.zeros((m, n)), p)
+    at_cells(to_lines(z, p), *axes, heights)
+    add_from_cells(pull, *axes, sums)
+    np.testing.assert_allclose(heights.ravel(), design @ z.ravel(), atol=1e-12)
+    np.testing.assert_allclose(from_lines(sums, m, p).ravel(), design.T @ pull.ravel(), atol=1e-12)
+
+
+def test_solve_with_indefinite_matrix_raises():
+    stencil = np.zeros((9, 4, 4, line_width(9, 3)))
+    stencil[:, 0, 0, 3:12] = -1.0
+    grids = Multigrid((9, 9), 3, None)
+    with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
+        grids.solve(stencil, grids.lines(np.ones((9, 9))), 1e-6, True)
+
+
+def test_solve_undetermined_points_keep_their_height():
+    stencil, *_ = made(20, 20, 3, (60, 60))
+    stencil[10:, :] = 0.0
+    grids = Multigrid((20, 20), 3, None)
+    right = np.zeros((20, 20))
+    right[:, :5] = 1.0
+    solution = grids.points(grids.solve(stencil, grids.lines(right), 1e-8, True))
+    assert np.isfinite(solution).all()
+    np.testing.assert_array_equal(solution[:, 15:], 0.0)
