@@ -32,7 +32,6 @@ def main(names: list[str]) -> None:
         for name in [name for name in there if name not in FIRST]:
             print(f"  {name:18}{about(there[name])}")
         print("two checkouts against each other: python tests/bench/compare.py OTHER_CHECKOUT")
-        print("GRASS and GMT as peers: python tests/bench/debian_peers.py")
 
 
 def about(path: Path) -> str:

@@ -83,6 +83,17 @@ def test_map_lazy_jobs_are_taken_as_workers_become_free(running):
     assert sorted(done) == [2 * job for job in range(40)]
 
 
+def test_map_many_jobs_cache_of_keys_stays_small(running, monkeypatch):
+    from dask.utils import key_split
+
+    from flexroad.pipeline.execute import session
+
+    monkeypatch.setattr(session, "FORGET_KEYS_EVERY", 20)
+    key_split.cache_clear()
+    assert len(list(DaskExecutor(scheduler=running.address).map(double, range(70), lost))) == 70
+    assert 0 < key_split.cache_info().currsize < 40
+
+
 def threads(job):
     """Return the process id and the numbers of threads, with numpy and torch loaded."""
     import numpy  # noqa: F401
