@@ -83,14 +83,15 @@ def test_map_lazy_jobs_are_taken_as_workers_become_free(running):
     assert sorted(done) == [2 * job for job in range(40)]
 
 
-def test_map_many_jobs_cache_of_keys_stays_small(running, monkeypatch):
+def test_map_many_jobs_cache_of_keys_stays_small(cluster, monkeypatch):
     from dask.utils import key_split
 
     from flexroad.pipeline.execute import session
 
     monkeypatch.setattr(session, "FORGET_KEYS_EVERY", 20)
+    # The scheduler runs in this process.
     key_split.cache_clear()
-    assert len(list(DaskExecutor(scheduler=running.address).map(double, range(70), lost))) == 70
+    assert len(list(DaskExecutor(scheduler=cluster.scheduler_address).map(double, range(70), lost))) == 70
     assert 0 < key_split.cache_info().currsize < 40
 
 
