@@ -187,8 +187,10 @@ def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Latt
 
     missing, cell = np.isnan(_ground(data, clusters)), data.grid.cell
     if not missing.all():
-        away = scipy.ndimage.distance_transform_edt(missing) * cell
-        needed = BEYOND_DATA_M + max(float(away[side].max()) for side in border.sides)
+        needed = BEYOND_DATA_M
+        if any(missing[side].any() for side in border.sides):
+            away = scipy.ndimage.distance_transform_edt(missing) * cell
+            needed += max(float(away[side].max()) for side in border.sides)
         for lines in map(lattice.lines_within, REACHES_M):
             if min(np.multiply(lines, lattice.unit_m)) >= needed:
                 return lines
