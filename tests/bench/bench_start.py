@@ -1,43 +1,61 @@
 """Start of commands: CPU time of whole processes, relative to ``python -c "import numpy"``.
 
 Targets: ``flexroad --help`` at most 5, ``flexroad config show`` at most 8, a run with nothing to do over ten
-tiles at most 15.
+tiles at most 15, a rerun of one tile at most 25, all with the default number of workers. Two workers must not
+take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``. The commands of
+``make reproduce``, one by one: ``bench_start.py --reproduce [TILES]``.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
+from flexroad.catalog import Catalog
 from flexroad.pipeline import ONE_THREAD
 
+ROOT = Path(__file__).parents[2]
 ROUNDS = 7
+SMALL_TILES = 48
 FLEXROAD = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
+ENVIRONMENT = {
+    name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+} | ONE_THREAD
+"""An installed package has its bytecode on the disk."""
 
 
 def cpu_s(command: list[str]) -> float:
     """Return the CPU time of a process and its children (s)."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, capture_output=True, env={**os.environ, **ONE_THREAD})
+    subprocess.run(command, check=True, capture_output=True, env=ENVIRONMENT)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def main() -> None:
+def start() -> None:
+    """Print the CPU time of short commands."""
     with tempfile.TemporaryDirectory() as scratch:
         survey, run = Path(scratch, "survey"), Path(scratch, "run")
         synthetic = ["catalog", "synthetic", "-o", str(survey), "--tiles", "10", "--tile-size", "60"]
         subprocess.run([*FLEXROAD, *synthetic], check=True, capture_output=True)
         catalog = ["--catalog", str(survey / "catalog.parquet"), "--out", str(run)]
+        tile = Catalog.read(survey / "catalog.parquet").tiles[0].id
         commands = {
             "python -c 'import numpy'": ([sys.executable, "-c", "import numpy"], 1),
             "flexroad --help": ([*FLEXROAD, "--help"], 5),
             "flexroad config show nightly": ([*FLEXROAD, "config", "show", "nightly"], 8),
             "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "nightly", *catalog], 15),
+            "rerun of one of ten tiles": (
+                [*FLEXROAD, "rerun", str(run), "--from", "load", "--tile", tile],
+                25,
+            ),
         }
         for command, _ in commands.values():
             # First call not timed: it reads files into the cache and finishes the run.
@@ -49,6 +67,65 @@ def main() -> None:
     print(f"{'command':32}{'CPU s':>8}{'ratio':>8}{'target':>8}")
     for name, (_, target) in commands.items():
         print(f"{name:32}{best[name]:8.2f}{best[name] / base:8.1f}{target:8}")
+
+
+def tiles() -> None:
+    """Print wall and CPU time of a run over small tiles with one and with two workers, in turn."""
+    with tempfile.TemporaryDirectory() as scratch:
+        survey = Path(scratch, "survey")
+        synthetic = [
+            "catalog",
+            "synthetic",
+            "-o",
+            str(survey),
+            "--tiles",
+            str(SMALL_TILES),
+            "--tile-size",
+            "60",
+        ]
+        subprocess.run([*FLEXROAD, *synthetic], check=True, capture_output=True)
+        common = [*FLEXROAD, "run", "--config", "nightly", "--catalog", str(survey / "catalog.parquet")]
+        ways = {
+            "one worker": ["--workers", "1"],
+            "two workers": ["--workers", "2"],
+            "two workers, always": ["--workers", "2", "--executor", "dask"],
+        }
+        # First run not timed: it compiles.
+        subprocess.run([*common, "--out", str(Path(scratch, "first"))], check=True, capture_output=True)
+        print(f"{SMALL_TILES} tiles of 60 m{'':14}{'wall s':>8}{'CPU s':>8}")
+        for turn in range(2):
+            for name, words in ways.items():
+                begin = time.perf_counter()
+                cpu = cpu_s([*common, *words, "--out", str(Path(scratch, f"{name} {turn}"))])
+                print(f"{name:32}{time.perf_counter() - begin:8.1f}{cpu:8.1f}")
+
+
+def reproduce(number: int) -> None:
+    """Print the CPU time of each command of ``make reproduce``."""
+    listed = subprocess.run(
+        ["make", "-n", "-o", ".venv/.installed", "reproduce", f"TILES={number}"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    ).stdout.replace("\\\n", " ")
+    total = 0.0
+    with tempfile.TemporaryDirectory() as scratch:
+        for command in re.findall(r"flexroad ([^;&\n]+)", listed):
+            words = [word.replace("runs/", f"{scratch}/") for word in shlex.split(command)]
+            spent = cpu_s([*FLEXROAD, *words])
+            total += spent
+            print(f"{' '.join(shlex.split(command)[:9])[-60:]:62}{spent:8.1f}", flush=True)
+    print(f"{f'make reproduce TILES={number}':62}{total:8.1f}")
+
+
+def main() -> None:
+    if "--tiles" in sys.argv:
+        tiles()
+    elif "--reproduce" in sys.argv:
+        reproduce(int(sys.argv[2]) if len(sys.argv) > 2 else 24)
+    else:
+        start()
 
 
 if __name__ == "__main__":

@@ -66,10 +66,14 @@ def new_figure(height_in: float) -> Figure:
 
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write NAME.pdf, NAME.png and NAME.webp, a small picture; equal figures give equal bytes."""
+    files: dict[str, bytes] = {}
     # A date or a software version in the metadata would change the bytes.
-    for kind, metadata in (("pdf", {"CreationDate": None, "Producer": None}), ("png", {"Software": None})):
+    for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None, "Producer": None})):
         buffer = io.BytesIO()
         with rc_context(STYLE):
             figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
-        write(folder / f"{name}.{kind}", buffer.getvalue())
-    write(folder / f"{name}.webp", webp(buffer.getvalue(), SMALL_PX))
+        # The layout costs as much as the drawing: the PDF has that of the PNG.
+        figure.set_layout_engine("none")
+        files[kind] = buffer.getvalue()
+        write(folder / f"{name}.{kind}", files[kind])
+    write(folder / f"{name}.webp", webp(files["png"], SMALL_PX))
