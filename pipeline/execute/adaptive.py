@@ -20,7 +20,7 @@ from flexroad.pipeline.execute.executor import Executor, J, R
 
 START_S = 4.0
 """Time until new workers do their first job (s): their start, imports and compiled code, on idle cores."""
-MARGIN = 2.0
+MARGIN = 3.0
 """How many times their start workers must save: times of jobs are estimates."""
 MANY = 200
 """Largest number of jobs for which workers may be left out."""

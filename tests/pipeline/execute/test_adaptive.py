@@ -76,8 +76,8 @@ def test_known_time_decides_before_the_first_job(monkeypatch):
 @pytest.mark.usefixtures("two_cores")
 def test_busy_machine_delays_workers_as_it_delays_jobs(monkeypatch):
     """Jobs that wait three quarters of their time for a core say that workers would start as slowly."""
-    assert run(made_clock(monkeypatch, 0.8), 24)[1]
-    assert not run(made_clock(monkeypatch, 0.8, cpu=0.25), 24)[1]
+    assert run(made_clock(monkeypatch, 1.2), 24)[1]
+    assert not run(made_clock(monkeypatch, 1.2, cpu=0.25), 24)[1]
 
 
 @pytest.mark.usefixtures("two_cores")
