@@ -21,9 +21,14 @@ from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from flexroad.catalog.borders import Border
+    from flexroad.tasks.errors import TaskError
+    from flexroad.tasks.spline.batch import Engine
     from flexroad.tasks.spline.frame import Corner, Edge, Frame
     from flexroad.tasks.spline.lattice import Lattice, Range
+    from flexroad.tasks.spline.problem import Problem
     from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
 
@@ -36,6 +41,9 @@ BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 BORDER_TOLERANCE = 1e-6
 """Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
+
+BATCH_DEGREE = 3
+"""Largest degree of `fit_batch`: above it, its conjugate gradients converge too slowly."""
 
 
 class Options(BaseOptions):
@@ -74,18 +82,80 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
-    from flexroad.tasks.spline.space import check_cells, surface_on
+    problem, held = _tile_problem(data, clusters, options, frame)
+    return _surface(data, problem, held, _minimum_of(problem, options))
+
+
+def fit_batch(
+    tiles: Sequence[tuple[TileData, RoadClusters, Frame | None]], options: Options, engine: Engine
+) -> list[NurbsSurface | TaskError]:
+    """Fit the surfaces of many tiles like `fit`, those of one shape together, in torch.
+
+    Parameters
+    ----------
+    tiles : sequence
+        The arguments of `fit` for each tile.
+    options : Options
+        The options of all tiles.
+    engine : Engine
+        The device and the memory for a batch.
+
+    Returns
+    -------
+    list
+        The surface of each tile, or the error that `fit` raises for it: it does not stop the others.
+
+    Raises
+    ------
+    TaskError
+        If the device is not available, or the degree is above `BATCH_DEGREE`.
+    """
+    from flexroad.tasks.errors import TaskError
+    from flexroad.tasks.spline.batch import minimise
+
+    if options.degree > BATCH_DEGREE:
+        raise TaskError(f"batches need fit.degree {BATCH_DEGREE} or less, not {options.degree}")
+
+    results: list[NurbsSurface | TaskError | None] = []
+    prepared = []
+    for number, (data, clusters, frame) in enumerate(tiles):
+        try:
+            prepared.append((number, *_tile_problem(data, clusters, options, frame)))
+            results.append(None)
+        except TaskError as error:
+            results.append(error)
+    problems = [problem for _, problem, _ in prepared]
+    solved = minimise(problems, options.huber_m, options.iterations, options.stop_tolerance, engine)
+    for (number, problem, held), z in zip(prepared, solved, strict=True):
+        results[number] = _surface(tiles[number][0], problem, held, z)
+    return [result for result in results if result is not None]
+
+
+def _tile_problem(
+    data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None
+) -> tuple[Problem, Floats]:
+    """Return the loss over the tile's core, and the heights of the control points that are held, else NaN."""
+    from flexroad.tasks.spline.space import check_cells
 
     core = data.grid.window(data.core)
     lattice = _lattice((data.core.width, data.core.height), data.core.cell, options)
     (n, m), start = lattice.intervals, (core[0].stop, core[1].start)
-    space, _ = lattice.part(data.grid.shape, start, (0, n), (0, m))
-    check_cells(_ground(data, clusters)[core], space.points)
-    shape = space.points[1], space.points[0]
+    shape = m + options.degree, n + options.degree
+    check_cells(_ground(data, clusters)[core], (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
-    z = _control_heights(data, clusters, lattice, start, (0, n), (0, m), held, options)
+    return _problem(data, clusters, lattice, start, (0, n), (0, m), held, options), held
+
+
+def _surface(data: TileData, problem: Problem, held: Floats, z: Floats) -> NurbsSurface:
+    from flexroad.tasks.spline.space import surface_on
+
+    A = _with_held(held, z + problem.datum)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    return surface_on(space, data.core, data.core.exact_bounds, z, np.ones_like(z), datum=0.0)
+    return surface_on(problem.space, data.core, data.core.exact_bounds, A, np.ones_like(A), datum=0.0)
+
+
+def _with_held(held: Floats, z: Floats) -> Floats:
+    return np.where(np.isfinite(held), held, z)
 
 
 def acting_m(options: Options) -> float:
@@ -205,7 +275,19 @@ def _control_heights(
 
     Points with a finite height in ``held`` keep it. The others are NaN if no cell has a height.
     """
+    problem = _problem(data, clusters, lattice, start, u, v, held, options)
+    if np.isnan(problem.heights).all():
+        return held
+    return _with_held(held, _minimum_of(problem, options) + problem.datum)
+
+
+def _problem(
+    data: TileData, clusters: RoadClusters, lattice: Lattice, start: tuple[int, int], u: Range, v: Range,
+    held: Floats, options: Options,
+) -> Problem:  # fmt: skip
+    """Return the loss over the cells in a part of the lattice."""
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+    from flexroad.tasks.spline.problem import Problem
     from flexroad.tasks.spline.space import start_heights
 
     space, window = lattice.part(data.grid.shape, start, u, v)
@@ -215,20 +297,23 @@ def _control_heights(
     if np.isnan(ground).all():
         # Of a corner or edge: tiles that bridge it must still hold the same points.
         dtm = ground = dsm
-    if np.isnan(ground).all():
-        return held
-    first, datum = start_heights(dsm, dtm, road, space)
+    no_ground = np.isnan(ground).all()
+    first, datum = (held, 0.0) if no_ground else start_heights(dsm, dtm, road, space)
     is_held = np.isfinite(held)
-    z = _minimum(
+    return Problem(
         space,
-        ground - datum,
-        np.where(road, 1.0, options.lambda_terrain),
-        options.bending_m3 * np.where(road, 1.0, options.bending_terrain),
-        np.where(is_held, held, first) - datum,
-        is_held,
-        options,
+        heights=ground - datum,
+        weight=np.where(road, 1.0, options.lambda_terrain),
+        stiffness=options.bending_m3 * np.where(road, 1.0, options.bending_terrain),
+        first=np.where(is_held, held, first) - datum,
+        held=is_held,
+        datum=datum,
     )
-    return np.where(is_held, held, z + datum)
+
+
+def _minimum_of(problem: Problem, options: Options) -> Floats:
+    p = problem
+    return _minimum(p.space, p.heights, p.weight, p.stiffness, p.first, p.held, options)
 
 
 def _minimum(
