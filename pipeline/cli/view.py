@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Annotated
 
@@ -71,6 +72,8 @@ def view(
     from flexroad.pipeline.monitor.progress import StepProgress
     from flexroad.pipeline.run.record import Run
 
+    if port and not serve:
+        raise ConfigError(f"--port {port} is for --serve; add that, or leave out --port")
     run = Run.open(parse_location(path), [str(place) for place in allow or ()])
     folder = parse_location(output) if output else run.path / FOLDER
     if serve and is_remote(folder):
@@ -91,7 +94,12 @@ def view(
 def _serve(folder: Path, port: int) -> None:
     from flexroad.pipeline.export.serving import server
 
-    with server(folder, port) as web:
+    try:
+        web = server(folder, port)
+    except OSError as error:
+        why = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be served: {error.strerror}"
+        raise ConfigError(f"port {port} {why}; choose another with --port, or leave it out") from error
+    with web:
         echo(f"http://127.0.0.1:{web.server_address[1]}/  (Ctrl-C stops)")
         try:
             web.serve_forever()

@@ -14,7 +14,7 @@ from typing import Any
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.crs import in_plan, name, short
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.storage.paths import Location, exists, read, remove, write
+from flexroad.catalog.storage.paths import Location, absolute, listing, read, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import write_pieces
@@ -31,6 +31,8 @@ VERSION = 100 * viewer.VERSION + glb.VERSION
 PAGE = "index.html"
 MARK = b'<meta name="generator" content="FlexRoad viewer">'
 """Text of a page that this program has written."""
+OWNER = ".flexroad-viewer"
+"""File with the path of the run whose viewer the folder has."""
 PENDING, DONE, FAILED = range(3)
 """States of tiles in the index."""
 MEASURES = {
@@ -78,8 +80,8 @@ def write_viewer(
     Raises
     ------
     ConfigError
-        If the folder has a page of another program, no tile can be shown, tiles have different CRSs, or a
-        tile's results cannot be read.
+        If the folder is of the run or has files of others, no tile can be shown, tiles have different CRSs,
+        or a tile's results cannot be read.
     CatalogError
         If an id is not in the run, or no tile touches the box.
     OSError
@@ -87,7 +89,7 @@ def write_viewer(
     """
     tiles = shown_tiles(run, ids, bbox)
     variant = run.config.export.variants[0]
-    _remove_page(out)
+    _claim(out, run)
     index, done = _index(run, tiles, variant)
     options = run.config.chains[variant]["segment"]
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
@@ -97,7 +99,9 @@ def write_viewer(
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
-    pictures = {row["tile"]: row["picture"] for row in rows if row["picture"]}
+    # In the order of the catalog: equal viewers are equal byte by byte.
+    found = {row["tile"]: row["picture"] for row in rows if row["picture"]}
+    pictures = {tile.id: found[tile.id] for tile in done if tile.id in found}
     write(out / viewer.NAME_PICTURES, viewer.encode_pictures(pictures))
     write(out / viewer.NAME_RUN, viewer.encode_run(index | {"pictures": bool(pictures)}))
     write(out / PAGE, (_built() / PAGE).read_bytes())
@@ -136,12 +140,33 @@ def _built() -> Path:
     return Path(__file__).resolve().parents[2] / "viewer" / "dist"
 
 
-def _remove_page(out: Location) -> None:
-    """Remove the page of an earlier viewer."""
-    page = out / PAGE
-    if exists(page) and MARK not in read(page):
-        raise ConfigError(f"{page} is no page of `flexroad view`; choose another folder with -o")
-    remove(page)
+def _claim(out: Location, run: Run) -> None:
+    """Take the folder for this run's viewer: remove the page of an earlier one, and note the run.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is the run, its store or one of their folders, has files of others, or is the viewer of
+        another run.
+    """
+    for place in (run.path, run.store, run.path / "tiles"):
+        if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
+            raise ConfigError(f"{out} is a folder of the run or above it; choose another one with -o")
+    for place in (run.store, run.path / "tiles"):
+        if absolute(place) in absolute(out).parents:
+            raise ConfigError(f"{out} lies in {place}, which belongs to the run; choose another with -o")
+    if isinstance(out, Path) and out.is_file():
+        raise ConfigError(f"{out} is a file; choose a folder with -o")
+    names = set(listing(out))
+    owner = read(out / OWNER).decode(errors="replace") if OWNER in names else ""
+    own = str(absolute(run.path))
+    # A folder inside the run may have been moved with it.
+    if owner and owner != own and absolute(run.path) not in absolute(out).parents:
+        raise ConfigError(f"{out} has the viewer of {owner}; choose another folder with -o, or remove it")
+    if names and not owner and not (PAGE in names and MARK in read(out / PAGE)):
+        raise ConfigError(f"{out} has files that are not of a viewer; choose another folder with -o")
+    write(out / OWNER, own.encode())
+    remove(out / PAGE)
 
 
 def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[Shown]:

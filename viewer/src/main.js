@@ -76,13 +76,15 @@ class Page {
     this.hash = window.location.hash;
     this.maps.by(state.by);
     const tile = this.run.byId.get(state.tile);
+    // The address has its entry in the history already.
+    this.recorded = tile?.state === DONE;
     if (tile?.state === DONE) {
       this.openTile(tile, state);
       return;
     }
     this.showMap();
     if (tile) this.maps.choose(tile);
-    else if (state.tile !== undefined) this.maps.find(state.tile);
+    else if (state.tile !== undefined) this.maps.lacks(state.tile);
   }
 
   async openTile(tile, state = {}) {
@@ -144,10 +146,13 @@ class Page {
     const hash = format(this.inTile && this.tiles?.tile ? { ...this.tileState(), by } : { by });
     if (hash === this.hash) return;
     this.hash = hash;
+    // Back leads from a tile to the map, and not through each move of the camera.
+    const entered = this.inTile !== this.recorded;
+    this.recorded = this.inTile;
     try {
-      history.replaceState(null, "", hash || window.location.pathname);
+      history[entered ? "pushState" : "replaceState"](null, "", hash || window.location.pathname);
     } catch {
-      window.location.replace(hash || "#");
+      window.location[entered ? "assign" : "replace"](hash || "#");
     }
   }
 
@@ -177,6 +182,8 @@ class Page {
       lines: this.tiles?.drive.lines.length ?? 0,
       driving: this.tiles?.drive.running ?? false,
       box: { ...this.maps.map.box },
+      corners: stage?.active && this.tiles.tile ? stage.pixels(stage.corners(this.tiles.tile)) : null,
+      free: stage ? this.tiles.canvas.clientWidth - stage.covered() : null,
     };
   }
 }

@@ -43,6 +43,7 @@ export class MapView {
     const rate = this.choices.find((choice) => choice.key === "error_estimate_m");
     const listed = worst(this.run, LISTED);
     this.results = el("div", {});
+    this.found = [];
     this.chosen = el("section", { hidden: true });
     return [
       this.chosen,
@@ -62,6 +63,9 @@ export class MapView {
           placeholder: "Id of a tile",
           "aria-label": "Id of a tile",
           input: (event) => this.find(event.target.value.trim()),
+          keydown: (event) => {
+            if (event.key === "Enter" && this.found.length) this.choose(this.found[0]);
+          },
         }),
         this.results,
       ),
@@ -79,7 +83,7 @@ export class MapView {
   }
 
   find(text) {
-    const found = text ? this.run.tiles.filter((tile) => tile.id.toLowerCase().includes(text.toLowerCase())) : [];
+    const found = (this.found = text ? this.run.tiles.filter((tile) => tile.id.toLowerCase().includes(text.toLowerCase())) : []);
     const more = found.length > LISTED ? el("p", { class: "quiet small" }, `and ${count(found.length - LISTED, "more")}`) : null;
     const none = text && !found.length ? el("p", { class: "quiet small" }, "No tile has this in its id.") : null;
     const list = tileList(found.slice(0, LISTED), {
@@ -90,6 +94,12 @@ export class MapView {
     fill(this.results, list, more, none);
   }
 
+  /** Says that the run has no such tile, and lists those with a like id. */
+  lacks(id) {
+    this.find(id);
+    this.say(el("p", {}, `This run has no tile ${id}.`));
+  }
+
   /** Opens a finished tile; of others, says what is known. */
   choose(tile) {
     this.map.select(tile);
@@ -97,11 +107,11 @@ export class MapView {
       this.open(tile);
       return;
     }
-    fill(
-      this.chosen,
-      tileHead(tile),
-      tile.state === FAILED ? null : el("p", { class: "quiet small" }, "It has no surface yet."),
-    );
+    this.say(tileHead(tile), tile.state === FAILED ? null : el("p", { class: "quiet small" }, "It has no surface yet."));
+  }
+
+  say(...text) {
+    fill(this.chosen, ...text);
     show(this.chosen, true);
     byId("panel").classList.add("open");
     byId("panel-content").scrollTop = 0;

@@ -13,6 +13,9 @@ import { TileObject } from "./tile_object.js";
 const EYE = 1.5;
 const MOST_TILES = window.matchMedia("(max-width: 700px)").matches ? 5 : 9;
 const NEARBY = 1.6;
+const FROM_SOUTH = new Vector3(-0.25, 0.8, 0.9);
+// Part of the free height and width that a tile seen as a whole takes.
+const FILLED = 0.86;
 
 export class Stage {
   /** Draws into a canvas; `events` are changed(), entered(tile), loading(number), failed(tile, error), frame(). */
@@ -66,13 +69,40 @@ export class Stage {
     this.missing.clear();
   }
 
-  /** Shows the whole tile, seen from the south. */
+  /** Shows the whole tile in what is free beside the settings, seen from the south. */
   overlook(tile) {
-    const size = Math.max(tile.east - tile.west, tile.north - tile.south);
     const [easting, northing] = [(tile.west + tile.east) / 2, (tile.south + tile.north) / 2];
-    const height = this.heightAt(easting, northing) ?? this.base;
-    const away = size * (this.camera.aspect < 1 ? 1.3 : 0.95);
-    this.place([easting - away * 0.25, northing - away * 0.9, height + away * 0.8, easting, northing, height]);
+    const target = this.toScene(easting, northing, this.heightAt(easting, northing) ?? this.base);
+    const toEye = FROM_SOUTH.clone().normalize();
+    const right = new Vector3(0, 1, 0).cross(toEye).normalize();
+    const up = toEye.clone().cross(right);
+    const { clientWidth, clientHeight } = this.renderer.domElement;
+    const high = Math.tan((this.camera.fov * Math.PI) / 360) * FILLED;
+    const wide = (high * (clientWidth - this.covered())) / clientHeight;
+    const needed = this.corners(tile).map((corner) => {
+      const place = corner.sub(target);
+      return place.dot(toEye) + Math.max(Math.abs(place.dot(right)) / wide, Math.abs(place.dot(up)) / high);
+    });
+    this.camera.position.copy(target).addScaledVector(toEye, Math.max(...needed));
+    this.controls.target.copy(target);
+    this.controls.update();
+    this.moved();
+  }
+
+  /** Returns the corners of a tile at the height of the surface. */
+  corners({ west, south, east, north }) {
+    const places = [[west, south], [east, south], [west, north], [east, north]];
+    return places.map(([x, y]) => this.toScene(x, y, this.heightAt(x, y) ?? this.base));
+  }
+
+  /** Returns the pixels of places of the scene on the canvas. */
+  pixels(places) {
+    const { clientWidth, clientHeight } = this.renderer.domElement;
+    this.camera.updateMatrixWorld();
+    return places.map((place) => {
+      const { x, y } = place.clone().project(this.camera);
+      return [((x + 1) * clientWidth) / 2, ((1 - y) * clientHeight) / 2];
+    });
   }
 
   /** Puts the camera: easting, northing and height (m) of the eye, then of what it looks at. */

@@ -237,8 +237,10 @@ export class TileView {
     for (const name of ["from", "to", "cursor"]) this.overlay.dot(name, null);
     this.overlay.line("section", null);
     show(byId("section"), false);
-    if (on) this.hint("Choose where the section begins.");
-    else show(byId("hint"), false);
+    if (on) {
+      byId("panel").classList.remove("open");
+      this.hint("Choose where the section begins.");
+    } else show(byId("hint"), false);
     this.redraw();
   }
 

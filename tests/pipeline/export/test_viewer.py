@@ -5,7 +5,9 @@ import http.client
 import json
 import os
 import re
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -121,11 +123,58 @@ def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch)
     assert not (tmp_path / PAGE).exists()
 
 
-def test_page_of_another_program_is_kept(city, tmp_path):
-    (tmp_path / PAGE).write_text("<h1>mine</h1>")
-    with pytest.raises(ConfigError, match="no page of `flexroad view`; choose another folder"):
+@pytest.mark.parametrize("name", [PAGE, "notes.txt"])
+def test_folder_with_files_of_others_is_refused(city, tmp_path, name):
+    (tmp_path / name).write_text("<h1>mine</h1>")
+    with pytest.raises(ConfigError, match="has files that are not of a viewer; choose another folder"):
         write_viewer(Run.open(city), tmp_path, SerialExecutor())
-    assert (tmp_path / PAGE).read_text() == "<h1>mine</h1>"
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "<h1>mine</h1>")]
+
+
+@pytest.mark.parametrize("inside", [".", "..", "tiles", "tiles/viewer", "store"])
+def test_folder_of_the_run_is_refused(city, inside):
+    before = sorted(city.rglob("*"))
+    with pytest.raises(ConfigError, match="choose another"):
+        write_viewer(Run.open(city), city / inside, SerialExecutor())
+    assert sorted(city.rglob("*")) == before
+
+
+def test_viewer_of_another_run_is_kept(city, tmp_path):
+    run = Run.open(city)
+    tile = [run.catalog.tiles[0].id]
+    write_viewer(run, tmp_path / "page", SerialExecutor(), tile)
+    before = (tmp_path / "page" / PAGE).stat().st_mtime_ns
+    moved = shutil.copytree(city, tmp_path / "moved", symlinks=True)
+    with pytest.raises(ConfigError, match=f"has the viewer of {city}; choose another folder"):
+        write_viewer(Run.open(moved), tmp_path / "page", SerialExecutor(), tile)
+    assert (tmp_path / "page" / PAGE).stat().st_mtime_ns == before
+
+
+def test_output_that_is_a_file_is_refused(city, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="is a file; choose a folder with -o"):
+        write_viewer(Run.open(city), tmp_path / "file", SerialExecutor())
+
+
+def test_viewer_that_was_brought_up_to_date_equals_a_new_one(city, tmp_path):
+    run = Run.open(city)
+    write_viewer(run, tmp_path / "old", SerialExecutor(), [run.catalog.tiles[1].id])
+    for name in ("old", "new"):
+        write_viewer(run, tmp_path / name, SerialExecutor())
+    old, new = (
+        {file.name: file.read_bytes() for file in (tmp_path / name).rglob("*") if file.is_file()}
+        for name in ("old", "new")
+    )
+    assert old == new
+
+
+def test_used_port_is_named(city, flexroad, tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        said = flexroad("view", city, "-o", tmp_path / "page", "--serve", "--port", port).expected(2)
+    assert said.errors[-1] == f"error: port {port} is in use; choose another with --port, or leave it out"
 
 
 def test_selection_without_a_surface_is_a_map_alone(city, tmp_path):
@@ -191,6 +240,7 @@ def test_command_writes_into_the_run_and_names_the_page(city, flexroad):
     ("words", "message"),
     [
         (["nowhere"], "nowhere is no run"),
+        (["{city}", "--port", "8137"], "--port 8137 is for --serve; add that, or leave out --port"),
         (["{city}", "--tile", "x"], "no tile 'x' in the catalog"),
         (["{city}", "--bbox", "0", "0", "1", "1"], "no tile touches --bbox"),
     ],

@@ -285,6 +285,80 @@ def test_phone_zooms_by_two_fingers_on_the_map_and_in_a_tile(run, page):
     assert near < 0.8 * far
 
 
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (1000, 640), (390, 844), (844, 390)])
+def test_first_view_has_the_whole_tile_beside_the_settings(run, page, width, height):
+    link = f"#tile={run.catalog.tiles[0].id}"
+    size = {"width": width, "height": height}
+    _, seen = browse(page, {"wait": SETTLED}, {"eval": INSPECT}, fragment=link, **size)
+    for x, y in seen["corners"]:
+        assert 0 < x < seen["free"]
+        assert 0 < y < height
+    assert (seen["free"] < width) == (width > 900)
+    spans = np.ptp(np.array(seen["corners"]), axis=0) / [seen["free"], height]
+    assert spans.max() > 0.5
+
+
+def test_back_and_forward_lead_from_the_tile_to_the_map_and_again_to_the_tile(run, page):
+    (box,) = browse(page, {"eval": f"{INSPECT}.box"})
+    west, south, east, north = run.catalog.tiles[0].grid.bounds
+    results = browse(
+        page,
+        {"click": pixel_of(box, (west + east) / 2, (south + north) / 2)},
+        {"wait": SETTLED},
+        {"key": "ArrowUp"},
+        {"key": "ArrowUp"},
+        {"eval": "history.back()"},
+        {"wait": f"() => {INSPECT}.view === 'map'"},
+        {"eval": "history.forward()"},
+        {"wait": f"() => {INSPECT}.view === 'tile'"},
+        {"eval": f"{INSPECT}.tile"},
+    )
+    assert results[-1] == run.catalog.tiles[0].id
+
+
+def test_unknown_tile_in_the_address_is_named(run, page):
+    _, text, view = browse(
+        page,
+        {"wait": "() => window.FLEXROAD.inspect"},
+        {"eval": "document.getElementById('panel-content').textContent"},
+        {"eval": f"{INSPECT}.view"},
+        fragment="#tile=nope",
+    )
+    assert "This run has no tile nope." in text
+    assert view == "map"
+
+
+def test_enter_opens_the_first_tile_that_is_found(run, page):
+    search = "#panel-content input[type=search]"
+    typed = (
+        f"(e => {{ e.value = '_'; e.dispatchEvent(new Event('input')) }})(document.querySelector('{search}'))"
+    )
+    opened = browse(
+        page,
+        {"eval": typed},
+        {"focus": search},
+        {"key": "Enter"},
+        {"wait": SETTLED},
+        {"eval": f"{INSPECT}.tile"},
+    )[-1]
+    assert opened == run.catalog.tiles[0].id
+
+
+def test_phone_closes_the_settings_while_a_section_is_made(run, page):
+    results = browse(
+        page,
+        {"wait": SETTLED},
+        {"press": "#panel-toggle"},
+        {"press": "#panel-content button[data-tool=measure]"},
+        {"eval": "getComputedStyle(document.getElementById('panel-content')).display"},
+        {"eval": "document.getElementById('hint').textContent"},
+        fragment=f"#tile={run.catalog.tiles[0].id}",
+        width=390,
+        height=844,
+    )
+    assert results[3:] == ["none", "Choose where the section begins."]
+
+
 def test_ten_thousand_tiles_are_drawn_and_coloured_by_a_measure(tmp_path):
     ids = [f"tile {i}" for i in range(10_000)]
     page = made(tmp_path, ids, [FAILED if i % 10 == 0 else DONE for i in range(10_000)])
