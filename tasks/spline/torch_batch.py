@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-5
 """Tolerance of the normal equations. The fit stops long before the loss is lowest, so batches must take the
 steps that `tasks.spline.irls` takes: with 1e-3 in the first step a surface over a void differed by 12 mm."""
-EVALUATIONS, STEP_TOLERANCE = 12, 1e-3
-"""Largest number of evaluations along a step, and tolerance of its length, as a share of the whole step."""
+EVALUATIONS, SLOPE_TOLERANCE = 40, 1e-5
+"""Largest number of evaluations along a step, and largest slope at its end, as a share of the first one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,18 +141,18 @@ class _Line:
         import torch
 
         low, high = torch.zeros_like(self.energy), torch.full_like(self.energy, MAX_STEP)
-        t, done = torch.ones_like(low), torch.zeros_like(low, dtype=torch.bool)
-        for _ in range(EVALUATIONS):
+        t, least = torch.ones_like(low), SLOPE_TOLERANCE * self.slopes(low)[0].abs()
+        for number in range(EVALUATIONS):
             slope, rate = self.slopes(t)
-            low, high = torch.where(slope < 0, t, low), torch.where(slope < 0, high, t)
-            newton = t - slope / rate
-            inside = (newton > low) & (newton < high)
-            following = torch.where(inside, newton, (low + high) / 2)
-            following = torch.where(done | (slope == 0), t, following)
-            done |= (following - t).abs() <= STEP_TOLERANCE
-            t = following
+            done = slope.abs() <= least
             if bool(done.all()):
                 break
+            low, high = torch.where(slope < 0, t, low), torch.where(slope < 0, high, t)
+            newton = t - slope / rate
+            # Every third time halved too: Newton's step can be short on one side of a bend.
+            inside = (newton > low) & (newton < high) & (number % 3 != 2)
+            following = torch.where(inside, newton, (low + high) / 2)
+            t = torch.where(done, t, following)
         return t
 
 
