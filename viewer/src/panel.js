@@ -89,7 +89,10 @@ export function legend(entries, ramp) {
 export function surfaceLegend(colour) {
   if (colour === "support") return legend([1, 2, 3].map((k) => ({ colour: SUPPORT_COLOURS[k], label: SUPPORT[k] })));
   if (colour === "estimate") {
-    return legend([], { stops: ESTIMATE_COLOURS, low: "0 m", high: `${ESTIMATE_MOST} m and more` });
+    const ramp = { stops: ESTIMATE_COLOURS, low: "0 m", high: `${ESTIMATE_MOST} m and more` };
+    // Else the colours beside the road seem to contradict the tile's figure.
+    const note = "The figure of a tile is over its road. Where the data have no height, the estimate is 0.3 m or more.";
+    return [legend([], ramp), el("p", { class: "quiet small" }, note)];
   }
   if (colour === "photo") return null;
   return legend([
