@@ -92,7 +92,7 @@ export function surfaceLegend(colour) {
     const ramp = { stops: ESTIMATE_COLOURS, low: "0 m", high: `${ESTIMATE_MOST} m and more` };
     // Else the colours beside the road seem to contradict the tile's figure.
     const note = "The figure of a tile is over its road. Where the data have no height, the estimate is 0.3 m or more.";
-    return [legend([], ramp), el("p", { class: "quiet small" }, note)];
+    return el("div", {}, legend([], ramp), el("p", { class: "quiet small" }, note));
   }
   if (colour === "photo") return null;
   return legend([
