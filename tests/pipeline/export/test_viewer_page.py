@@ -185,7 +185,7 @@ def test_each_setting_changes_the_picture(run, page):
     assert np.abs(shots[4] - shots[0]).mean() < 1
     # Without road and terrain only points are left.
     sky = np.median(shots[8], axis=(0, 1))
-    assert np.median(np.abs(shots[8] - sky)) < 10 < np.median(np.abs(shots[7] - sky))
+    assert np.median(np.abs(shots[8] - sky)) < 10 < np.median(np.abs(shots[6] - sky))
 
 
 def test_section_between_two_clicks_has_the_heights_of_the_run(run, page):
