@@ -72,6 +72,7 @@ class _Asset(_Schema):
 class _Assets(_Schema):
     dsm: _Asset | None = None
     dtm: _Asset | None = None
+    road_height: _Asset | None = None
     dop: _Asset | None = None
     road_mask: _Asset | None = None
     reference: _Asset | None = None

@@ -12,15 +12,18 @@ from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.trust import AllowedFolders, full_name, located
 
-HEIGHTS = ("dsm", "dtm", "reference", "bridges")
+HEIGHTS = ("dsm", "dtm", "road_height", "reference", "bridges")
 """Layers with heights in metres."""
-LAYERS = ("dsm", "dtm", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
-"""Layers a tile can have: digital surface and terrain model (m), orthophoto, road mask, true heights of road
-and terrain including bridges (m), true road mask, heights of bridge decks only (m), roads as lines or areas
-(vectors)."""
-LOADED = ("dsm", "dtm", "reference", "bridges", "road_mask", "reference_road")
+LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask", "reference", "reference_road", "bridges", "roads")
+"""Layers a tile can have: digital surface and terrain model (m), heights of hard surfaces without the bias of
+the highest point (m, `ROAD_HEIGHT_BANDS`), orthophoto, road mask, true heights of road and terrain including
+bridges (m), true road mask, heights of bridge decks only (m), roads as lines or areas (vectors)."""
+ROAD_HEIGHT_BANDS = (("height", "m"), ("count", ""), ("spread", "m"))
+"""Description and unit of the bands of ``road_height``: mean height of a cell's highest points, their number,
+and the standard deviation of their heights. A file may have the first band alone."""
+LOADED = ("dsm", "dtm", "road_height", "reference", "bridges", "road_mask", "reference_road")
 """Rasters that `load` reads; it passes on only the names of the other layers' files."""
-BORDER_LAYERS = ("dsm", "dtm", "dop", "road_mask", "roads")
+BORDER_LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask", "roads")
 """Layers of ground along the borders of tiles (`Tile.around`)."""
 
 REACH_M = 200.0

@@ -6,22 +6,20 @@ in the north and NaN where there is no value.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER
-from flexroad.catalog.crs import Unit, height_unit, is_projected, plan_unit
 from flexroad.catalog.storage.paths import Location, stat
-from flexroad.catalog.text import count
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.height_units import absurd_note, check_units, in_metres, with_unit
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 if TYPE_CHECKING:
@@ -35,21 +33,8 @@ READS = HEIGHTS + CLASSES
 NEEDS = ("dsm", "dtm")
 """Layers without which a tile fails."""
 
-LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Heights outside this range are taken as undeclared nodata."""
-
 MAX_CELLS = 25_000_000
 """Largest number of cells of a tile with its halo: 0.2 GB for each of several layers."""
-
-METRE: Unit = ("metre", 1.0)
-
-UNITS = {
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
-    **dict.fromkeys(("us-ft", "us-foot", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
-    **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
-}
-"""Size (m) of the units of height that bands declare; names in lower case."""
 
 
 class Options(options.Options):
@@ -67,6 +52,17 @@ class Options(options.Options):
         ge=0,
         le=1,
         description="share of the tile's cells that need a DSM height, or the tile fails",
+    )
+    road_height: Literal["dsm", "auto", "layer", "offset"] = Field(
+        "dsm",
+        description="heights that roads are fitted to: dsm, its highest points; layer, the catalog's "
+        "road_height; auto, that layer where the tile has it, else the DSM; offset, the DSM minus its height "
+        "above the DTM on open road, if both declare the same date and vertical CRS",
+    )
+    offset_undeclared: bool = Field(
+        False,
+        description="with road_height: offset, take DSM and DTM as of one survey where they declare no date "
+        "or no vertical CRS",
     )
 
 
@@ -106,9 +102,10 @@ def load(tile: Tile, options: Options) -> TileData:
     """
     if tile.fault:
         raise TaskError(tile.fault)
-    for name in NEEDS:
+    for name in NEEDS + (("road_height",) if options.road_height == "layer" else ()):
         if tile.layer(name) is None:
-            raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{name}")
+            option = name.replace("_", "-")
+            raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{option}")
     from flexroad.catalog.headers.rasters import quiet
 
     grid = tile.grid.buffered(options.halo_m)
@@ -121,30 +118,35 @@ def load(tile: Tile, options: Options) -> TileData:
     core = grid.window(tile.grid)
     with quiet():
         mosaics = {
-            layer.name: _mosaic(tile, layer, grid, tile.grid) for layer in tile.layers if layer.name in READS
+            layer.name: _mosaic(tile, layer, grid, tile.grid)
+            for layer in tile.layers
+            if _is_read(layer, options)
         }
     for layer in tile.layers:
         if layer.name in mosaics:
             _check_read(tile, layer, mosaics[layer.name], core, grid)
-    _check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
+    check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
     _check_valid(mosaics["dsm"], core, options.min_valid)
     _check_valid(mosaics["dtm"], core, 0.0)
+    offset_dsm, remarks = _offset(tile, options)
     return TileData(
         tile_id=tile.id,
         grid=grid,
         core=tile.grid,
         dsm=mosaics["dsm"].values,
         dtm=mosaics["dtm"].values,
+        road_height=mosaics["road_height"].values if "road_height" in mosaics else None,
+        offset_dsm=offset_dsm,
         road_mask=_road(tile, "road_mask", mosaics),
         reference=_reference(mosaics),
         reference_road=_road(tile, "reference_road", mosaics),
-        notes=tuple(note for mosaic in mosaics.values() for note in mosaic.notes),
+        notes=(*(note for mosaic in mosaics.values() for note in mosaic.notes), *remarks),
         dop=layer_source(tile, "dop"),
         roads=layer_source(tile, "roads"),
     )
 
 
-def load_border(ground: Tile, core: Grid) -> TileData:
+def load_border(ground: Tile, core: Grid, options: Options | None = None) -> TileData:
     """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
 
     Parameters
@@ -153,6 +155,8 @@ def load_border(ground: Tile, core: Grid) -> TileData:
         The ground, with the files that reach it (`Tile.around`).
     core : Grid
         The tile that the files are of: the position of a file without georeference.
+    options : Options, optional
+        The heights that roads are fitted to; None: the DSM's. The halo does not count.
 
     Raises
     ------
@@ -161,27 +165,51 @@ def load_border(ground: Tile, core: Grid) -> TileData:
     """
     from flexroad.catalog.headers.rasters import quiet
 
-    grid = ground.grid
+    grid, chosen = ground.grid, options or Options()
     with quiet():
         mosaics = {
             layer.name: _mosaic(ground, layer, grid, core, around=True)
             for layer in ground.layers
-            if layer.name in READS
+            if _is_read(layer, chosen)
         }
     patches = [patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches]
     if patches:
-        _check_units(patches)
-    unknown = np.full(grid.shape, np.nan)
+        check_units(patches)
+    dsm, dtm = (
+        mosaics[name].values if name in mosaics else np.full(grid.shape, np.nan) for name in ("dsm", "dtm")
+    )
     return TileData(
         tile_id=ground.id,
         grid=grid,
         core=grid,
-        dsm=mosaics["dsm"].values if "dsm" in mosaics else unknown,
-        dtm=mosaics["dtm"].values if "dtm" in mosaics else unknown,
+        dsm=dsm,
+        dtm=dtm,
+        road_height=mosaics["road_height"].values if "road_height" in mosaics else None,
+        offset_dsm=_offset(ground, chosen)[0],
         road_mask=_road(ground, "road_mask", mosaics),
         dop=_optional(layer_source(ground, "dop")),
         roads=_optional(layer_source(ground, "roads")),
     )
+
+
+def _is_read(layer: Layer, options: Options) -> bool:
+    return layer.name in READS and (layer.name != "road_height" or options.road_height in ("auto", "layer"))
+
+
+def _offset(tile: Tile, options: Options) -> tuple[bool, list[str]]:
+    """Return whether roads are fitted to the DSM minus an offset, and a note if they would be but cannot."""
+    if options.road_height != "offset":
+        return False, []
+    from flexroad.tasks.io.same_survey import survey_difference
+
+    differs, undeclared = survey_difference(tile)
+    unchanged = "road_height: the DSM is used without an offset, because"
+    if differs:
+        return False, [f"{unchanged} the DTM differs in {differs}"]
+    if undeclared and not options.offset_undeclared:
+        remedy = "set load.offset_undeclared if they are of one survey"
+        return False, [f"{unchanged} dsm and dtm do not declare {undeclared}; {remedy}"]
+    return True, []
 
 
 def layer_source(tile: Tile, name: str) -> Source | None:
@@ -239,7 +267,7 @@ def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = Fal
         if patch is None:
             continue
         if heights:
-            patch, absurd = _metres(_with_unit(patch, layer))
+            patch, absurd = in_metres(with_unit(patch, layer))
             absurd_cells += absurd
         patches.append(patch)
         if patch.lattice.crs:
@@ -307,71 +335,6 @@ def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[st
     return list(dict.fromkeys(notes))
 
 
-def _with_unit(patch: RasterWindow, layer: Layer) -> RasterWindow:
-    """Return a patch of heights with the unit that the catalog or the CRS gives if none is declared."""
-    if patch.unit or patch.crs is None or height_unit(patch.crs):
-        return patch
-    unit, metres = plan_unit(patch.crs)
-    implied = unit if patch.lattice.crs and is_projected(patch.crs) and metres != 1 else ""
-    unit = layer.height_unit or implied
-    return replace(patch, unit=unit, unit_assumed=bool(unit))
-
-
-def _metres(patch: RasterWindow) -> tuple[RasterWindow, int]:
-    """Return the patch with heights in metres, and the number of cells outside the range of heights."""
-    values = patch.values * _unit(patch)[1]
-    return replace(patch, values=values), remove_absurd(values)
-
-
-def remove_absurd(heights: Floats) -> int:
-    """Set heights (m) outside `LOWEST_M` to `HIGHEST_M` to NaN, in place; return their number."""
-    absurd = (heights < LOWEST_M) | (heights > HIGHEST_M)
-    heights[absurd] = np.nan
-    return int(np.count_nonzero(absurd))
-
-
-def absurd_note(layer: str, removed: int) -> str:
-    """Return the note on heights that `remove_absurd` removed from a layer."""
-    return f"{layer}: {count(removed, 'cell')} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
-
-
-def _unit(patch: RasterWindow) -> Unit:
-    """Return the unit of heights declared by the band, else by the CRS, else metres."""
-    if not patch.unit:
-        return (height_unit(patch.crs) if patch.crs else None) or METRE
-    metres = UNITS.get(patch.unit.lower())
-    if metres is None:
-        raise TaskError(
-            f"{patch.name} has the unit {patch.unit!r}, which is not a supported unit of height; "
-            "convert it, or correct the unit with gdal_edit.py -units m",
-            patch.file,
-        )
-    return patch.unit, metres
-
-
-def _check_units(patches: Sequence[RasterWindow]) -> None:
-    """Raise an error if layers differ in their unit of height: probably a missing tag, not a mixed survey.
-
-    Files in different CRSs may differ if both declare their unit.
-    """
-    first = patches[0]
-    for patch in patches[1:]:
-        (a, a_metres), (b, b_metres) = _unit(first), _unit(patch)
-        if (first.lattice.crs or patch.lattice.crs) and _declares_unit(first) and _declares_unit(patch):
-            continue
-        if not math.isclose(a_metres, b_metres, rel_tol=1e-4):
-            raise TaskError(
-                f"{first.name} has heights in {a}, {patch.name} in {b}; "
-                "convert one, or correct its unit with gdal_edit.py -units",
-                patch.file,
-            )
-
-
-def _declares_unit(patch: RasterWindow) -> bool:
-    declared = patch.unit and not patch.unit_assumed
-    return bool(declared or (patch.crs and height_unit(patch.crs)))
-
-
 def _check_valid(mosaic: _Mosaic, core: tuple[slice, slice], min_valid: float) -> None:
     first = mosaic.patches[0]
     share = 1 - np.isnan(mosaic.values[core]).mean()
@@ -391,5 +354,5 @@ def _road(tile: Tile, name: str, mosaics: Mapping[str, _Mosaic]) -> Bools | None
     if layer is None:
         return None
     values = mosaics[name].values
-    road: Bools = np.isin(values, layer.values) if layer.values else np.nan_to_num(values) != 0
+    road: Bools = np.isin(values, layer.values) if layer.values else (values != 0) & ~np.isnan(values)
     return road

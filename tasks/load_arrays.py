@@ -11,9 +11,10 @@ from rasterio.enums import Resampling
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.load import UNITS, Options, absurd_note, remove_absurd
+from flexroad.tasks.load import Options
 from flexroad.tasks.types import Floats, TileData
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
         If an array has no CRS, is in degrees or feet, is rotated, has pixels that are not square or more
         than two dimensions; if the CRS of two arrays differ; if there are too few heights.
     """
+    if options.road_height == "layer":
+        raise TaskError("load.road_height is layer, but arrays have none; set it to auto")
     patches = {
         name: _patch(name, array) for name, array in (("dsm", dsm), ("dtm", dtm), ("road_mask", road_mask))
     }
@@ -67,7 +70,15 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
     notes += [] if road[window].any() else [WITHOUT_ROAD]
     return TileData(
-        TILE_ID, grid, core, heights["dsm"], heights["dtm"], road, notes=tuple(filter(None, notes))
+        TILE_ID,
+        grid,
+        core,
+        heights["dsm"],
+        heights["dtm"],
+        road,
+        notes=tuple(filter(None, notes)),
+        # Arrays declare neither date nor vertical CRS.
+        offset_dsm=options.road_height == "offset" and options.offset_undeclared,
     )
 
 

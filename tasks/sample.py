@@ -1,6 +1,7 @@
 """Sample the surface to a mesh: the paper's step D, "Dynamic Surface Sampling".
 
 dynamic: points at ``road_m`` on the road and at ``terrain_m`` elsewhere, joined by Delaunay triangulation;
+adaptive: as few points as keep the mesh within a tolerance of the surface (`tasks.meshing.adaptive`);
 uniform: a regular grid of triangles (RGT); corners: the two triangles of a plane.
 
 The lattices are anchored at the south-west corner of the domain: the hull of the core's cell centres where
@@ -14,7 +15,7 @@ roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,44 +24,64 @@ from pydantic import Field
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing.lines import apart_from, divided, ends_at_border, points_and_segments
+from flexroad.tasks.meshing.adaptive import Area, adaptive, free_sides, thinned
+from flexroad.tasks.meshing.breaklines import breaklines
+from flexroad.tasks.meshing.lines import (
+    apart_from,
+    divided,
+    ends_at_border,
+    parts_of,
+    points_and_segments,
+)
 from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.positions import DECIMALS, axis, without_duplicates
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
-from flexroad.tasks.meshing.triangulate import Faces, constrained
+from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,
     SAME_M,
     border_heights,
     border_points,
+    border_sides,
     joined,
     on_border,
 )
+from flexroad.tasks.spline.moving import MovingNurbs
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
+
+if TYPE_CHECKING:
+    import shapely
 
 VERSION = 4
 
-DECIMALS = 6
-"""Decimals (of a metre) to which lattice offsets are rounded, so that 3 * 0.1 m equals 1 * 0.3 m."""
+PROBES = 2
+"""Probes of an adaptive mesh per ``road_m``: places where it is compared with the surface."""
 FEW = 0.1
 """Share of the points below which it takes longer to find the squares of a lattice than to do without."""
-SNAP_M = 1e-3
-"""The last line of a lattice is moved onto the border if it is closer to it than this (m)."""
 
 
 class Options(base.Options):
     """Where the surface is sampled."""
 
-    method: Literal["dynamic", "uniform", "corners"] = Field(
+    method: Literal["dynamic", "adaptive", "uniform", "corners"] = Field(
         "dynamic",
-        description="dynamic: fine on roads, coarse elsewhere; uniform: road_m everywhere; corners: a plane",
+        description="dynamic: fine on roads, coarse elsewhere; adaptive: fine where the surface bends; "
+        "uniform: road_m everywhere; corners: a plane",
     )
     road_m: float = Field(1.0, ge=0.05, description="spacing of samples on roads, the paper's s^r (m)")
     terrain_m: float = Field(10.0, ge=0.05, description="spacing of samples elsewhere, the paper's s^t (m)")
     mask: Literal["raw", "filtered"] = Field(
         "raw",
         description="road mask for sampling: raw: as segmented, M^r; filtered: as kept by ECSRC, M^{r+}",
+    )
+    tolerance_m: float = Field(
+        0.005, ge=0.0005, description="adaptive: largest distance of the mesh from the surface on roads (m)"
+    )
+    terrain_tolerance_m: float = Field(
+        0.2, ge=0.0005, description="adaptive: largest distance of the mesh from the surface elsewhere (m)"
     )
 
 
@@ -107,8 +128,17 @@ def sample(
         local = west, south, east, north
     if options.method == "dynamic":
         return _dynamic(surface, road, mask, local, options, frame)
+    if options.method == "adaptive":
+        if isinstance(surface, MovingNurbs):
+            raise TaskError("sample.method adaptive needs a surface over plan; use dynamic with plan: moving")
+        if isinstance(surface, SteppedSurface):
+            raise TaskError("sample.method adaptive has no edges at steps; use dynamic with fit.steps")
+        return _adaptive(surface, road, mask, local, options, frame)
     step = options.road_m if options.method == "uniform" else np.inf
     points, faces = _regular(surface, origin, local, step, frame)
+    if isinstance(surface, MovingNurbs):
+        points, _ = without_duplicates(_in_space(points, surface, origin))
+        faces = delaunay(points)
     inside = np.ones(len(faces), np.bool_)
     if options.method == "uniform":
         inside = ~road.outside[road.grid.cells(*(middles(points, faces) + origin).T)]
@@ -131,24 +161,12 @@ def _domain(road: RoadMask, frame: Frame | None) -> Bounds:
     return road.core.hull
 
 
-def _axis(start: float, stop: float, step: float, to_end: bool) -> Floats:
-    """Return ``start``, ``start + step``, ... up to ``stop``; ``to_end`` adds ``stop`` if it is missing."""
-    count = int(np.floor((stop - start + SNAP_M) / step))
-    axis = start + np.round(np.arange(1, count + 1) * step, DECIMALS)
-    axis = np.concatenate([[start], axis])
-    if stop - axis[-1] <= SNAP_M:
-        axis[-1] = stop
-    elif to_end:
-        axis = np.append(axis, stop)
-    return axis
-
-
 def _regular(
     surface: Surface, origin: tuple[float, float], local: Bounds, step: float, frame: Frame | None
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Return points of a full lattice and two faces per quad, cut from south-west to north-east."""
     west, south, east, north = local
-    x, y = _axis(west, east, step, to_end=True), _axis(south, north, step, to_end=True)
+    x, y = axis(west, east, step, to_end=True), axis(south, north, step, to_end=True)
     z = surface.lattice(x + origin[0], y + origin[1])
     points = np.stack([*np.broadcast_arrays(x, y[:, None]), z], axis=-1).reshape(-1, 3)
     if frame:
@@ -167,7 +185,11 @@ def _dynamic(
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
     limit, outline = _limit(road, local, frame), None
-    lines = [] if limit is None else [_divided(limit, road, mask, options)]
+    lines = [] if limit is None else [_divided(limit.lines, road, mask, options)]
+    breaks = None
+    if isinstance(surface, SteppedSurface):
+        breaks = breaklines(surface, local)
+        lines.append(_divided(breaks.lines, road, mask, options))
     if road.areas is not None and options.mask == "raw":
         outline = road_outline(road.areas, local, options.road_m)
         lines.append(outline.lines)
@@ -182,9 +204,13 @@ def _dynamic(
     if limit:
         free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
-    z = surface.height(*(plan + road.core.origin).T)
-    points, number = _without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
+    z = breaks.height(plan) if breaks else surface.height(*(plan + road.core.origin).T)
+    if isinstance(surface, MovingNurbs):
+        free, border = (_in_space(part, surface, road.core.origin) for part in (free, border))
+    points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
     known = {options.road_m: len(fine), options.terrain_m: len(coarse)}
+    if isinstance(surface, MovingNurbs):
+        known = {}
     lattices = [(local[:2], step) for step, count in known.items() if count > FEW * len(points)]
     faces = constrained(points, number[len(free) + len(border) + segments], lattices)
     if limit:
@@ -192,26 +218,53 @@ def _dynamic(
     return _mesh(points, faces, road, mask, outline)
 
 
-def _without_duplicates(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return points by northing, then easting, each place once, and the new numbers of the given ones."""
-    order = _by_northing(points)
-    ordered = points[order]
-    first = np.ones(len(points), bool)
-    first[1:] = (ordered[1:, :2] != ordered[:-1, :2]).any(axis=1)
-    number = np.empty(len(points), np.intp)
-    number[order] = np.cumsum(first) - 1
-    return ordered[first], number
+def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
+    """Return the points S(u, v) for the parameters of lattice points, without those at poles, ``(n, 3)``."""
+    places = surface.moved(*(points[:, :2] + origin).T)
+    moved = np.column_stack([*places, points[:, 2]])
+    moved[:, :2] += np.subtract(surface.origin, origin)
+    return moved[np.isfinite(moved).all(axis=1)]
 
 
-def _by_northing(points: Floats) -> NDArray[np.intp]:
-    """Return the order of points by northing, then easting."""
-    x, y = np.ascontiguousarray(points[:, :2].T)
-    # A stable sort of one number is fast, as the points come in a few ordered parts. Rounding makes it wrong
-    # where two points on nearly the same northing are nearly at the same place.
-    order = np.argsort(y * 2.0 ** np.ceil(np.log2(np.abs(x).max() + 1.0) + 1.0) + x, kind="stable")
-    x, y = x[order], y[order]
-    ordered = (y[:-1] < y[1:]) | ((y[:-1] == y[1:]) & (x[:-1] <= x[1:]))
-    return order if ordered.all() else np.lexsort((points[:, 0], points[:, 1]))
+def _outline(
+    road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
+) -> RoadOutline:
+    """Return the outline of roads: that of their polygons, else lines between road and other cells."""
+    core, raw = road.core, options.mask == "raw"
+    if road.areas is not None and raw:
+        return road_outline(road.areas, local, np.inf)
+    cells = mask[road.grid.window(core)]
+    if frame:
+        cells = frame.road(cells, raw)
+    corner = core.west - core.origin[0], core.north - core.origin[1]
+    between = survey_limit(~cells, corner, core.cell, local)
+    return RoadOutline(between.covered, parts_of(between.lines))
+
+
+def _adaptive(
+    surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
+) -> Mesh:
+    """Return the mesh of few points within the tolerances, with roads and the survey's limit as edges."""
+    limit, outline = _limit(road, local, frame), _outline(road, mask, local, options, frame)
+    lines = [outline.lines] if limit is None else [outline.lines, parts_of(limit.lines)]
+    tolerances = options.tolerance_m, options.terrain_tolerance_m
+    area = Area(road.core.origin, local, outline, limit, lines, options.road_m / PROBES, *tolerances)
+    if frame:
+        dense = [axis(0.0, local[i + 2] - local[i], area.step, to_end=True) for i in (0, 1)]
+        raw = options.mask == "raw"
+        crossed = raw and road.areas is not None
+        sides = border_sides(frame, local, road.core.cell, dense, raw, crossed, area.step / 2)
+    else:
+        sides = free_sides(area, ends_at_border(lines, local))
+    height = border_heights if frame else type(surface).height
+    border = []
+    for plan, needed, on_road in sides:
+        z = height(surface, *(plan + road.core.origin).T)
+        along = np.abs(plan - plan[0]).sum(axis=1)
+        kept = thinned(along, z, np.where(on_road, *tolerances), needed)
+        border.append(np.column_stack([plan, z])[kept])
+    points, faces = adaptive(surface, area, np.concatenate(border), SAME_M)
+    return _mesh(points, faces, road, mask, outline)
 
 
 def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | None:
@@ -225,19 +278,21 @@ def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | 
     return survey_limit(outside, (core.west - core.origin[0], core.north - core.origin[1]), core.cell, local)
 
 
-def _divided(limit: SurveyLimit, road: RoadMask, mask: Bools, options: Options) -> NDArray[np.object_]:
-    """Return the limit of the survey with points as dense as those of the ground beside it."""
+def _divided(
+    lines: shapely.MultiLineString, road: RoadMask, mask: Bools, options: Options
+) -> NDArray[np.object_]:
+    """Return lines with points as dense as those of the ground beside them."""
 
     def on_road(places: Floats) -> Bools:
         return np.asarray(mask[road.grid.cells(*(places + road.core.origin).T)])
 
-    return divided(limit.lines, options.road_m, options.terrain_m, on_road)
+    return divided(lines, options.road_m, options.terrain_m, on_road)
 
 
 def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step: float) -> Floats:
     """Return the points of a lattice whose nearest cell is in ``where``, ``(n, 3)``."""
     west, south, east, north = local
-    x, y = _axis(west, east, step, to_end=False), _axis(south, north, step, to_end=False)
+    x, y = axis(west, east, step, to_end=False), axis(south, north, step, to_end=False)
     eastings, northings = x + road.core.origin[0], y + road.core.origin[1]
     z = surface.lattice(eastings, northings)
     # A point on the line between two cells belongs to the eastern or southern one, independent of rounding.
@@ -253,7 +308,7 @@ def _border(
 ) -> Floats:  # fmt: skip
     """Return points along the four edges of the domain, with corners and ends of lines, ``(n, 3)``."""
     west, south, east, north = local
-    x, y = (_axis(*ends, options.terrain_m, to_end=True) for ends in ((west, east), (south, north)))
+    x, y = (axis(*ends, options.terrain_m, to_end=True) for ends in ((west, east), (south, north)))
     sides = [np.stack(np.broadcast_arrays(x, edge), axis=1) for edge in (south, north)]
     sides += [np.stack(np.broadcast_arrays(edge, y), axis=1) for edge in (west, east)]
     plan = np.concatenate(sides)
@@ -270,7 +325,7 @@ def _shared_border(surface: Surface, core: Grid, local: Bounds, options: Options
     """Return the border points of a tile that joins its neighbours, ``(n, 3)``."""
     lengths = local[2] - local[0], local[3] - local[1]
     fine, coarse = (
-        [_axis(0.0, length, step, to_end=True) for length in lengths]
+        [axis(0.0, length, step, to_end=True) for length in lengths]
         for step in (options.road_m, options.terrain_m)
     )
     plan = border_points(frame, local, core.cell, fine, coarse, options.mask == "raw", options.road_m / 4)

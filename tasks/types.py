@@ -61,6 +61,12 @@ class TileData:
     """The orthophoto, or None if the tile has none."""
     roads: Source | None = None
     """Roads as vectors, or None if the tile has none."""
+    road_height: Floats | None = None
+    """Height of hard surfaces without the bias of the highest point, ``(H, W)``, m; NaN where unknown. None
+    if roads are not fitted to it."""
+    offset_dsm: bool = False
+    """Whether roads are fitted to the DSM minus its height above the DTM on open road
+    (`tasks.roads.road_height`)."""
 
     def lacks_road(self, mask: Bools) -> bool:
         """Return whether no cell of the tile's core is road in a mask, ``(H, W)``."""
@@ -180,9 +186,9 @@ class Quality:
     """
 
     residual_median_m: float
-    """Median of surface minus DSM at the kept road cells: a vertical shift."""
+    """Median of surface minus the heights it was fitted to at the kept road cells: a vertical shift."""
     residual_nmad_m: float
-    """NMAD (spread) of surface minus DSM."""
+    """NMAD (spread) of that difference."""
     residual_p95_m: float
     """95th percentile of the absolute difference: cells that the surface does not follow."""
     curvature_per_m: float
@@ -197,6 +203,8 @@ class Quality:
     """Share of the road supported by neither."""
     dropped_road: float
     """Share of the mask that the filter dropped."""
+    dsm_excess_m: float
+    """Median height of the DSM above the heights that the road was fitted to; 0 if they are the DSM's."""
     off_dtm_m: float
     """Median of surface minus DTM."""
     off_dtm_road: float
@@ -204,10 +212,16 @@ class Quality:
     bounded_weights: float
     """Share of the weights at a bound; NaN unless the surface is a NURBS."""
     error_estimate_m: float
-    """Mean distance of the surface to the nearer of scan and DTM: an estimate of its error."""
+    """Mean estimated error of the surface, by `tasks.quality.estimate`."""
     suspect_m2: float
     """Area of the largest road patch whose distance to scan and DTM exceeds that of two heights of the same
     ground (m2); 0 if the road has none."""
+    holdout_squares: float
+    """Number of squares of road that a second fit did without; NaN if there was none."""
+    holdout_error_m: float
+    """Mean absolute difference of that fit and the heights of these squares."""
+    holdout_covered: float
+    """Share of these squares whose difference is within the 90% interval of the error estimate."""
     flags: tuple[str, ...]
     """Names of problems, from `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]

@@ -29,21 +29,21 @@ def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "re
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
-    catalog, _, first, second, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
+    catalog, _, first, second, literal, _, _, tables, figures = commands(tmp_path, "TILES=3", "SEED=5")
     assert catalog[:2] == ["catalog", "synthetic"]
     assert {"--preset", "gerod", "--tiles", "3", "--seed", "5"} <= set(catalog)
-    stores = [line[line.index("--store") + 1] for line in (first, second)]
-    assert stores[0] == stores[1]
-    assert ("ablation" in first, "ablation_true" in second) == (True, True)
-    outs = [line[line.index("--out") + 1] for line in (first, second)]
-    assert tables[:4] == ["tables", outs[0], "--true", outs[1]]
+    stores = [line[line.index("--store") + 1] for line in (first, second, literal)]
+    assert stores[0] == stores[1] == stores[2]
+    assert ("ablation" in first, "ablation_true" in second, "literal" in literal) == (True, True, True)
+    outs = [line[line.index("--out") + 1] for line in (first, second, literal)]
+    assert tables[:6] == ["tables", outs[0], "--true", outs[1], "--literal", outs[2]]
     assert figures[:2] == ["figures", outs[0]]
     assert tables[-2:] == figures[-2:]
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_reproduce_with_gerod_root_uses_real_tiles(tmp_path):
-    catalog, _, run, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
+    catalog, _, run, _, _, _, tables, _ = commands(tmp_path, "GEROD_ROOT=/data/gerod")
     assert catalog[:3] == ["catalog", "gerod", "/data/gerod"]
     assert "ablation" in run
     assert run[run.index("--allow") + 1] == "/data/gerod"

@@ -8,8 +8,10 @@ from typing import Any
 from rasterio.enums import ColorInterp
 
 from flexroad.catalog.grid import FARTHEST
+from flexroad.catalog.tile import ROAD_HEIGHT_BANDS
 
 AGAIN = "give it its georeference with gdal_translate -a_ullr"
+BANDS = tuple(name for name, _ in ROAD_HEIGHT_BANDS)
 
 
 def georeference_fault(dataset: Any) -> str | None:
@@ -31,9 +33,12 @@ def georeference_fault(dataset: Any) -> str | None:
 
 
 def heights_fault(dataset: Any) -> str | None:
-    """Return why an open raster has no heights, to follow its name; None if it has one band of numbers."""
+    """Return why an open raster has no heights, to follow its name; None if it has them.
+
+    They are its only band of numbers, or the first one if its bands are described as `ROAD_HEIGHT_BANDS`.
+    """
     kinds = [kind for kind in dataset.colorinterp if kind != ColorInterp.alpha]
-    if len(kinds) > 1:
+    if len(kinds) > 1 and dataset.descriptions[: len(BANDS)] != BANDS:
         bands = f"{len(kinds)} bands ({', '.join(kind.name for kind in kinds[:4])})"
         return f"has {bands}, but heights are one; keep theirs with gdal_translate -b 1"
     if ColorInterp.palette in kinds:

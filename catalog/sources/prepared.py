@@ -30,7 +30,7 @@ from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
-HEIGHTS = ("dsm", "dtm", "reference")
+HEIGHTS = ("dsm", "dtm", "road_height", "reference")
 MASKS = ("road_mask", "reference_road")
 PHOTO = "dop"
 SUPPORTED = (*HEIGHTS, *MASKS, PHOTO)
@@ -61,8 +61,9 @@ def write_tile(
     grid : Grid
         Grid of every layer but ``dop``.
     layers : mapping of str to (H, W) array
-        Arrays by layer name: heights (m) as ``dsm``, ``dtm`` and ``reference``, masks as ``road_mask`` and
-        ``reference_road``, red, green and blue (uint8) as ``dop``, ``(3, h, w)`` over the grid's bounds.
+        Arrays by layer name: heights (m) as ``dsm``, ``dtm``, ``road_height`` and ``reference``, masks as
+        ``road_mask`` and ``reference_road``, red, green and blue (uint8) as ``dop``, ``(3, h, w)`` over the
+        grid's bounds.
     stratum : str
         Class of area for reports.
     date : datetime, optional

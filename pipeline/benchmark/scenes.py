@@ -14,14 +14,12 @@ from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
+from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs
 from flexroad.tasks.io.vector_date import vector_date
 from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tasks.synthetic.orthophoto import orthophoto
 
-PARALLEL_FROM = 12
-"""Number of tiles from which worker processes are started."""
 PRESETS = ("gerod", "dsc3d")
 TILES, SIZE_M = 4, 250
 """Default number and side (m) of the tiles."""
@@ -79,10 +77,10 @@ def write_scenes(
     if preset == "dsc3d" and size_m in (None, dsc3d.SIZE_M):
         return write_stand_in(folder, tiles, seed)
     jobs = _jobs(folder, tiles, seed, size_m, dop, preset)
-    executor: Executor = DaskExecutor() if len(jobs) >= PARALLEL_FROM else SerialExecutor()
+    executor = AdaptiveExecutor(None, DaskExecutor(), lambda line: None)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for error in executor.map(_write_scene, jobs, _failure):
+        for error in executor.map(_write_scene, Jobs(iter(jobs), len(jobs)), _failure):
             if error:
                 raise ConfigError(error)
         path = folder / "catalog.parquet"

@@ -82,6 +82,7 @@ def catalog_rasters(
     dsm: Annotated[str, _files("Surface model: 'dsm/*.tif' in ROOT, or '/data/dsm/*.tif'.")],
     dtm: Annotated[str, _files("Terrain model.")],
     output: Output,
+    road_height: Annotated[str | None, _files("Unbiased heights of hard surfaces, for roads.")] = None,
     dop: Annotated[str | None, _files("Orthophoto.")] = None,
     road_mask: RoadMask = None,
     road_value: RoadValue = None,
@@ -118,6 +119,7 @@ def catalog_rasters(
     patterns = {
         "dsm": dsm,
         "dtm": dtm,
+        "road_height": road_height,
         "dop": dop,
         "road_mask": road_mask,
         "reference": reference,

@@ -41,6 +41,9 @@ for command in (init, run, rerun, status, clean, report, query, export, view, ta
 
 def main() -> None:
     """Run the command line; a user error is printed as one line, with exit code 2."""
+    # Rasterio loads boto3 where it is installed, for a tenth of the time of a short command. It uses it only
+    # for credentials, which GDAL reads by itself.
+    sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]
     try:
         app()
     except (CatalogError, ConfigError) as error:

@@ -93,6 +93,14 @@ def tables(
             rich_help_panel=options.INPUTS,
         ),
     ] = None,
+    literal: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="The same tiles, or some, run with --config literal: a second column.",
+            rich_help_panel=options.INPUTS,
+        ),
+    ] = None,
     allow: options.Allow = None,
 ) -> None:
     """Write the paper's tables and claims beside the values of a run.
@@ -102,7 +110,7 @@ def tables(
     from flexroad.pipeline.reproduce.tables import write_comparison
     from flexroad.pipeline.run.record import Run
 
-    folders = (true, dsc3d, dsc3d_true)
+    folders = (true, dsc3d, dsc3d_true, literal)
     runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
     for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
         echo(str(written))

@@ -19,7 +19,6 @@ from flexroad.pipeline.errors import ClusterLost, ConfigError
 if TYPE_CHECKING:
     from flexroad.catalog import Catalog, Tile
     from flexroad.catalog.storage.paths import Location
-    from flexroad.pipeline.config.cluster import Cluster
     from flexroad.pipeline.config.models import Config
     from flexroad.pipeline.execute import Executor
     from flexroad.pipeline.run.record import Run
@@ -131,7 +130,7 @@ def run(
             with _named(f"preparing {out}"):
                 opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
-            make_executor = partial(_executor, executor, died, workers, scheduler, chosen.cluster, dashboard)
+            make_executor = partial(_executor, executor, died, workers, scheduler, chosen, dashboard)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
     _exit(outcome)
 
@@ -186,8 +185,8 @@ def rerun(
                 opened = Run.open(location, allow or ())
                 check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
-            cluster = opened.config.cluster
-            make_executor = partial(_executor, executor, died, workers, scheduler, cluster, dashboard)
+            config = opened.config
+            make_executor = partial(_executor, executor, died, workers, scheduler, config, dashboard)
             _run_tiles(opened, make_executor, only, force, verify, outcome)
     _exit(outcome)
 
@@ -246,15 +245,25 @@ def _executor(
     died: bool,
     workers: int | None,
     scheduler: str | None,
-    cluster: Cluster,
+    config: Config,
     dashboard: bool,
     say: Callable[[str], None],
 ) -> Executor:
-    from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, SerialExecutor
+    from flexroad.pipeline.execute import AdaptiveExecutor, BatchExecutor, DaskExecutor, SerialExecutor
+    from flexroad.pipeline.graph.stages import in_batches
+
+    cluster = config.cluster
 
     if name == "serial":
         return SerialExecutor()
-    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say)
+    together = cluster.batch > 1 and any(in_batches(chain["fit"]) for chain in config.chains.values())
+    # Jobs of SLURM and pods are alike: one with a GPU beside others needs a scheduler of its own.
+    gpu = together and (cluster.kind == "local" or scheduler is not None)
+    parallel: Executor = DaskExecutor(workers, scheduler, cluster, dashboard, say, gpu)
+    if gpu:
+        from flexroad.pipeline.worker.batch import fit_together, prepare
+
+        parallel = BatchExecutor(parallel, prepare, partial(fit_together, cluster), cluster.batch)
     if name == "dask" or died or scheduler or dashboard or cluster.needs_workers:
         return parallel
     return AdaptiveExecutor(workers or cluster.workers, parallel, say)

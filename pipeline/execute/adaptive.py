@@ -1,10 +1,13 @@
 """The adaptive executor: jobs run in this process as long as worker processes would not pay for their start.
 
-With ``n`` jobs left of ``t`` seconds each, ``w`` workers save ``n * t * (1 - 1 / w)`` seconds. They are
-started if that is more than `MARGIN` times their start, or if there are more than `MANY` jobs: then a job
-that ends or blocks its process must not end or block the run. ``t`` is the median time in an earlier run,
-and from the second job on the mean time here. On a machine with other work to do, the start takes longer by
-the same factor as the jobs: their wall time over their CPU time.
+``n`` jobs left of ``t`` seconds each take ``n * t`` seconds here and ``START_S + n * t / w`` seconds on ``w``
+workers. Workers are started if they save more than a margin times their start, or if there are more than
+`MANY` jobs: then a job that ends or blocks its process must not end or block the run. Each job done here
+refines ``t``, and workers that were started stay.
+
+All times are CPU times: other programs on the machine delay jobs here and the start of workers alike, so
+that wall times would say nothing about which of both is less. Before jobs were measured, ``t`` is their
+median time in an earlier run.
 """
 
 from __future__ import annotations
@@ -18,10 +21,15 @@ from typing import Generic
 from flexroad.catalog.text import count
 from flexroad.pipeline.execute.executor import Executor, J, R
 
-START_S = 4.0
-"""Time until new workers do their first job (s): their start, imports and compiled code, on idle cores."""
-MARGIN = 3.0
-"""How many times their start workers must save: times of jobs are estimates."""
+START_S = 12.0
+"""CPU time per core of the start of workers (s): processes, imports, compiled code. Measured: runs of 48
+tiles took 25 s more with two workers than with none."""
+MARGIN = 1.25
+"""How many times their start workers must save if `ENOUGH` jobs were measured."""
+UNSURE_MARGIN = 3.0
+"""The same before: a time of fewer jobs, or of an earlier run, may be wrong by a factor."""
+ENOUGH = 4
+"""Number of measured jobs whose mean time is reliable."""
 MANY = 200
 """Largest number of jobs for which workers may be left out."""
 
@@ -41,27 +49,42 @@ class Jobs(Generic[J]):
         return self.source
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """The estimated time of one more job."""
+
+    job_s: float | None
+    """CPU time (s), None if unknown."""
+    sure: bool = False
+    """Whether `ENOUGH` jobs were measured."""
+
+
 class Pace:
-    """The time of the jobs done in this process. The first one also loads libraries, so it is not counted."""
+    """CPU times of the jobs done in this process.
+
+    The first job also loads libraries, so it is not counted. A later one may load what the first did not
+    need, so the longest is not counted either: one job alone never decides.
+    """
 
     def __init__(self, job_s: float | None) -> None:
-        self.job_s = job_s
-        """Estimated time of one more job (s), None if unknown."""
-        self.slowdown = 1.0
-        """Wall time over CPU time."""
+        self.known_s = job_s
+        """Median time in an earlier run (s), None if there was none."""
         self.times: list[float] = []
-        self.cpu_s = 0.0
+        """CPU times (s), in the order of the jobs."""
 
     def run(self, function: Callable[[J], R], job: J) -> R:
         """Do a job and measure it."""
-        wall, cpu = time.perf_counter(), time.process_time()
+        start = time.process_time()
         result = function(job)
-        self.times.append(time.perf_counter() - wall)
-        self.cpu_s += time.process_time() - cpu
-        self.slowdown = max(1.0, sum(self.times) / max(self.cpu_s, 1e-3))
-        if len(self.times) > 1:
-            self.job_s = sum(self.times[1:]) / (len(self.times) - 1)
+        self.times.append(time.process_time() - start)
         return result
+
+    def estimate(self) -> Estimate:
+        """Return the mean time of the jobs that count, or the known time before there are any."""
+        measured = sorted(self.times[1:])
+        if len(measured) < 2:
+            return Estimate(self.known_s)
+        return Estimate(sum(measured[:-1]) / (len(measured) - 1), len(measured) >= ENOUGH)
 
 
 def workers_of(asked: int | None) -> int:
@@ -70,22 +93,28 @@ def workers_of(asked: int | None) -> int:
     return min(asked or cores, cores)
 
 
-def workers_pay(number: int, job_s: float | None, workers: int, slowdown: float = 1.0) -> bool:
-    """Return whether ``workers`` processes are worth their start for ``number`` jobs of ``job_s`` seconds."""
+def workers_pay(number: int, estimate: Estimate, workers: int) -> bool:
+    """Return whether ``workers`` processes are worth their start for ``number`` jobs."""
     if number > MANY:
         return True
-    return job_s is not None and number * job_s * (1 - 1 / workers) > MARGIN * START_S * slowdown
+    if estimate.job_s is None:
+        return False
+    saved_s = number * estimate.job_s * (1 - 1 / workers)
+    return saved_s > (MARGIN if estimate.sure else UNSURE_MARGIN) * START_S
 
 
-def decision(number: int, job_s: float | None, workers: int, slowdown: float = 1.0) -> str:
+def decision(number: int, estimate: Estimate, workers: int) -> str:
     """Return one line on where ``number`` jobs run, and why."""
+    job_s = estimate.job_s
     what = count(number, "tile") + (f" of about {job_s:.2g} s" if job_s is not None else "")
     if number > MANY:
         return f"worker processes: {what}"
-    if workers_pay(number, job_s, workers, slowdown):
-        return f"worker processes: {what}; {workers} of them save more than {MARGIN:g} times their start"
+    if workers_pay(number, estimate, workers):
+        return (
+            f"worker processes: {what}; {workers} of them save more than their start of about {START_S:g} s"
+        )
     if job_s is None:
-        return f"no worker processes yet: {what}, the first two show whether workers pay"
+        return f"no worker processes yet: {what}, the first ones show whether workers pay"
     return f"no worker processes: {what}, less work than the start of {workers}"
 
 
@@ -122,7 +151,7 @@ class AdaptiveExecutor:
             return
         rest, left, pace = iter(jobs), jobs.number, Pace(jobs.job_s)
         self._tell(jobs, left, pace)
-        while not workers_pay(left, pace.job_s, self.workers, pace.slowdown):
+        while not workers_pay(left, pace.estimate(), self.workers):
             if left == 0:
                 return
             left -= 1
@@ -132,6 +161,6 @@ class AdaptiveExecutor:
         yield from self.parallel.map(function, rest, lost, probe)
 
     def _tell(self, jobs: Jobs[J], left: int, pace: Pace) -> None:
-        line = decision(left, pace.job_s, self.workers, pace.slowdown)
+        line = decision(left, pace.estimate(), self.workers)
         jobs.log(line)
         self.say(line)

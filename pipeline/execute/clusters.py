@@ -8,15 +8,17 @@ import logging
 import shutil
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from typing import Any
 
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute.batches import GPU
 
 SETTINGS = {
     "distributed.worker.memory.target": False,
@@ -24,11 +26,14 @@ SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
     "distributed.worker.profile.enabled": False,
+    "distributed.admin.log-length": 1000,
+    "distributed.admin.system-monitor.log-length": 240,
     "distributed.nanny.pre-spawn-environ": ONE_THREAD,
 }
 """Dask settings of all workers. Dask's defaults suit data frames that are kept in workers. A tile leaves
 nothing that could be spilled to disk, and a paused worker would wait forever for its only tile to free
-memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time. Dask also
+memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time. The logs of
+scheduler and monitor are shorter than by default: they grew for the first hour of a run. Dask also
 makes workers return every freed array to the system at once (MALLOC_TRIM_THRESHOLD_), which costs 15% of a
 tile's time in page faults: it is left out of their environment."""
 DEFAULT_MEMORY_BYTES = 4 * 1024**3
@@ -60,9 +65,11 @@ class ClusterTarget:
 
 @contextlib.contextmanager
 def open_cluster(
-    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
+    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool, gpu: bool = False
 ) -> Iterator[ClusterTarget]:
     """Connect to, start or request a cluster; on exit, stop it if it was started here.
+
+    With ``gpu`` one of the workers of this machine declares the resource GPU.
 
     Raises
     ------
@@ -76,7 +83,9 @@ def open_cluster(
         cluster = cluster.model_copy(update={"workers": workers})
     import dask
 
-    make = {"local": local, "slurm": slurm, "kubernetes": kubernetes}[cluster.kind]
+    makers: dict[str, Callable[[Cluster, str, bool], Any]]
+    makers = {"local": partial(local, gpu=gpu), "slurm": slurm, "kubernetes": kubernetes}
+    make = makers[cluster.kind]
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
         stack.enter_context(dask.config.set(settings(cluster)))
@@ -93,8 +102,8 @@ def settings(cluster: Cluster) -> dict[str, Any]:
     return SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
 
 
-def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return a cluster of single-threaded processes on this machine.
+def local(cluster: Cluster, scratch: str, dashboard: bool, gpu: bool = False) -> Any:
+    """Return a cluster of single-threaded processes on this machine; with ``gpu`` one declares a GPU.
 
     Raises
     ------
@@ -109,8 +118,8 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
     # Dask's count respects the limits of a container.
     workers = cluster.workers or CPU_COUNT
     try:
-        return LocalCluster(
-            n_workers=workers,
+        opened = LocalCluster(
+            n_workers=1 if gpu else workers,
             threads_per_worker=1,
             processes=True,
             memory_limit=cluster.memory or available_bytes() // workers,
@@ -119,7 +128,14 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
             local_directory=scratch,
             env=ONE_THREAD,
             silence_logs=logging.CRITICAL,
+            resources=GPU if gpu else None,
         )
+        if gpu:
+            # Further workers do not declare the GPU.
+            plain = opened.new_spec["options"] | {"resources": None}
+            opened.new_spec = opened.new_spec | {"options": plain}
+            opened.scale(workers)
+        return opened
     except (OSError, RuntimeError) as error:
         raise ConfigError(
             f"cannot start {workers} worker processes here: {_one_line(error).rstrip('.')}; use fewer "

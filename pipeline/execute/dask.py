@@ -39,6 +39,8 @@ class DaskExecutor:
         Serve Dask's dashboard; its address is passed to ``say``.
     say : callable
         Prints one line for the user: the address of the dashboard, a wait for workers.
+    gpu : bool
+        Whether jobs need the resource GPU; one of the local workers declares it.
     """
 
     def __init__(
@@ -48,17 +50,19 @@ class DaskExecutor:
         cluster: Cluster = LOCAL,
         dashboard: bool = False,
         say: Callable[[str], None] = lambda line: None,
+        gpu: bool = False,
     ) -> None:
         self.workers = workers
         self.scheduler = scheduler
         self.cluster = cluster
         self.dashboard = dashboard
         self.say = say
+        self.gpu = gpu
 
     def map(
         self,
         function: Callable[[J], R],
-        jobs: Iterable[J],
+        jobs: Iterable[J | None],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
@@ -68,13 +72,18 @@ class DaskExecutor:
         if not first:
             # Without jobs no cluster is started.
             return
-        from flexroad.pipeline.execute.session import Session
+        from flexroad.pipeline.execute.session import Session, declared
 
         with (
             _quiet(),
-            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as target,
+            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard, self.gpu) as target,
             self._connected(target) as client,
         ):
+            if self.gpu and "GPU" not in declared(client):
+                raise ConfigError(
+                    f"{target.name} has no worker with the resource GPU; start one (`dask worker ADDRESS "
+                    "--nthreads 1 --resources GPU=1`), or set cluster.batch to 1"
+                )
             check = _check_workers(client, target, probe)
             session = Session(
                 client,

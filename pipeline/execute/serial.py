@@ -13,10 +13,11 @@ class SerialExecutor:
     def map(
         self,
         function: Callable[[J], R],
-        jobs: Iterable[J],
+        jobs: Iterable[J | None],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
         """Yield results in the order of the jobs; ``probe`` is not called, the caller has done so here."""
         for job in jobs:
-            yield function(job)
+            if job is not None:
+                yield function(job)

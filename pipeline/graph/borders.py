@@ -26,6 +26,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.stages import stage_function, stage_module
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.load import READS, load_border
+from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
@@ -53,14 +54,21 @@ class BorderStages:
     segment: Options
     ecsrc: Options
     fit: Options
-    halo_m: float = 0.0
-    """The halo of the tiles (m): if it sees the far side of a void, so must the corner or edge."""
+    load: LoadOptions
+    """The heights that roads are fitted to, and the halo of the tiles: if it sees the far side of a void, so
+    must the corner or edge."""
 
     @classmethod
     def of(cls, chain: Chain) -> BorderStages:
         """Return those of a variant."""
-        halo_m: float = getattr(chain["load"], "halo_m", 0.0)
-        return cls(chain["segment"], chain["ecsrc"], chain["fit"], halo_m)
+        load = chain["load"]
+        assert isinstance(load, LoadOptions)
+        return cls(chain["segment"], chain["ecsrc"], chain["fit"], load)
+
+    @property
+    def heights(self) -> list[Any]:
+        """The options of `load` that its ground depends on, as they enter fingerprints."""
+        return [self.load.road_height, self.load.offset_undeclared]
 
     @property
     def by_name(self) -> dict[str, Options]:
@@ -78,7 +86,7 @@ class BorderStages:
         context_m: float = getattr(stage_module(self.segment), "CONTEXT_M", 0.0)
         fit: Any = stage_module(self.fit)
         acting_m: float = fit.acting_m(self.fit)
-        return min(max(AROUND_M, self.halo_m, acting_m) + context_m, REACH_M)
+        return min(max(AROUND_M, self.load.halo_m, acting_m) + context_m, REACH_M)
 
     def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of a corner, or of an edge between its two ends.
@@ -123,6 +131,8 @@ def _cut(data: TileData, grid: Grid) -> TileData:
         core=grid,
         dsm=data.dsm[part],
         dtm=data.dtm[part],
+        road_height=None if data.road_height is None else data.road_height[part],
+        offset_dsm=data.offset_dsm,
         road_mask=None if data.road_mask is None else data.road_mask[part],
     )
 
@@ -142,7 +152,8 @@ class BorderTask:
 
     def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of the corner, or of the edge between its two ends."""
-        return self.stages.part(self.border, load_border(self.ground(tile), tile.grid), ends)
+        data = load_border(self.ground(tile), tile.grid, self.stages.load)
+        return self.stages.part(self.border, data, ends)
 
 
 def check_tiles(config: Config, catalog: Catalog) -> None:

@@ -57,6 +57,8 @@ class Node:
     """Fingerprints of the corners and edges that it takes as well, in the order of `Frame`'s fields."""
     border: BorderTask | None = None
     """Its computation if it is a corner or edge; ``options`` are then those of the fit."""
+    refit: Options | None = None
+    """The options of the fit if `assess` withholds a part of the road from a second one."""
 
     @property
     def function(self) -> Callable[..., Any]:
@@ -128,6 +130,8 @@ class Step:
     """The stages of the border that it takes, None if it takes none."""
     framed: int | None = None
     """Index of the step whose frame it takes, None if it takes none."""
+    refit: Options | None = None
+    """See `Node.refit`."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +206,7 @@ class Pattern:
             layers = ",".join(text for layer, text in texts if layer in step.reads)
             name = hashed(f"[{step.head},{hashed_inputs},[{layers}],{sources.models(step.files)}]")
             names.append(name)
-            nodes[name] = Node(name, step.stage, step.options, inputs, step.stored, frame)
+            nodes[name] = Node(name, step.stage, step.options, inputs, step.stored, frame, refit=step.refit)
         variants = {
             variant: {stage: names[number] for stage, number in numbers.items()}
             for variant, numbers in self.variants.items()
@@ -237,9 +241,12 @@ def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) 
     head = to_json(_head(stage.name, options))[1:-1]
     shared = has_borders(chain["fit"])
     borders = BorderStages.of(chain) if shared and stage.name == "fit" else None
-    # The mesh of a tile takes the frame of its surface, the first of its inputs.
-    framed = inputs[0] if shared and stage.name == "sample" else None
-    return Step(stage.name, options, head, inputs, reads, model_files(options), stored, borders, framed)
+    # A second fit and the mesh of a tile take the frame of its surface.
+    refit = chain["fit"] if getattr(options, "holdout", 0) else None
+    framed = inputs[stage.inputs.index("fit")] if shared and (refit or stage.name == "sample") else None
+    return Step(
+        stage.name, options, head, inputs, reads, model_files(options), stored, borders, framed, refit
+    )
 
 
 def _head(stage: str, options: Options) -> list[Any]:
@@ -250,7 +257,8 @@ def _border_nodes(tile: Tile, step: Step, sources: SourceFiles) -> list[Node]:
     """Return the nodes of a tile's corners and edges, in the order of `Frame`'s fields."""
     assert step.borders
     chain = step.borders.by_name
-    head = to_json([STAGE, load.VERSION, [_head(stage, options) for stage, options in chain.items()]])[1:-1]
+    stages = [_head(stage, options) for stage, options in chain.items()]
+    head = to_json([STAGE, load.VERSION, step.borders.heights, stages])[1:-1]
     models = sources.models([file for options in chain.values() for file in model_files(options)])
     nodes: list[Node] = []
     for number, border in enumerate(border_of(tile.grid, step.borders.reach_m)):

@@ -136,7 +136,9 @@ def _rasterise_block(job: BlockJob) -> BlockJob:
     reach = reach_m(job.options, job.grid.cell)
     points = job.buckets.read(job.grid, reach, with_colours=job.dop_cell is not None)
     rasters = rasterise(points, job.grid, job.options, job.dop_cell)
+    top = rasters.top
     layers = {"dsm": rasters.dsm, "dtm": rasters.dtm}
+    layers["road_height"] = np.stack([top.height, top.count, top.spread])
     if rasters.bridges is not None:
         layers["bridges"] = rasters.bridges
     arrays: dict[str, NDArray[Any]] = {name: heights.astype(np.float32) for name, heights in layers.items()}
@@ -153,7 +155,7 @@ def _fail(job: BlockJob, reason: str) -> BlockJob:
 
 def _write_block(writer: RasterWriter, job: BlockJob) -> None:
     with np.load(job.target) as rasters:
-        for layer in ("dsm", "dtm", "bridges", GROUND):
+        for layer in ("dsm", "dtm", "road_height", "bridges", GROUND):
             if layer in rasters:
                 writer.write(layer, job.grid, rasters[layer])
         if "colour" in rasters and job.dop_cell:

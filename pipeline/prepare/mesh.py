@@ -164,6 +164,7 @@ def _tags(name: str, mesh_options: MeshOptions, options: to_rasters.Options) -> 
     tags = {
         "SOURCE": f"{name}; {mesh_options.density:g} points per m2 of surface, seed {mesh_options.seed}",
         "DSM": by_layer["DSM"],
+        "ROAD_HEIGHT": by_layer["ROAD_HEIGHT"],
         "DTM": by_layer["DTM"] + ("; refined by ECSRC" if mesh_options.refine else ""),
     }
     if mesh_options.dop:

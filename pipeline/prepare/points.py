@@ -30,7 +30,6 @@ from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWrite
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, reach_m, tags
 
-AHN = BRIDGE_CLASSES["ahn"]
 Ground = Literal["auto", "classes", "filter"]
 MIN_GROUND = 0.01
 """A file with a smaller share of ground points is taken as not classified."""
@@ -202,14 +201,19 @@ def _classes(classes: Collection[int]) -> str:
 
 
 def _other_bridges(bucketed: BucketedPoints, options: Options) -> tuple[str, ...]:
-    """Return a note on points of a class that is one of bridges in another scheme."""
-    number = int(sum(kinds[list(AHN)].sum() for kinds in bucketed.kinds))
-    if not number or set(AHN) & {*options.bridge_classes, *options.ground_classes}:
-        return ()
-    return (
-        f"{number:,} points of {_classes(AHN)}, bridges and other structures in the Dutch AHN, are not used "
-        "as bridges; --class-scheme ahn does so",
-    )
+    """Return notes on points of classes that are bridges in another scheme."""
+    meanings = {
+        "asprs": "bridge decks by the standard of LAS, are not used; --bridge-class",
+        "ahn": "bridges and other structures in the Dutch AHN, are not used as bridges; "
+        "--class-scheme ahn does so, or --bridge-class",
+    }
+    notes = []
+    for scheme, meaning in meanings.items():
+        (number,) = BRIDGE_CLASSES[scheme]
+        points = int(sum(kinds[number] for kinds in bucketed.kinds))
+        if points and number not in {*options.bridge_classes, *options.ground_classes}:
+            notes.append(f"{points:,} points of class {number}, {meaning} {number} takes them")
+    return tuple(notes)
 
 
 def _left_out(bucketed: BucketedPoints, colourless: Sequence[str]) -> tuple[str, ...]:

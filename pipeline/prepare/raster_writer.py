@@ -30,7 +30,7 @@ from flexroad.catalog.crs import compound
 from flexroad.catalog.headers.rasters import opened, some, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.storage.outputs import output_file
-from flexroad.catalog.tile import HEIGHTS
+from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.types import Orthophoto
@@ -42,6 +42,7 @@ BLOCK = 256
 """Side of the internal tiles of the temporary GeoTIFFs (cells)."""
 CATALOG = "catalog.parquet"
 HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
+ROAD_HEIGHT_PROFILE = {**HEIGHT_PROFILE, "count": len(ROAD_HEIGHT_BANDS)}
 MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
 PHOTO_PROFILE = {"dtype": "uint8", "nodata": None, "count": 3, "photometric": "RGB", "interleave": "pixel"}
 
@@ -130,6 +131,8 @@ class RasterWriter:
     def write(self, layer: str, part: Grid, values: NDArray[Any]) -> None:
         """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
 
+        Of ``road_height`` it has all bands, ``(3, H, W)``.
+
         Raises
         ------
         ConfigError
@@ -139,9 +142,10 @@ class RasterWriter:
         """
         heights = layer in HEIGHTS
         with self._writing(layer):
-            raster = self._raster(layer, self.grid, HEIGHT_PROFILE if heights else MASK_PROFILE)
+            raster = self._raster(layer, self.grid, _profile(layer))
             cells = values.astype(np.float32 if heights else np.uint8)
-            raster.write(cells, 1, window=_window(self.grid, part))
+            bands = cells if cells.ndim > 2 else cells[None]
+            raster.write(bands, window=_window(self.grid, part))
 
     def write_photo(self, photo: Orthophoto) -> None:
         """Write a window of the orthophoto; pixels without a colour are masked.
@@ -279,6 +283,8 @@ class RasterWriter:
                 **profile,
             )
             raster.update_tags(**self.tags, LAYER=layer)
+            if layer == "road_height":
+                raster.descriptions, raster.units = zip(*ROAD_HEIGHT_BANDS, strict=True)
             self._open[layer] = raster
         return self._open[layer]
 
@@ -292,6 +298,12 @@ class RasterWriter:
             raise ConfigError(
                 f"cannot write {self.out / layer}.tif: {reason}; free disk space and repeat"
             ) from error
+
+
+def _profile(layer: str) -> Mapping[str, Any]:
+    if layer == "road_height":
+        return ROAD_HEIGHT_PROFILE
+    return HEIGHT_PROFILE if layer in HEIGHTS else MASK_PROFILE
 
 
 def _to_cog(source: Path, target: Path, layer: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pandas as pd
 import yaml
@@ -10,7 +10,7 @@ import yaml
 from flexroad.catalog.storage.paths import exists
 from flexroad.catalog.text import count
 from flexroad.pipeline.report.meshes import mesh_checks
-from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
+from flexroad.pipeline.report.quality import held_out, highest_error_estimates, over_tiles
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
@@ -84,6 +84,8 @@ class Content:
     """Ids of the finished tiles, in the order of the catalog."""
     running: bool = False
     """Whether another process is computing tiles of the run."""
+    held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """Second fits beside the squares withheld from them, per variant; empty if nothing was withheld."""
 
 
 def gather(run: Run, track: Track = untracked) -> Content:
@@ -118,6 +120,7 @@ def gather(run: Run, track: Track = untracked) -> Content:
         strata=_per_stratum(done, variants),
         worst=_worst(done, exported),
         quality=over_tiles(done, variants),
+        held_out=held_out(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
         meshes=mesh_checks(rows, run.config.chains),
         steps=edge_steps(run, track=track),

@@ -83,6 +83,7 @@ def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Worst tiles by road L2", content.worst, ""),
         (WORST_ESTIMATES, content.worst_estimates, quality.MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
+        ("Error estimates at withheld squares", content.held_out, quality.HOLDOUT),
         ("Meshes", content.meshes, meshes.MEANING),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
         ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),

@@ -19,7 +19,8 @@ from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.quality.assess import Options, compare
+from flexroad.tasks.quality.assess import Options
+from flexroad.tasks.quality.compared import compare
 from flexroad.tasks.quality.places import places
 from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface, TileData
 
@@ -95,7 +96,7 @@ def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
     truth = (data.dtm if data.reference is None else data.reference)[window]
     against = "DTM" if data.reference is None else "reference"
     options = Options.model_validate(graph.nodes[nodes["assess"]].options.model_dump())
-    cells = compare(data, road, clusters, surface, options)
+    cells = compare(data, road, clusters, surface, options.agree_m)
     at = {flag: place for flag, place in places(cells, core, options).items() if flag in quality.flags}
     return TilePictures(
         graph.tile.id,

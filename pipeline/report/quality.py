@@ -19,11 +19,12 @@ FIGURES = {
 SUPPORT = {"measured_road": "measured (%)", "dtm_road": "DTM (%)", "inferred_road": "inferred (%)"}
 """Shares of the road by the support of the surface."""
 MEANING = (
-    "The error estimate is the mean vertical distance of the surface to the nearer of two sources, over the "
-    "cells of the raw road mask: the DSM where the filter kept it, but at least its local scatter, and the "
-    "DTM where it supports the surface. It estimates the road L2; errors common to DSM and DTM are not "
-    "detected. Flags are set by the thresholds of `assess`; docs/quality.md explains each flag."
+    "The error estimate follows from what the surface leaves of the heights that it was fitted to, around "
+    "each cell of the raw road mask, and from the scatter of the DSM that the filter kept. It estimates the "
+    "road L2; errors common to DSM and DTM are not detected. Flags are set by the thresholds of `assess`; "
+    "docs/quality.md explains each flag."
 )
+HOLDOUT = "A second fit did without these squares of road (`assess.holdout`); 90% intervals hold 90% of them."
 
 
 def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
@@ -37,6 +38,25 @@ def over_tiles(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
     flagged = (~done["flags"].fillna("").isin(["", NO_ROAD])).groupby(done.variant).sum()
     table = _labelled(table)
     table.insert(0, "flagged tiles", flagged.reindex(variants))
+    return table.reset_index().rename(columns={"variant": "method"})
+
+
+def held_out(done: pd.DataFrame, variants: list[str]) -> pd.DataFrame:
+    """Return how well a second fit and its intervals meet the squares withheld from it; empty without any."""
+    counted = done[done["holdout_squares"].fillna(0) > 0]
+    if counted.empty:
+        return pd.DataFrame()
+    squares = counted["holdout_squares"]
+    sums = pd.DataFrame(
+        {
+            "withheld squares": squares,
+            "mean difference (m)": counted["holdout_error_m"] * squares,
+            "within the 90% interval (%)": 100 * counted["holdout_covered"] * squares,
+        }
+    )
+    table = sums.groupby(counted["variant"]).sum().reindex(variants).dropna()
+    table.iloc[:, 1:] = table.iloc[:, 1:].div(table["withheld squares"], axis=0)
+    table["withheld squares"] = table["withheld squares"].astype(int)
     return table.reset_index().rename(columns={"variant": "method"})
 
 

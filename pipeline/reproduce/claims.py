@@ -8,10 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexroad.pipeline.reproduce.bootstrap import Means, interval
+from flexroad.pipeline.reproduce.bootstrap import LEVEL, Means, interval
 from flexroad.pipeline.reproduce.published import BASE, DSC3D, GEROD, published
+from flexroad.tasks.types import Floats
 
-HELD, WEAKER, STRONGER, NOT_HELD, NOT_TESTED = "held", "weaker", "stronger", "not held", "not tested"
+HELD, WEAKER, STRONGER, NOT_HELD = "held", "weaker", "stronger", "not held"
+NOT_DECIDED, NOT_TESTED = "not decided", "not tested"
 REACH = 2.0
 """A change is stronger if its log ratio is more than `REACH` times the paper's, weaker below 1 / `REACH`."""
 
@@ -85,6 +87,15 @@ CLAIMS: tuple[Claim, ...] = (
     Change(
         "DSC3D: roads are 94% smoother than RGT's", RESULTS, MAD_ROAD, BASE, -94, base="rgt", dataset=DSC3D
     ),
+    Change(
+        "DSC3D: triangles are 11% fewer than RGT's (40K, 45K)",
+        RESULTS,
+        T,
+        BASE,
+        -11,
+        base="rgt",
+        dataset=DSC3D,
+    ),
     Change("w/o ECSRC, road L2 rises by 111%", ABLATION, ROAD, "wo_ecsrc", 111),
     Change("w/o ECSRC, road MAD rises by 135%", ABLATION, MAD_ROAD, "wo_ecsrc", 135),
     Change("w/o DTM support, terrain L2 rises by 786%", ABLATION, TERRAIN, "wo_dtm", 786),
@@ -95,6 +106,13 @@ CLAIMS: tuple[Claim, ...] = (
         "Dynamic sampling keeps the road's accuracy (within 5%)",
         ABLATION,
         ROAD,
+        (BASE, "wo_dynamic"),
+        slack=0.05,
+    ),
+    Order(
+        "Dynamic sampling keeps the terrain's accuracy (within 5%)",
+        ABLATION,
+        TERRAIN,
         (BASE, "wo_dynamic"),
         slack=0.05,
     ),
@@ -146,7 +164,7 @@ class Verdict:
     ours: str
     """The run's figures; "–" if not tested."""
     certainty: str
-    """Interval of the change, or share of resamples in which the order holds."""
+    """Share of resamples with the order; or interval of the change, and share with the means' verdict."""
     verdict: str
 
 
@@ -155,7 +173,8 @@ def check(claim: Claim, means: Means, dataset: str = GEROD) -> Verdict:
 
     An order holds if the means over tiles are in that order. A change holds if it has the paper's sign and
     the logarithm of its ratio is between half and twice that of the paper's tables; below that range it is
-    weaker, above it stronger.
+    weaker, above it stronger. Whatever the verdict, it is "not decided" if fewer than `LEVEL` percent of the
+    resamples give it.
 
     Parameters
     ----------
@@ -196,25 +215,41 @@ def _check_order(claim: Order, paper: list[float], means: Means) -> Verdict:
         _ordered(claim.figure, paper),
         _ordered(claim.figure, ours),
         f"{100 * share:.0f}% of resamples",
-        HELD if holds else NOT_HELD,
+        _if_certain(HELD if holds else NOT_HELD, share if holds else 1 - share),
     )
 
 
 def _check_change(claim: Change, paper: float, means: Means) -> Verdict:
     ratio, resampled = means.ratio(claim.variant, claim.base, claim.figure)
     low, high = interval(resampled)
-    certainty = f"{percent(low)} to {percent(high)}"
-    return Verdict(claim, percent(paper), percent(ratio), certainty, _verdict(ratio, paper))
+    verdict = strength(ratio, paper)
+    share = _share(verdict, paper, resampled)
+    certainty = f"{percent(low)} to {percent(high)}, {100 * share:.0f}% of resamples"
+    return Verdict(claim, percent(paper), percent(ratio), certainty, _if_certain(verdict, share))
 
 
-def _verdict(ratio: float, paper: float) -> str:
-    """Return the verdict on a change from our ratio and the paper's."""
+def strength(ratio: float, paper: float) -> str:
+    """Return how our ratio compares with the paper's: held, weaker, stronger, not held or not tested."""
     if not (math.isfinite(ratio) and ratio > 0):
         return NOT_TESTED
     relative = math.log(ratio) / math.log(paper)
     if relative <= 0:
         return NOT_HELD
     return STRONGER if relative > REACH else WEAKER if relative < 1 / REACH else HELD
+
+
+def decided(verdict: str, paper: float, resampled: Floats) -> bool:
+    """Return whether enough resampled ratios give the same verdict."""
+    return _if_certain(verdict, _share(verdict, paper, resampled)) == verdict
+
+
+def _share(verdict: str, paper: float, resampled: Floats) -> float:
+    """Return the share of resampled ratios with this verdict."""
+    return float(np.mean([strength(float(ratio), paper) == verdict for ratio in resampled]))
+
+
+def _if_certain(verdict: str, share: float) -> str:
+    return verdict if verdict == NOT_TESTED or 100 * share >= LEVEL else NOT_DECIDED
 
 
 def _paper(claim: Claim, variant: str) -> float:

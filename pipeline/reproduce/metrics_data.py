@@ -16,7 +16,7 @@ from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.tables import frame_of, read_metrics
 
-FILE, DSC3D_FILE = "metrics.parquet", "metrics_dsc3d.parquet"
+FILE, DSC3D_FILE, LITERAL_FILE = "metrics.parquet", "metrics_dsc3d.parquet", "metrics_literal.parquet"
 KEYS = ["dataset", "classes", "tile_id", "stratum", "variant"]
 FIGURE_DTYPE: Final = "float32"
 """Type of the stored figures. Pages are made from these values: the stored files reproduce them exactly."""
@@ -33,6 +33,8 @@ class MetricsData:
     """Columns `KEYS` and `FIGURES`, one row per classes, tile and variant; NaN for failed tiles."""
     dsc3d: tuple[MetricsData, ...] = ()
     """Runs for the DSC3D rows, one per reference; the reference that the paper describes comes first."""
+    literal: MetricsData | None = None
+    """A run with the paper read literally over all or some of the tiles, None if there is none."""
 
     @property
     def dataset(self) -> str:
@@ -76,7 +78,11 @@ class MetricsData:
 
 
 def collect(
-    run: Run, true: Run | None = None, dsc3d: Run | None = None, dsc3d_true: Run | None = None
+    run: Run,
+    true: Run | None = None,
+    dsc3d: Run | None = None,
+    dsc3d_true: Run | None = None,
+    literal: Run | None = None,
 ) -> MetricsData:
     """Return the figures of a run and of the runs it is compared with.
 
@@ -90,6 +96,8 @@ def collect(
         Scenes of DSC3D or of its stand-in, measured against the reference that the paper describes.
     dsc3d_true : Run, optional
         The same scenes, measured against the true surface.
+    literal : Run, optional
+        A run with configs/literal.yaml over the same tiles or some of them.
 
     Raises
     ------
@@ -102,8 +110,9 @@ def collect(
     if dsc3d and dsc3d_true:
         _check_twins(dsc3d, dsc3d_true, *(data.rows for data in scenes))
     first = _rows(run)
+    column = _checked_literal(literal, first) if literal else None
     if true is None:
-        return _checked(first, run.path, scenes)
+        return _checked(first, run.path, scenes, column)
     second = _rows(true)
     if not any(tile.layer("reference_road") for tile in true.catalog.tiles):
         raise ConfigError(f"{true.path} has no true road mask in its catalog; leave out --true")
@@ -116,7 +125,16 @@ def collect(
         raise ConfigError(
             f"{true.path} has other data, tiles or variants than {run.path}; run both over the same catalog"
         )
-    return _checked(pd.concat([first, second], ignore_index=True), run.path, scenes)
+    return _checked(pd.concat([first, second], ignore_index=True), run.path, scenes, column)
+
+
+def _checked_literal(literal: Run, first: pd.DataFrame) -> MetricsData:
+    rows = _rows(literal)
+    if {*rows.dataset} != {*first.dataset} or not {*rows.tile_id} <= {*first.tile_id}:
+        raise ConfigError(
+            f"{literal.path} has other data or tiles than the main run; --literal needs its catalog"
+        )
+    return _checked(rows, literal.path)
 
 
 def _check_twins(run: Run, true: Run, first: pd.DataFrame, second: pd.DataFrame) -> None:
@@ -144,14 +162,19 @@ def write_metrics_data(data: MetricsData, folder: Path) -> None:
         write(folder / DSC3D_FILE, _parquet(rows))
     else:
         (folder / DSC3D_FILE).unlink(missing_ok=True)
+    if data.literal:
+        write(folder / LITERAL_FILE, _parquet(data.literal.rows))
+    else:
+        (folder / LITERAL_FILE).unlink(missing_ok=True)
 
 
 def read_metrics_data(folder: Path) -> MetricsData:
     """Read the files of `write_metrics_data`."""
     dsc3d = _read(folder / DSC3D_FILE) if (folder / DSC3D_FILE).exists() else pd.DataFrame({"dataset": []})
     parts = [rows for _, rows in dsc3d.groupby("dataset", sort=False)]
+    literal = MetricsData(_read(folder / LITERAL_FILE)) if (folder / LITERAL_FILE).exists() else None
     return MetricsData(
-        _read(folder / FILE), tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts)
+        _read(folder / FILE), tuple(MetricsData(rows.reset_index(drop=True)) for rows in parts), literal
     )
 
 
@@ -192,8 +215,13 @@ def _classes_used(run: Run, option: str, rows: pd.DataFrame) -> str:
     return "reference" if with_mask == len(tiles) else PARTLY
 
 
-def _checked(rows: pd.DataFrame, run: Location, dsc3d: tuple[MetricsData, ...] = ()) -> MetricsData:
-    data = MetricsData(rows, dsc3d)
+def _checked(
+    rows: pd.DataFrame,
+    run: Location,
+    dsc3d: tuple[MetricsData, ...] = (),
+    literal: MetricsData | None = None,
+) -> MetricsData:
+    data = MetricsData(rows, dsc3d, literal)
     if not data.tiles.complete.any():
         raise ConfigError(f"{run} has no tile with figures for every variant; see `flexroad status {run}`")
     return data

@@ -39,7 +39,8 @@ def side_by_side(
     rows : tuple of Row
         The paper's rows; every variant is in `ours`.
     ours : Mapping[str, Means]
-        Our means by column name; the difference from the paper is added if there is only one.
+        Our means by column name; the difference from the paper is added if there is only one. A variant that
+        a column lacks has a dash there.
     line : str
         The data of the table, if not the page's main data.
     """
@@ -113,6 +114,8 @@ def format_difference(value: float, figure: str) -> str:
 
 
 def _with_interval(means: Means, variant: str, figure: str) -> str:
+    if variant not in means.variants:
+        return "–"
     low, high = means.interval(variant, figure)
     mean, low_text, high_text = (
         format_figure(value, figure) for value in (means.mean[variant, figure], low, high)

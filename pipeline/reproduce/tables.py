@@ -29,7 +29,12 @@ NARROW, SENTENCE = 12, 25
 
 
 def write_comparison(
-    run: Run, true: Run | None, folder: Path, dsc3d: Run | None = None, dsc3d_true: Run | None = None
+    run: Run,
+    true: Run | None,
+    folder: Path,
+    dsc3d: Run | None = None,
+    dsc3d_true: Run | None = None,
+    literal: Run | None = None,
 ) -> tuple[Path, ...]:
     """Write the paper's tables with a run's figures beside them; return the paths of the files.
 
@@ -45,6 +50,8 @@ def write_comparison(
         A run over DSC3D or its stand-in, for the DSC3D rows.
     dsc3d_true : Run, optional
         A run over the same scenes, measured against the true surface.
+    literal : Run, optional
+        A run with configs/literal.yaml over the same tiles or some of them, for a second column.
 
     Raises
     ------
@@ -52,7 +59,7 @@ def write_comparison(
         If a run has no figures or mixes datasets, two runs to compare have different tiles, or the folder
         cannot be written.
     """
-    data = collect(run, true, dsc3d, dsc3d_true)
+    data = collect(run, true, dsc3d, dsc3d_true, literal)
     texts = pages(data)
     try:
         folder.mkdir(parents=True, exist_ok=True)

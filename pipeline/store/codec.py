@@ -19,6 +19,9 @@ from flexroad.catalog import Grid
 from flexroad.pipeline.config.methods import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
+from flexroad.tasks.spline.moving import MovingNurbs
+from flexroad.tasks.spline.problem import TileProblem
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
 
@@ -70,7 +73,10 @@ def _plain(item: Any) -> Any:
 
 
 def _types() -> dict[str, type]:
-    shared = (Corner, Edge, Mesh, Metrics, NurbsSurface, Quality, RoadClusters, RoadMask)
+    shared = (
+        Corner, Edge, Mesh, Metrics, MovingNurbs, NurbsSurface, Quality, RoadClusters, RoadMask,
+        SteppedSurface, TileProblem,
+    )  # fmt: skip
     types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():
         types |= {k: v for k, v in vars(module).items() if k.endswith("Surface") and is_dataclass(v)}

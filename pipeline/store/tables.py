@@ -52,11 +52,15 @@ COLUMNS: dict[str, str] = {
     "dtm_road": "float64",
     "inferred_road": "float64",
     "dropped_road": "float64",
+    "dsm_excess_m": "float64",
     "off_dtm_m": "float64",
     "off_dtm_road": "float64",
     "bounded_weights": "float64",
     "error_estimate_m": "float64",
     "suspect_m2": "float64",
+    "holdout_squares": "float64",
+    "holdout_error_m": "float64",
+    "holdout_covered": "float64",
     "flags": "str",
 }
 """Columns of metrics.parquet and their types in pandas, in the table's order."""
@@ -166,7 +170,7 @@ def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
             raise ValueError(f"it has the columns {', '.join(map(repr, sorted(unknown, key=repr)))}")
         # Tables of older versions lack the newer columns.
         return frame.reindex(columns=list(COLUMNS))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, NotImplementedError) as error:
         remedy = f"`flexroad rerun {run}` writes it again" if name == METRICS else "remove it"
         raise ConfigError(f"{path} is damaged: {error}; {remedy}") from error
 

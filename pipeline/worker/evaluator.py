@@ -10,17 +10,21 @@ import traceback
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Location, stat
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
+from flexroad.pipeline.graph.stages import stage_function
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure
 from flexroad.pipeline.worker.profiling import StageCost
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import Options
 from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.types import RoadClusters, Surface, TileData
 
 
 class StageError(Exception):
@@ -56,6 +60,8 @@ class Evaluator:
     """Cost of each stage in this process."""
     errors: dict[str, StageError] = field(default_factory=dict)
     """Errors by fingerprint."""
+    computed: frozenset[str] = frozenset()
+    """Fingerprints of nodes that were computed for this tile in another process: ``force`` is done."""
 
     def __call__(self, fingerprint: str) -> Any:
         """Return the result of a node.
@@ -69,12 +75,13 @@ class Evaluator:
             raise self.errors[fingerprint]
         if fingerprint not in self.results:
             node = self.graph.nodes[fingerprint]
-            artefact = self.store.get(node) if node.stored and node.stage not in self.force else None
+            forced = node.stage in self.force and fingerprint not in self.computed
+            artefact = self.store.get(node) if node.stored and not forced else None
             if artefact is None:
                 self._compute(node)
             else:
                 self.results[fingerprint], self.chain_seconds[fingerprint] = artefact
-                self.spans[node.stage].reused += 1
+                self.spans[node.stage].reused += fingerprint not in self.computed
         return self.results[fingerprint]
 
     def _compute(self, node: Node) -> None:
@@ -90,13 +97,13 @@ class Evaluator:
             self.errors[node.fingerprint] = failed
             raise failed from error
         span.computed += 1
-        seconds = self._seconds_before(node)
+        seconds = self.seconds_before(node)
         seconds[node.stage] = span.seconds - before
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
         if node.stored and self.keep:
             self._store(node, result, seconds)
 
-    def _seconds_before(self, node: Node) -> dict[str, float]:
+    def seconds_before(self, node: Node) -> dict[str, float]:
         """Return the computing time of each stage before a node (s); that of a border is its own alone."""
         if node.border:
             return {}
@@ -109,7 +116,9 @@ class Evaluator:
         try:
             if node.border:
                 return node.border(self.graph.around, inputs)
-            framed = {"frame": Frame(*frame)} if frame else {}
+            framed: dict[str, Any] = {"frame": Frame(*frame)} if frame else {}
+            if node.refit:
+                framed = {"refit": partial(_refit, options=node.refit, framed=framed)}
             return node.function(*(inputs or [self.graph.readable]), node.options, **framed)
         finally:
             # Also after an error: a file that is being replaced may be unreadable.
@@ -124,6 +133,11 @@ class Evaluator:
             failed = StageError(failure_of(self.graph.tile, "store", full))
             self.errors[node.fingerprint] = failed
             raise failed from error
+
+
+def _refit(data: TileData, clusters: RoadClusters, options: Options, framed: Mapping[str, Any]) -> Surface:
+    surface: Surface = stage_function("fit", options)(data, clusters, options, **framed)
+    return surface
 
 
 def check_unchanged(graph: TileGraph, files: Iterable[Location]) -> None:

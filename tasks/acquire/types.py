@@ -37,6 +37,18 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
+class TopLayer:
+    """The points of each cell that are close below its highest one."""
+
+    height: Floats
+    """Their mean height, ``(H, W)``, m; NaN where there are none."""
+    count: Floats
+    """Their number, ``(H, W)``."""
+    spread: Floats
+    """Standard deviation of their heights, ``(H, W)``, m; 0 for one point, NaN where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
 class Rasters:
     """The rasters of an area."""
 
@@ -46,6 +58,8 @@ class Rasters:
     """Highest point per cell, ``(H, W)``, m; NaN where there is none."""
     dtm: Floats
     """Bare ground, ``(H, W)``, m; NaN where there is none."""
+    top: TopLayer
+    """The points close below the DSM; its height has the same voids filled, with the count 0."""
     ground: Bools
     """Cells with ground points, ``(H, W)``; in the others the DTM is interpolated."""
     bridges: Floats | None = None

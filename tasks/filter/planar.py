@@ -31,6 +31,7 @@ from flexroad.tasks.filter.kit.union_find import (
     unite,
 )
 from flexroad.tasks.roads.columns import columns_of
+from flexroad.tasks.roads.distances import columns_aside
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
@@ -140,35 +141,13 @@ def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
 def _within(cells: Bools, width: float) -> Bools:
     """Return the cells at most ``width`` cells away from one of the given cells, ``(H, W)``."""
     rows, cols = cells.shape
-    aside, near, reach = _columns_away(cells), np.zeros((rows, cols), np.bool_), min(int(width), rows - 1)
+    aside, near, reach = columns_aside(cells), np.zeros((rows, cols), np.bool_), min(int(width), rows - 1)
     for down in range(-reach, reach + 1):
         wide = int(math.sqrt(width**2 - down**2))
         for r in range(max(down, 0), min(rows + down, rows)):
             for c in range(cols):
-                near[r, c] |= aside[r - down, c] <= wide
+                near[r, c] |= abs(aside[r - down, c]) <= wide
     return near
-
-
-@compiled()
-def _columns_away(cells: Bools) -> NDArray[np.int32]:
-    """Return the number of columns to the nearest of the given cells in the same row, ``(H, W)``.
-
-    In rows without a given cell it is larger than any distance in the grid.
-    """
-    rows, cols = cells.shape
-    away = np.empty((rows, cols), np.int32)
-    for r in range(rows):
-        last = -(rows + cols)
-        for c in range(cols):
-            if cells[r, c]:
-                last = c
-            away[r, c] = c - last
-        last = cols + rows + cols
-        for c in range(cols - 1, -1, -1):
-            if cells[r, c]:
-                last = c
-            away[r, c] = min(away[r, c], last - c)
-    return away
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

@@ -1,7 +1,8 @@
 """Fit a NURBS surface to road and terrain (the paper's step C, section "Surface Fitting").
 
 Adam optimises the heights and weights of a fixed grid of control points under the loss of
-`tasks.spline.objective`, starting from the DTM. The surface is that of `tasks.spline.surface`.
+`tasks.spline.objective`, starting from the DTM. The surface is that of `tasks.spline.surface`, or with
+``plan: moving`` that of `tasks.spline.moving`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
 
 if TYPE_CHECKING:
+    from flexroad.tasks.spline.moving import MovingNurbs
     from flexroad.tasks.spline.objective import Objective
     from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
@@ -43,9 +45,20 @@ class Options(BaseOptions):
         description="false: no DTM support: no terrain term, and the start is a plane through the road; "
         "a tile without roads gets the plane through the DTM",
     )
-    weights: Literal["free", "unit"] = Field(
-        "free", description="free: weights are optimised between 1/10 and 10; unit: all are 1"
+    plan: Literal["fixed", "moving", "uniform"] = Field(
+        "fixed",
+        description="fixed: a graph over easting and northing; moving: x and y move with the weights, for "
+        "comparisons with the paper; uniform: moving, with control points at equal distances",
     )
+    weights: Literal["free", "unit", "softplus", "unbounded"] = Field(
+        "free",
+        description="free: weights are optimised between 1/10 and 10; unit: all are 1; softplus: positive, "
+        "without bounds; unbounded: of any sign",
+    )
+    start: Literal["dtm", "level"] = Field(
+        "dtm", description="dtm: start from the DTM; level: from its mean height"
+    )
+    result: Literal["best", "last"] = Field("best", description="step of the fit that is its result")
     learning_rate: float = Field(
         0.1, gt=0, description="learning rate of Adam (m for heights, no unit for ln w)"
     )
@@ -66,10 +79,14 @@ class Options(BaseOptions):
             raise ValueError(f"degree {self.degree} needs more control points each way than {n} x {m}")
         if self.engine == "numba" and self.device != "cpu":
             raise ValueError(f"device {self.device} needs engine torch; numba runs on the cpu")
+        if self.engine == "torch" and (self.weights in ("softplus", "unbounded") or self.result == "last"):
+            raise ValueError("weights softplus and unbounded, and result last, need engine numba")
+        if self.weights == "unbounded" and self.plan == "fixed":
+            raise ValueError("weights unbounded may be negative, which needs plan moving or uniform")
         return self
 
 
-def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface:
+def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurface | MovingNurbs:
     """Fit the surface to the DSM on filtered road cells and to the valid DTM elsewhere.
 
     Raises
@@ -79,16 +96,20 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         height to start from, or if the device is not available.
     """
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+    from flexroad.tasks.roads.road_height import with_road_heights
+    from flexroad.tasks.spline.moving import moving
     from flexroad.tasks.spline.space import start_heights, surface_on
 
-    data, space = without_invalid_dtm(data, clusters), space_of(data, options)
+    data = without_invalid_dtm(with_road_heights(data, clusters), clusters)
+    space = space_of(data, options)
     start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
     loss = objective_of(data, clusters.mask, space, datum, options)
-    z, weights = start - datum, np.ones_like(start)
+    z, weights = (start - datum) * (options.start == "dtm"), np.ones_like(start)
     # Without terrain term and road only the regulariser is left, which would flatten the plane of the start.
     if options.terrain or (clusters.mask & np.isfinite(data.dsm)).any():
         z, weights = _adam(loss, z, options)
-    return surface_on(space, data.grid, data.grid.hull, weights * z, weights, datum)
+    surface = surface_on(space, data.grid, data.grid.hull, weights * z, weights, datum)
+    return surface if options.plan == "fixed" else moving(surface, options.plan == "uniform")
 
 
 def space_of(data: TileData, options: Options) -> Space:
@@ -127,13 +148,19 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
 def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
     """Return the optimised control heights above the datum (m) and the weights."""
     from flexroad.tasks.spline import adam, torch_engine
+    from flexroad.tasks.spline.moving import WEIGHTS
     from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT
 
+    schedule = adam.Schedule(
+        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window,
+        options.result == "last",
+    )  # fmt: skip
+    if weights := WEIGHTS.get(options.weights):
+        variables = np.stack([start, np.full_like(start, weights.start)])
+        (z, s), _ = adam.minimise(weights.loss(loss), variables, np.array(math.inf), schedule)
+        return z, weights.value(s)
     variables = np.stack([start, np.zeros_like(start)])
     limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
-    schedule = adam.Schedule(
-        options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window
-    )
     if options.engine == "torch":
         (z, rho), _ = torch_engine.minimise(loss, variables, limit, schedule, options.device)
     else:

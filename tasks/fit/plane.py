@@ -62,6 +62,9 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> PlaneSurfac
     TaskError
         If neither the road nor the DTM has a height.
     """
+    from flexroad.tasks.roads.road_height import with_road_heights
+
+    data = with_road_heights(data, clusters)
     heights = np.where(clusters.mask, data.dsm, np.nan)
     from_dtm = not np.isfinite(heights).any()
     if from_dtm:

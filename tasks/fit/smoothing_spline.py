@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
@@ -24,15 +24,16 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flexroad.catalog.borders import Border
+    from flexroad.catalog.grid import Grid
     from flexroad.tasks.errors import TaskError
     from flexroad.tasks.spline.batch import Engine
     from flexroad.tasks.spline.frame import Corner, Edge, Frame
     from flexroad.tasks.spline.lattice import Lattice, Range
-    from flexroad.tasks.spline.problem import Problem
+    from flexroad.tasks.spline.problem import Problem, TileProblem
     from flexroad.tasks.spline.space import Space
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 4
+VERSION = 6
 
 REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
@@ -62,10 +63,27 @@ class Options(BaseOptions):
     bending_terrain: float = Field(
         0.02, gt=0, le=1000, description="weight of the terrain's squared curvature, as a share of the road's"
     )
+    steps: bool = Field(
+        False, description="give the cells beside roads a step above the spline: kerbs, walls and banks"
+    )
     iterations: int = Field(200, ge=1, description="largest number of steps of reweighted least squares")
     stop_tolerance: float = Field(
         1e-4, ge=0, description="stop when the relative decrease of the loss is below this"
     )
+    engine: Literal["numba", "torch"] = Field(
+        "numba",
+        description="numba: one tile after the other, on the CPU; torch: many tiles at once, on the GPU of a "
+        "worker; surfaces differ by less than 1 mm (docs/operations.md)",
+    )
+
+    @model_validator(mode="after")
+    def _torch_has_what_it_needs(self) -> Options:
+        if self.engine == "torch" and self.degree > BATCH_DEGREE:
+            limit = f"degree {BATCH_DEGREE} or less, not {self.degree}"
+            raise ValueError(f"engine torch needs {limit}; choose engine numba")
+        if self.engine == "torch" and self.steps:
+            raise ValueError("engine torch has no steps; choose engine numba")
+        return self
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None) -> NurbsSurface:
@@ -82,8 +100,19 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
+    if options.engine == "torch":
+        from flexroad.tasks.spline.batch import Engine
+
+        (surface,) = solve([tile_problem(data, clusters, options, frame)], options, Engine())
+        return surface
     problem, held = _tile_problem(data, clusters, options, frame)
-    return _surface(data, problem, held, _minimum_of(problem, options))
+    heights = _with_held(held, _minimum_of(problem, options) + problem.datum)
+    surface = _surface(data.core, problem.space, heights)
+    if options.steps:
+        from flexroad.tasks.spline.stepped import with_steps
+
+        return with_steps(data, clusters, surface)
+    return surface
 
 
 def fit_batch(
@@ -111,32 +140,66 @@ def fit_batch(
         If the device is not available, or the degree is above `BATCH_DEGREE`.
     """
     from flexroad.tasks.errors import TaskError
+
+    results: list[TileProblem | TaskError] = []
+    for data, clusters, frame in tiles:
+        try:
+            results.append(tile_problem(data, clusters, options, frame))
+        except TaskError as error:
+            results.append(error)
+    problems = [result for result in results if not isinstance(result, TaskError)]
+    surfaces = iter(solve(problems, options, engine))
+    return [result if isinstance(result, TaskError) else next(surfaces) for result in results]
+
+
+def tile_problem(
+    data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None
+) -> TileProblem:
+    """Return all that `solve` needs of a tile; the arguments and errors are those of `fit`."""
+    from flexroad.tasks.spline.problem import TileProblem
+
+    problem, held = _tile_problem(data, clusters, options, frame)
+    return TileProblem(
+        data.core, problem.heights, problem.weight, problem.stiffness, problem.first, held, problem.datum
+    )
+
+
+def solve(tiles: Sequence[TileProblem], options: Options, engine: Engine) -> list[NurbsSurface]:
+    """Return the surfaces of many tiles, those of one shape fitted together, in torch.
+
+    Raises
+    ------
+    TaskError
+        If the device is not available, or the degree is above `BATCH_DEGREE`.
+    """
+    from flexroad.tasks.errors import TaskError
     from flexroad.tasks.spline.batch import minimise
 
     if options.degree > BATCH_DEGREE:
         raise TaskError(f"batches need fit.degree {BATCH_DEGREE} or less, not {options.degree}")
+    problems = [tile.on(_space(tile.grid, options)) for tile in tiles]
+    heights = minimise(problems, options.huber_m, options.iterations, options.stop_tolerance, engine)
+    return [
+        _surface(tile.grid, problem.space, _with_held(tile.held, z + tile.datum))
+        for tile, problem, z in zip(tiles, problems, heights, strict=True)
+    ]
 
-    results: list[NurbsSurface | TaskError | None] = []
-    prepared = []
-    for number, (data, clusters, frame) in enumerate(tiles):
-        try:
-            prepared.append((number, *_tile_problem(data, clusters, options, frame)))
-            results.append(None)
-        except TaskError as error:
-            results.append(error)
-    problems = [problem for _, problem, _ in prepared]
-    solved = minimise(problems, options.huber_m, options.iterations, options.stop_tolerance, engine)
-    for (number, problem, held), z in zip(prepared, solved, strict=True):
-        results[number] = _surface(tiles[number][0], problem, held, z)
-    return [result for result in results if result is not None]
+
+def _space(core: Grid, options: Options) -> Space:
+    """Return the splines over the core of a tile."""
+    lattice = _lattice((core.width, core.height), core.cell, options)
+    n, m = lattice.intervals
+    return lattice.part(core.shape, (core.height, 0), (0, n), (0, m))[0]
 
 
 def _tile_problem(
     data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None
 ) -> tuple[Problem, Floats]:
     """Return the loss over the tile's core, and the heights of the control points that are held, else NaN."""
+    from flexroad.tasks.roads.road_height import with_road_heights
     from flexroad.tasks.spline.space import check_cells
 
+    data = with_road_heights(data, clusters)
     core = data.grid.window(data.core)
     lattice = _lattice((data.core.width, data.core.height), data.core.cell, options)
     (n, m), start = lattice.intervals, (core[0].stop, core[1].start)
@@ -146,12 +209,11 @@ def _tile_problem(
     return _problem(data, clusters, lattice, start, (0, n), (0, m), held, options), held
 
 
-def _surface(data: TileData, problem: Problem, held: Floats, z: Floats) -> NurbsSurface:
+def _surface(core: Grid, space: Space, A: Floats) -> NurbsSurface:
     from flexroad.tasks.spline.space import surface_on
 
-    A = _with_held(held, z + problem.datum)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    return surface_on(problem.space, data.core, data.core.exact_bounds, A, np.ones_like(A), datum=0.0)
+    return surface_on(space, core, core.exact_bounds, A, np.ones_like(A), datum=0.0)
 
 
 def _with_held(held: Floats, z: Floats) -> Floats:
@@ -174,8 +236,10 @@ def corner(data: TileData, clusters: RoadClusters, border: Border, options: Opti
         The filtered road there.
     """
     from flexroad.tasks.roads.extent import beyond_extent
+    from flexroad.tasks.roads.road_height import with_road_heights
     from flexroad.tasks.spline.frame import Corner, rounded
 
+    data = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
     held = np.full((2 * j + p, 2 * k + p), np.nan)
@@ -203,8 +267,10 @@ def edge(
         The corners at the western and eastern, or the southern and northern end; their points are held.
     """
     from flexroad.tasks.meshing.road_outline import crossings
+    from flexroad.tasks.roads.road_height import with_road_heights
     from flexroad.tasks.spline.frame import Edge, rounded
 
+    data = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     eastward = border.kind == "east"
     n, m = (lattice.intervals[0], 0) if eastward else (0, lattice.intervals[1])
@@ -253,14 +319,15 @@ def _ground(data: TileData, clusters: RoadClusters) -> Floats:
 
 def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Lattice) -> tuple[int, int]:
     """Return the number of intervals up to which a corner or edge is fitted, along easting and northing."""
-    import scipy
+    from flexroad.tasks.roads.distances import distances
 
     missing, cell = np.isnan(_ground(data, clusters)), data.grid.cell
     if not missing.all():
-        needed = BEYOND_DATA_M
-        if any(missing[side].any() for side in border.sides):
-            away = scipy.ndimage.distance_transform_edt(missing) * cell
-            needed += max(float(away[side].max()) for side in border.sides)
+        needed, along = BEYOND_DATA_M, np.zeros_like(missing)
+        for side in border.sides:
+            along[side] = missing[side]
+        if along.any():
+            needed += float(distances(along, ~missing).max()) * cell
         for lines in map(lattice.lines_within, REACHES_M):
             if min(np.multiply(lines, lattice.unit_m)) >= needed:
                 return lines

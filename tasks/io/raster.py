@@ -378,7 +378,9 @@ def _part(
     values: Floats = src.read(1, **how).astype(np.float64)
     if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
         values = values * src.scales[0] + src.offsets[0]
-    if MaskFlags.all_valid not in src.mask_flag_enums[0]:
+    # Cells whose nodata value is NaN are NaN already.
+    is_nan = step == 1 and src.mask_flag_enums[0] == [MaskFlags.nodata] and math.isnan(src.nodata)
+    if not is_nan and MaskFlags.all_valid not in src.mask_flag_enums[0]:
         how |= {"resampling": Resampling.mode} if step > 1 else {}
         values[src.read_masks(1, **how) == 0] = np.nan
     return values[::-1] if lattice.northward else values

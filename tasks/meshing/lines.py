@@ -20,6 +20,13 @@ AT_BORDER_M = 0.005
 """Points of lines within this distance of the border lie on it (m); more than crossings are moved."""
 
 
+def parts_of(lines: shapely.MultiLineString) -> NDArray[np.object_]:
+    """Return lines as an array."""
+    import shapely
+
+    return np.asarray(shapely.get_parts(lines))
+
+
 def divided(
     lines: shapely.MultiLineString, fine_m: float, coarse_m: float, is_fine: Callable[[Floats], Bools]
 ) -> NDArray[np.object_]:

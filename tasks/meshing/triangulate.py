@@ -82,7 +82,11 @@ def constrained(points: Floats, segments: Edges, lattices: Sequence[Lattice] = (
     ndarray of int32, (F, 3)
         Counter-clockwise; beside the segments the triangulation is Delaunay's.
     """
-    faces = delaunay(points, lattices)
+    return with_edges(points, delaunay(points, lattices), segments)
+
+
+def with_edges(points: Floats, faces: Faces, segments: Edges) -> Faces:
+    """Return faces of a triangulation, changed so that segments are edges, ``(F, 3)``; see `constrained`."""
     if not len(segments):
         return faces
     missing = segments[~_has_edges(faces, segments, len(points))]

@@ -6,7 +6,8 @@ import numpy as np
 import scipy
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.quality.assess import Compared, Options
+from flexroad.tasks.quality.assess import Options
+from flexroad.tasks.quality.compared import Compared
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
 
@@ -38,7 +39,7 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
     road, agree_m = cells.on_road, options.agree_m
     scores = {
         "error-estimate": _around(np.where(road, cells.estimate, 0.0), grid.cell),
-        "patch": _depth(_largest_patch(road & (cells.estimate > agree_m))),
+        "patch": _depth(_largest_patch(road & (cells.deviation > agree_m))),
         "spike": _bend(cells.height, road),
         "edge-step": _edge_step(cells.height, road),
         "loose": np.where(cells.kept, np.abs(cells.off_dsm), 0.0),

@@ -28,6 +28,8 @@ class Schedule:
     """Stop when the loss changed by at most this share of it over ``window`` steps."""
     window: int
     """Number of steps over which the change of the loss is taken."""
+    last: bool = False
+    """Whether the result is the last step, whatever its loss; else it is the one with the lowest loss."""
 
     def has_finished(self, losses: Sequence[float]) -> bool:
         """Return whether to stop, from the losses at the start and after each step so far."""
@@ -41,7 +43,7 @@ class Schedule:
 def minimise(
     objective: Callable[[Floats], tuple[float, Floats]], start: Floats, limit: Floats, schedule: Schedule
 ) -> tuple[Floats, list[float]]:
-    """Take Adam steps from ``start`` and return the variables with the lowest loss of all steps.
+    """Take Adam steps from ``start`` and return the variables with the lowest loss of all steps, or the last.
 
     The length of a step does not fall with the gradient, so the last step need not be the best: from a start
     that fits exactly, every step raises the loss.
@@ -60,7 +62,7 @@ def minimise(
     Returns
     -------
     variables : ndarray
-        Those of the lowest loss.
+        Those of the lowest loss, or of the last step with ``schedule.last``.
     losses : list of float
         The loss at the start and after each step.
     """
@@ -73,7 +75,7 @@ def minimise(
             best = variables.copy()
         losses.append(loss)
         if schedule.has_finished(losses):
-            return best, losses
+            return (variables if schedule.last else best), losses
         step = len(losses)
         mean += (1 - BETA_1) * (gradient - mean)
         variance += (1 - BETA_2) * (gradient**2 - variance)

@@ -92,6 +92,19 @@ class Frame:
         result[:, 0], result[:, -1] = self.west.outside[1, ::-1], self.east.outside[0, ::-1]
         return result
 
+    def road(self, cells: Bools, raw: bool) -> Bools:
+        """Return the road cells of the tile, ``(H, W)``; those along the edges are as these say.
+
+        The outline of the road then crosses an edge at the same places in both of its tiles.
+        """
+        south, north, west, east = (
+            edge.road if raw else edge.kept for edge in (self.south, self.north, self.west, self.east)
+        )
+        result = cells.copy()
+        result[:, 0], result[:, -1] = west[::-1], east[::-1]
+        result[0], result[-1] = north, south
+        return result
+
 
 def rounded(heights: np.ndarray) -> Floats:
     """Return control heights as multiples of `GRAIN_M`."""

@@ -4,8 +4,12 @@ With unit weights the surface is linear in its control heights and the loss is c
 every absolute difference by a quadratic function, solves the normal equations, and searches the line to their
 solution for the lowest loss (Huber and Ronchetti, "Robust Statistics", section 7.8).
 
-The normal equations are solved by `tasks.spline.multigrid`, from step to step more precisely: the error of a
-step is corrected by the next ones, which are shorter.
+Under Huber's function, the later steps of a narrow spline with a small tolerance are nearly those of Newton's
+method, see `OUTLIERS`.
+
+The normal equations of narrow splines are solved by `tasks.spline.banded`, the others by
+`tasks.spline.multigrid`, from step to step more precisely: the error of a step is corrected by the next ones,
+which are shorter.
 """
 
 from __future__ import annotations
@@ -16,9 +20,19 @@ from functools import cached_property
 import numpy as np
 
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.spline.banded import Banded
 from flexroad.tasks.spline.multigrid import Multigrid
 from flexroad.tasks.spline.objective import Objective
-from flexroad.tasks.spline.stencil import Lags, add_from_cells, at_cells, gram, line_width, multiply, to_lines
+from flexroad.tasks.spline.stencil import (
+    Lags,
+    add_from_cells,
+    at_cells,
+    from_lines,
+    gram,
+    line_width,
+    multiply,
+    to_lines,
+)
 from flexroad.tasks.spline.surface import Starts
 from flexroad.tasks.types import Bools, Floats
 
@@ -29,6 +43,13 @@ COOLING = 0.6
 MAX_STEP, SLOPE_TOLERANCE = 3.0, 1e-4
 """Longest step, as a multiple of the step to the quadratic model's minimum, and largest slope of the loss at
 its end, as a share of that at its start."""
+SETTLED, OUTLIERS = 2, 0.1
+"""After this many steps, differences above `huber_m` have this share of their weight in the quadratic model.
+Huber's function has no curvature there, so the model is closer to it, and fewer steps are needed."""
+PRECISE = 1e-6
+"""Largest tolerance with which this is done: with a larger one the steps end on the way to the minimum."""
+SHORT = 0.5
+"""A step shorter than this multiple of the step to the model's minimum shows that the share is too small."""
 LOOSE, TIGHT = 5e-4, 1e-5
 """Tolerances of the normal equations (`Multigrid.solve`): in the first step, and the smallest."""
 MAX_EVALUATIONS = 40
@@ -54,9 +75,10 @@ class HuberObjective:
     """Control points that keep their height, ``(m, n)``; None if all are free."""
 
     @cached_property
-    def grids(self) -> Multigrid:
+    def solver(self) -> Banded | Multigrid:
         """The solver of the normal equations, with its memory."""
-        return Multigrid(self.shape, self.degree, self.held)
+        kind = Banded if Banded.suits(self.shape, self.degree) else Multigrid
+        return kind(self.shape, self.degree, self.held)
 
     @property
     def degree(self) -> int:
@@ -96,7 +118,7 @@ class HuberObjective:
         return out
 
     def model_step(
-        self, bend: Floats, residuals: Floats, floor_m: float, tolerance: float, refresh: bool
+        self, bend: Floats, residuals: Floats, floor_m: float, share: float, tolerance: float, refresh: bool
     ) -> tuple[Floats, float]:
         """Return the step to the minimum of the quadratic model, as lines, and the loss's slope along it.
 
@@ -108,15 +130,17 @@ class HuberObjective:
             Surface minus targets (m).
         floor_m : float
             Smaller differences get the weight of this one (m).
+        share : float
+            Share of the weight of larger differences that enters the matrix.
         tolerance, refresh : float, bool
             See `tasks.spline.multigrid.Multigrid.solve`.
         """
         weight, pull = np.empty_like(residuals), np.empty_like(residuals)
-        _weigh(residuals, self.objective.factor, floor_m, weight, pull)
+        _weigh(residuals, self.objective.factor, floor_m, share, weight, pull)
         stencil, slope = self.stiffness.copy(), bend.copy()
         gram(weight, *self.basis, stencil)
         add_from_cells(pull, *self.basis, slope)
-        step = self.grids.solve(stencil, -slope, tolerance, refresh)
+        step = self.solver.solve(stencil, -slope, tolerance, refresh)
         return step, float(np.vdot(slope, step))
 
 
@@ -144,19 +168,23 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
     tolerance : float
         Relative decrease of the loss at which to stop.
     """
-    lines = loss.grids.lines(start)
+    lines = to_lines(start, loss.degree)
     residuals, bend = loss.heights(lines) - loss.objective.target, loss.bend(lines)
     losses, precision = [loss(start)], LOOSE
     floor_m = loss.huber_m or FINAL_M
+    newton = loss.huber_m > 0 and tolerance <= PRECISE and isinstance(loss.solver, Banded)
+    share, later = 1.0, OUTLIERS if newton else 1.0
     for number in range(iterations):
         least = INITIAL_M * COOLING**number
-        step, slope = loss.model_step(bend, residuals, max(least, floor_m), precision, number == 0)
+        share = later if number == SETTLED else share
+        step, slope = loss.model_step(bend, residuals, max(least, floor_m), share, precision, number == 0)
         change, step_bend = loss.heights(step), loss.bend(step)
         line = _Line(
             residuals, change, loss.objective.factor, loss.huber_m, float(np.vdot(bend, lines)) / 2,
             float(np.vdot(bend, step)), float(np.vdot(step_bend, step)) / 2,
         )  # fmt: skip
         t, lowest = line.minimum(slope)
+        share = 1.0 if t < SHORT else share
         if lowest < losses[-1]:
             lines, residuals, bend = lines + t * step, residuals + t * change, bend + t * step_bend
         losses.append(min(lowest, losses[-1]))
@@ -164,7 +192,7 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
         if least <= floor_m and decrease <= tolerance * losses[-2]:
             break
         precision = min(LOOSE, max(TIGHT, 0.1 * decrease / losses[-2]))
-    return Solution(loss.grids.points(lines), losses)
+    return Solution(from_lines(lines, loss.shape[0], loss.degree), losses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,12 +244,16 @@ def _lags(degree: int) -> Lags:
 
 
 @compiled(error_model="numpy", fused=True)
-def _weigh(residuals: Floats, factor: Floats, floor_m: float, weight: Floats, pull: Floats) -> None:
-    """Write the weights of the quadratic model, and weight times residual."""
+def _weigh(
+    residuals: Floats, factor: Floats, floor_m: float, share: float, weight: Floats, pull: Floats
+) -> None:
+    """Write the weights of the quadratic model, and the slope of the loss by each residual."""
     for r in range(residuals.shape[0]):
         for c in range(residuals.shape[1]):
-            weight[r, c] = factor[r, c] / max(abs(residuals[r, c]), floor_m)
-            pull[r, c] = weight[r, c] * residuals[r, c]
+            difference = abs(residuals[r, c])
+            whole = factor[r, c] / max(difference, floor_m)
+            pull[r, c] = whole * residuals[r, c]
+            weight[r, c] = whole if difference <= floor_m else share * whole
 
 
 @compiled(error_model="numpy", fused=True)

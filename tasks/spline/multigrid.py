@@ -18,21 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.coarser import add_coarse, coarsen, restrict
+from flexroad.tasks.spline.equations import RIDGE, undetermined
 from flexroad.tasks.spline.stencil import (
     Lags,
     add_lower,
     add_upper,
-    from_lines,
     line_width,
     multiply,
     to_lines,
 )
 from flexroad.tasks.types import Bools, Floats
 
-RIDGE = 1e-9
-"""Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
 COARSEST = 8
 """Splines with at most this many control points along an axis are not made coarser."""
 COARSEST_SWEEPS = 4
@@ -81,10 +78,7 @@ class Multigrid:
         depth = len(self.levels) if refresh else 1
         failed = _prepare(stencils, bands, free, self.levels, depth, self._weights, self._lags, RIDGE)
         if failed:
-            raise TaskError(
-                f"control point {failed} of the surface is undetermined; use fewer control points (a larger "
-                "fit.spacing_m), or raise fit.bending_m3"
-            )
+            raise undetermined(failed)
         return _conjugate_gradients(
             stencils, bands, vectors, free, self.levels, self._weights, right, tolerance, SMALLEST_M,
             MAX_ITERATIONS, COARSEST_SWEEPS, self._lags,
@@ -138,14 +132,6 @@ class Multigrid:
             coarse = np.min([padded[k : k + 2 * count : 2] for k in range(p + 2)], axis=0)
             fine = np.moveaxis(coarse, 0, axis)
         return fine
-
-    def lines(self, z: Floats) -> Floats:
-        """Return control points ``(m, n)`` as lines."""
-        return to_lines(z, self.degree)
-
-    def points(self, lines: Floats) -> Floats:
-        """Return lines as control points ``(m, n)``."""
-        return from_lines(lines, self.shape[0], self.degree)
 
 
 @compiled(error_model="numpy", fused=True)

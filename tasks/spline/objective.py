@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.spline.space import Space
-from flexroad.tasks.spline.surface import Starts, basis
+from flexroad.tasks.spline.surface import Starts, kept_basis
 from flexroad.tasks.types import Floats
 
 NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
@@ -47,17 +47,27 @@ class Objective:
         """Return the loss (m) and its gradient at ``variables``, ``(2, m, n)``: z and rho."""
         gradient = np.zeros_like(variables)
         z, w = variables[0], np.exp(variables[1])
-        by_a, by_w = np.zeros_like(z), np.zeros_like(z)
-        a = w * z
-        loss = _data_terms(
-            a, w, self.target, self.factor,
-            self.start_u, self.along_u, self.start_v, self.along_v, by_a, by_w,
-        )  # fmt: skip
+        loss, by_a, by_w = self._data_terms(z, w)
         # A = e^rho z and W = e^rho.
         gradient[0] = by_a * w
         if self.free_weights:
-            gradient[1] = by_a * a + by_w * w
+            gradient[1] = by_a * (w * z) + by_w * w
         return loss + range_term(z, self.lambda_reg, NEIGHBOURS, gradient[0]), gradient
+
+    def by_weight(self, z: Floats, w: Floats) -> tuple[float, Floats, Floats]:
+        """Return the loss (m) and its gradient by the heights z and by the weights w, ``(m, n)`` each."""
+        loss, by_a, by_w = self._data_terms(z, w)
+        by_z = by_a * w
+        return loss + range_term(z, self.lambda_reg, NEIGHBOURS, by_z), by_z, by_a * z + by_w
+
+    def _data_terms(self, z: Floats, w: Floats) -> tuple[float, Floats, Floats]:
+        """Return the road and terrain terms (m) and their gradient by A = w z and by W = w."""
+        by_a, by_w = np.zeros_like(z), np.zeros_like(z)
+        loss = _data_terms(
+            w * z, w, self.target, self.factor,
+            self.start_u, self.along_u, self.start_v, self.along_v, by_a, by_w,
+        )  # fmt: skip
+        return loss, by_a, by_w
 
 
 def objective(
@@ -83,8 +93,8 @@ def objective(
         Whether the weights are variables.
     """
     valid = np.isfinite(heights)
-    start_u, along_u, _ = basis(space.knots_u, space.degree[0], space.u)
-    start_v, along_v, _ = basis(space.knots_v, space.degree[1], space.v)
+    start_u, along_u = kept_basis(space.knots_u, space.degree[0], space.u)
+    start_v, along_v = kept_basis(space.knots_v, space.degree[1], space.v)
     return Objective(
         target=np.where(valid, heights, 0.0),
         factor=np.where(valid, factor, 0.0) / np.count_nonzero(valid),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.spline.space import Space
 from flexroad.tasks.types import Bools, Floats
 
@@ -32,3 +35,23 @@ class Problem:
         s = self.space
         ends = (s.knots_u[0], s.knots_v[0], s.u[0], s.v[0], s.u[-1], s.v[-1])
         return (self.heights.shape, s.points, s.degree, s.unit_m, *map(float, ends))
+
+
+@dataclass(frozen=True, eq=False)
+class TileProblem:
+    """The loss of one tile without its splines, which follow from the grid and the options: to be stored."""
+
+    grid: Grid
+    """The tile's core."""
+    heights: Floats
+    weight: Floats
+    stiffness: Floats
+    first: Floats
+    held: Floats
+    """Heights above sea level that control points keep, ``(m, n)``, m; NaN where they are fitted."""
+    datum: float
+
+    def on(self, space: Space) -> Problem:
+        """Return the loss over the splines of the tile."""
+        held = np.isfinite(self.held)
+        return Problem(space, self.heights, self.weight, self.stiffness, self.first, held, self.datum)

@@ -10,6 +10,7 @@ import scipy
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
+from flexroad.tasks.roads.distances import filled
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, greville
 from flexroad.tasks.types import Bools, Floats
 
@@ -130,7 +131,7 @@ def start_heights(
     rows = (space.v[0] - v) * ((len(space.v) - 1) / (space.v[0] - space.v[-1]))
     if terrain and np.isfinite(dtm).any():
         heights = scipy.ndimage.map_coordinates(
-            _nearest_filled(dtm), np.meshgrid(rows, cols, indexing="ij"), order=1, mode="nearest"
+            filled(dtm), np.meshgrid(rows, cols, indexing="ij"), order=1, mode="nearest"
         )
     else:
         ground = np.where(road, dsm, np.nan)
@@ -142,11 +143,3 @@ def start_heights(
         level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), ground[r, c])
         heights = level + by_col * cols[None, :] + by_row * rows[:, None]
     return heights, float(heights.mean())
-
-
-def _nearest_filled(heights: Floats) -> Floats:
-    missing = ~np.isfinite(heights)
-    if not missing.any():
-        return heights
-    nearest = scipy.ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return np.asarray(heights[tuple(nearest)])

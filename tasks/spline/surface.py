@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 Starts = NDArray[np.intp]
+
+KEPT = 16
+"""Number of axes whose basis functions are kept: tiles, corners and edges have few different ones."""
 
 MAX_LOG_WEIGHT = math.log(10)
 """Bound on abs(ln w). Unbounded weights became negative on real streets, which gives the surface poles."""
@@ -89,6 +93,17 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
         share = values / (right - left)
         values = _pair((u - left) * share, (right - u) * share)
     return span[:, 0] - degree, values, _pair(degree * share, -degree * share)
+
+
+def kept_basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats]:
+    """Return first functions and values of `basis`, kept for the next call: they must not be changed."""
+    return _kept_basis(knots.tobytes(), degree, u.tobytes())
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_basis(knots: bytes, degree: int, u: bytes) -> tuple[Starts, Floats]:
+    start, values, _ = basis(np.frombuffer(knots), degree, np.frombuffer(u))
+    return start, values
 
 
 def _pair(rising: Floats, falling: Floats) -> Floats:

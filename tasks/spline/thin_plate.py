@@ -7,11 +7,13 @@ may differ from cell to cell: a road is stiffer than the ground beside it.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from flexroad.tasks.spline.space import Space
 from flexroad.tasks.spline.stencil import gram, line_width
-from flexroad.tasks.spline.surface import Starts, basis, dense
+from flexroad.tasks.spline.surface import KEPT, Starts, basis, dense
 from flexroad.tasks.types import Floats
 
 Derivatives = tuple[Starts, tuple[Floats, Floats, Floats]]
@@ -49,9 +51,19 @@ def bending_energy(stiffness: Floats, space: Space) -> Floats:
 def _derivatives(knots: Floats, degree: int, u: Floats, unit_m: float) -> Derivatives:
     """Return the basis functions at ``u`` and their first and second derivatives per metre.
 
+    They are kept for the next fit and must not be changed: tiles and their borders use the same few.
+    """
+    return _kept_derivatives(knots.tobytes(), degree, u.tobytes(), unit_m)
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_derivatives(knots_bytes: bytes, degree: int, u_bytes: bytes, unit_m: float) -> Derivatives:
+    """Return the result of `_derivatives`.
+
     A derivative is a spline of one degree less over the knots without the outermost (de Boor, "A practical
     guide to splines", chapter X).
     """
+    knots, u = np.frombuffer(knots_bytes), np.frombuffer(u_bytes)
     points = len(knots) - degree - 1
     coefficients, derivatives = np.eye(points), []
     first, _, _ = basis(knots, degree, u)

@@ -19,7 +19,7 @@ from flexroad.tasks.synthetic.layout import SOUTH_M, WEST_M
 from flexroad.tasks.synthetic.noise import generator
 from flexroad.tasks.synthetic.options import SceneOptions
 from flexroad.tasks.synthetic.reconstruction import Faults
-from flexroad.tasks.synthetic.scene import make_scene
+from flexroad.tasks.synthetic.scene import true_height
 
 CRS = "EPSG:32632"
 """UTM zone 32 on WGS 84, as for DSC3D's own meshes."""
@@ -118,7 +118,7 @@ def _locate(row: int, site: Site, seed: int) -> Place:
 def _excess(site: Site, options: SceneOptions, grid: Grid, seed: int, slope: float) -> float:
     """Return the rise of the ground at a location minus the rise of the site (m), for a slope."""
     empty = _with(options, slope=slope, density=0.0)
-    return float(np.ptp(make_scene(grid, seed, site.stratum, empty).reference)) - site.rise_m
+    return float(np.ptp(true_height(grid, seed, site.stratum, empty))) - site.rise_m
 
 
 def _square(west: float, south: float, cell: float) -> Grid:

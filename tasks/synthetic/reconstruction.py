@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy import ndimage
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options as base
@@ -129,7 +129,7 @@ def _patches(grid: Grid, seed: int, purpose: str, share: float) -> Bools:
     x, y = np.meshgrid(grid.eastings, grid.northings)
     lengths = np.geomspace(*BLANK_M, 24)
     field = waves(generator(seed, purpose), lengths, np.sqrt(2 / lengths.size))(x, y)
-    covered: Bools = field > norm.isf(share)
+    covered: Bools = field > -ndtri(share)
     return covered
 
 

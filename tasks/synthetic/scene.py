@@ -117,6 +117,14 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     )
 
 
+def true_height(grid: Grid, seed: int, stratum: str | None, options: SceneOptions) -> Floats:
+    """Return ``reference`` of the scene that `make_scene` gives for these arguments, ``(H, W)``, m."""
+    wide = grid.buffered(4 * DTM_BLUR_M)
+    canvas = Canvas.of(wide, plan_of(seed, stratum, options))
+    height: Floats = _ground_near(canvas, options)(canvas.x, canvas.y).height
+    return height[wide.window(grid)]
+
+
 def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
     """Return the street plan of a world."""
     return Plan(
@@ -157,7 +165,15 @@ def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
     # Objects may lie beyond the tile, and the streets that shape their ground even farther.
     box = _box(canvas, 2 * OBJECT_REACH_M)
     circles = tuple(plan.circles(box, CIRCLE_M + REACH_M))
-    return partial(ground, land, Ways(plan.streets(box), tuple(plan.streams(box)), circles, options.curb_m))
+    ways = Ways(
+        plan.streets(box),
+        tuple(plan.streams(box)),
+        circles,
+        curb_m=options.curb_m,
+        wall_m=options.wall_m,
+        hump_m=options.hump_m,
+    )
+    return partial(ground, land, ways)
 
 
 def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:

@@ -116,6 +116,10 @@ class Ways:
     """Centres of roundabouts in the plan's frame."""
     curb_m: float = 0.0
     """Height of the pavement over the carriageway's edge (m)."""
+    wall_m: float = 0.0
+    """Height of the ground behind retaining walls over the carriageway's edge (m)."""
+    hump_m: float = 0.0
+    """Rise of streets over the middle of a stream (m)."""
 
 
 def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
@@ -123,15 +127,16 @@ def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
 
     A street has the height of the hills under its centre line, with a rounded crossfall. Its weight falls
     smoothly from its edge into the terrain. Where streets meet, the weighted mean of their heights is used,
-    so there is no step at kerbs and crossings.
+    so there is no step at crossings. Kerbs and walls are added to it.
     """
     hills = land.large(x, y)
+    rise = ways.hump_m * _crest(ways.streams if ways.hump_m else (), x, y)
     blend = _Blend.of(hills)
     for street in ways.streets:
         near = _near(street, x, y)
         if near.any():
             lift, beyond, edge = _street_lift(street, land, x[near], y[near])
-            blend.add(near, hills[near] + lift, beyond, edge)
+            blend.add(near, hills[near] + lift + rise[near], beyond, edge)
     for centre in ways.circles:
         away = np.hypot(x - centre[0], y - centre[1])
         blend.add(..., hills + land.grading(x, y), away - CIRCLE_M, away - CIRCLE_M)
@@ -145,6 +150,8 @@ def ground(land: Relief, ways: Ways, x: Floats, y: Floats) -> Ground:
     graded = blend.with_terrain(hills + land.small(x, y)) + land.datum_m
     if ways.curb_m:
         graded = graded + ways.curb_m * _pavement(over)
+    if ways.wall_m:
+        graded = graded + ways.wall_m * _terrace(over)
     return Ground(graded, _trough(ways.streams, x, y), blend.edge, over)
 
 
@@ -206,6 +213,21 @@ def _pavement(edge: Floats) -> Floats:
     """Return the pavement's profile beside an edge, 0 to 1: a step up, level, then a slope down."""
     up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
     return up - down
+
+
+def _terrace(edge: Floats) -> Floats:
+    """Return the profile of the ground behind a wall, 0 to 1: a step up, level, then a slope down."""
+    up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (8.0, 12.0)))
+    return up - down
+
+
+def _crest(streams: Sequence[Stream], x: Floats, y: Floats) -> Floats:
+    """Return the profile of hump bridges, 0 to 1: 1 on the axis of a stream, 0 beyond its banks."""
+    crest = np.zeros_like(x)
+    for stream in streams:
+        if not stream.paved:
+            crest = np.maximum(crest, 1 - _smoothstep(stream.distance(x, y) / (BED_M + BANK_M)))
+    return crest
 
 
 def _near(street: Street, x: Floats, y: Floats) -> Bools:

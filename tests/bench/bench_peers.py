@@ -2,7 +2,7 @@
 
 A peer gets the cells with a height of one tile (DSM on the filtered road, valid DTM elsewhere) and returns
 heights at the tile's cells; these are meshed and evaluated against the true surface like ours. Peers that are
-not installed are left out: ``pip install verde geomdl``.
+not installed are left out: ``pip install verde geomdl``, ``apt install gmt grass-core``.
 
 geomdl is written in Python: it gets one cell of 25, and its time is that of these alone.
 """
@@ -26,6 +26,7 @@ from flexroad.tasks.fit.raster import RasterSurface
 from flexroad.tasks.metrics import evaluate
 from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, Surface, TileData
+from tests.bench.gis_peers import installed
 from tests.bench.timing import cpu_s, one_cpu_s, one_thread
 
 SEED = 11
@@ -33,7 +34,7 @@ NEIGHBOURS, SMOOTHING = 30, 3.0
 """Cells around a place and smoothing of scipy's thin plate spline."""
 NOISE_M = 0.05
 """Standard deviation of heights, from which scipy's spline on a grid chooses its knots."""
-BLOCK_M, DAMPING = 3.6, 1e-3
+BLOCK_M, DAMPING = 3.6, 1e-8
 """Cells are averaged in blocks as wide as the distance of our control points: verde's spline is dense."""
 THINNED = 5
 """geomdl gets every fifth row and column."""
@@ -71,6 +72,10 @@ def main() -> None:
         heights: list[Floats] = []
         spent = one_cpu_s(lambda peer=peer, out=heights: out.append(heights_by(peer, case)))
         show(name, spent, seconds, case, surface_of(heights[0], case.core))
+    for name, program in installed().items():
+        x, y = places_of(case.core)
+        raster, spent = program(x, y, np.column_stack(scattered(x, y, case.ground)))
+        show(name, spent, seconds, case, surface_of(raster, case.core))
 
 
 def made_case() -> Case:
@@ -86,8 +91,12 @@ def made_case() -> Case:
 
 
 def heights_by(peer: Peer, case: Case) -> Floats:
-    x, y = case.core.eastings - case.core.west, case.core.northings - case.core.south
-    return peer(x, y, case.ground)
+    return peer(*places_of(case.core), case.ground)
+
+
+def places_of(core: Grid) -> tuple[Floats, Floats]:
+    """Return x and y of the cells, ``(W,)`` and ``(H,)``, from the tile's south-west corner (m)."""
+    return core.eastings - core.west, core.northings - core.south
 
 
 def surface_of(heights: Floats, core: Grid) -> RasterSurface:

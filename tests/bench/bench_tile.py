@@ -142,7 +142,7 @@ def works_of(run: Run, measured: dict[str, Any]) -> dict[str, Work]:
 def border_work(graph: TileGraph, node: Node, fits: list[floors.FitSize]) -> Work:
     """Return the least work of a corner or edge: its ground loaded, segmented, filtered and fitted."""
     assert node.border
-    data = load_border(node.border.ground(graph.around), graph.tile.grid)
+    data = load_border(node.border.ground(graph.around), graph.tile.grid, node.border.stages.load)
     cells = data.dsm.size
     # A mask read and written; DSM, DTM and mask read, labels written.
     masked = Work(0, 2 * cells) + Work(floors.PATCH * cells, (8 + 8 + 1 + 4) * cells)

@@ -106,6 +106,16 @@ def test_import_loads_no_heavy_library():
     assert done.stdout.strip() == "[]"
 
 
+def test_reading_a_config_loads_no_numerical_library():
+    heavy = "numba pandas xarray torch dask scipy.ndimage scipy.sparse scipy.spatial scipy.special".split()
+    code = (
+        "import sys; from flexroad.pipeline.config.loading import load_config; load_config('nightly'); "
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_public_names_exist():
     assert set(flexroad.__all__) <= set(dir(flexroad))
     assert all(hasattr(flexroad, name) for name in flexroad.__all__)

@@ -510,3 +510,57 @@ def test_load_tile_of_too_many_cells_fails_before_reading(tmp_path, dtm):
     huge = Grid(UTM, 295500.0, 5629480.0, 1.0, 30_000, 30_000)
     with pytest.raises(TaskError, match=r"30000 x 30000 cells with its halo, more than 25,000,000; catalog"):
         load(tile(tmp_path, grid=huge), Options())
+
+
+# --- heights of roads -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("chosen", "has_layer", "is_read"),
+    [("dsm", True, False), ("auto", True, True), ("auto", False, False), ("layer", True, True)],
+)
+def test_load_road_height_is_read_as_asked(tmp_path, dtm, chosen, has_layer, is_read):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    heights = relief(seed=2)
+    write(tmp_path / "road_height.tif", heights, **NORTH)
+    place = tile(tmp_path, road_height="road_height.tif" if has_layer else None)
+    for data in (
+        load(place, Options(road_height=chosen)),
+        load_border(place, GRID, Options(road_height=chosen)),
+    ):
+        assert not data.offset_dsm
+        assert (data.road_height is not None) == is_read
+        if is_read:
+            np.testing.assert_array_equal(data.road_height, heights)
+    assert load_border(place, GRID).road_height is None
+
+
+def test_load_without_required_road_height_fails(tmp_path, dtm):
+    write(tmp_path / "dsm.tif", relief(), **NORTH)
+    message, _ = fails(tile(tmp_path), Options(road_height="layer"))
+    assert message == "the tile has no road_height; give its files to `flexroad catalog` with --road-height"
+
+
+@pytest.mark.parametrize(
+    ("dates", "crs", "undeclared", "is_used", "note"),
+    [
+        (("2020-04-01", "2020-04-01"), "EPSG:25832+7837", False, True, None),
+        (
+            ("2020-04-01", "2020-04-02"),
+            "EPSG:25832+7837",
+            True,
+            False,
+            "differs in date: dsm 2020-04-01, dtm",
+        ),
+        (("2020-04-01", "2020-04-01"), UTM, False, False, "do not declare vertical CRS; set load.offset_und"),
+        (("2020-04-01", "2020-04-01"), UTM, True, True, None),
+    ],
+)
+def test_load_offset_needs_one_survey(tmp_path, dates, crs, undeclared, is_used, note):
+    for name, date in zip(("dsm", "dtm"), dates, strict=True):
+        write(tmp_path / f"{name}.tif", relief(), **NORTH, crs=crs, tags={"ACQUISITIONDATE": date})
+    options = Options(road_height="offset", offset_undeclared=undeclared)
+    data = load(tile(tmp_path), options)
+    assert data.offset_dsm == load_border(tile(tmp_path), GRID, options).offset_dsm == is_used
+    assert len(data.notes) == (note is not None)
+    assert note is None or note in data.notes[0]

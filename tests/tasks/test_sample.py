@@ -12,6 +12,8 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.sample import Options, sample
+from flexroad.tasks.spline.moving import moving
+from flexroad.tasks.spline.space import clamped_space, surface_on
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
 
 
@@ -194,6 +196,35 @@ def test_sample_neighbours_with_halo_meet(cell):
         edges.append({tuple(point) for point in xy if abs(point[0] - 295550) < 1e-6})
     assert edges[0] == edges[1]
     assert len(edges[0]) > 8
+
+
+def moving_surface(core, spread):
+    """A surface whose weights vary by a factor up to ``exp(2 * spread)``."""
+    w = np.exp(np.random.default_rng(5).uniform(-spread, spread, (9, 9)))
+    return moving(surface_on(clamped_space(core, 3, (9, 9)), core, core.hull, 0 * w, w, 150.0))
+
+
+@pytest.mark.parametrize("method", ["dynamic", "uniform"])
+def test_sample_moving_surface_has_vertices_in_space(method):
+    core = ground(60, 60)
+    mask, options = diagonal_street(core), Options(method=method)
+    surface = moving_surface(core, 1.0)
+    mesh = sampled(core, mask, options, surface)
+    fixed = sampled(core, mask, options)
+    assert faults(mesh) == ()
+    expected = np.column_stack(surface.moved(*(fixed.vertices[:, :2] + core.origin).T))
+    order = [np.lexsort(points[:, :2].T) for points in (expected, mesh.vertices)]
+    np.testing.assert_allclose(mesh.vertices[order[1], :2], expected[order[0]], atol=1e-9)
+    assert np.abs(expected - fixed.vertices[:, :2]).max() > 1
+    assert_covers(mesh, core.hull)
+
+
+def test_sample_moving_surface_that_stays_in_place_has_the_same_size():
+    core = ground(60, 60)
+    mask = diagonal_street(core)
+    still, fixed = sampled(core, mask, None, moving_surface(core, 0.0)), sampled(core, mask)
+    np.testing.assert_allclose(plan(still), plan(fixed), atol=1e-6)
+    assert len(still.faces) == len(fixed.faces)
 
 
 def test_sample_filtered_mask_is_used():

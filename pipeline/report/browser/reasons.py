@@ -27,7 +27,7 @@ class Meaning:
 
 MEANINGS = {
     "error-estimate": Meaning(
-        "the surface is {value} m off DSM and DTM on average (limit {limit} m)",
+        "the surface is {value} m off on average, by what it leaves of DSM and DTM (limit {limit} m)",
         "compare DSM and DTM{there}: one of them is wrong or older",
     ),
     "patch": Meaning(

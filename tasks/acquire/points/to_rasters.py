@@ -1,4 +1,4 @@
-"""Rasters from a point cloud: DSM, DTM, bridge decks and orthophoto of a block of ground.
+"""Rasters from a point cloud: DSM and its top layer, DTM, bridge decks and orthophoto of a block of ground.
 
 Values depend only on the points within `reach_m` of the block, not on the division into blocks or on the
 order of the points; heights agree to 1e-8 m, the rounding error of sums and large coordinates.
@@ -18,7 +18,8 @@ from flexroad.tasks.acquire.points import ground_filter as slope_filter
 from flexroad.tasks.acquire.points.binning import Cells, bins, means
 from flexroad.tasks.acquire.points.max_height import highest, spikes
 from flexroad.tasks.acquire.points.orthophoto import photo
-from flexroad.tasks.acquire.types import Points, Rasters
+from flexroad.tasks.acquire.points.top_layer import top_layer
+from flexroad.tasks.acquire.types import Points, Rasters, TopLayer
 from flexroad.tasks.types import Bools, Floats, Orthophoto
 
 BRIDGE_CLASSES = {"asprs": (17,), "ahn": (26,)}
@@ -35,6 +36,12 @@ class Options(base.Options):
         description="drop single points that are this much above all others around (m); null keeps all",
     )
     fill_m: float = Field(5.0, ge=0, le=100, description="DSM voids up to this width are filled (m)")
+    top_layer_m: float = Field(
+        0.25,
+        gt=0,
+        le=10,
+        description="points up to this much below a cell's highest one make the height of roads (m)",
+    )
     ground: Literal["classes", "filter"] = Field(
         "classes",
         description="classes: ground points have a ground class; filter: the slope filter identifies them",
@@ -80,14 +87,18 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     if options.despike_m is not None:
         points = _without_spikes(points, rim, options.despike_m)
     cells = bins(points.easting, points.northing, rim)
-    dsm = fill_voids.fill(highest(cells, points.height, rim.shape), rim, options.fill_m)
+    highest_points = highest(cells, points.height, rim.shape)
+    top = top_layer(cells, points.height, highest_points, options.top_layer_m, rim.shape)
     decks = np.isin(points.kind, options.bridge_classes)
     (bridges,) = means(cells[decks], rim.shape, points.height[decks])
     ground = _is_ground(points, options) & ~decks
     return Rasters(
         grid,
-        dsm=dsm[inner],
+        dsm=fill_voids.fill(highest_points, rim, options.fill_m)[inner],
         dtm=_dtm(points[ground], rim, options)[inner],
+        top=TopLayer(
+            fill_voids.fill(top.height, rim, options.fill_m)[inner], top.count[inner], top.spread[inner]
+        ),
         ground=_occupied(cells[ground], rim.shape)[inner],
         bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
         photo=_photo(points, grid, options, dop_cell),
@@ -127,6 +138,8 @@ def tags(options: Options) -> dict[str, str]:
     return {
         "DSM": f"highest point per cell{spikes}; voids up to {options.fill_m:g} m filled linearly",
         "DTM": f"{kind} of {ground}; voids up to {options.void_m:g} m bridged linearly",
+        "ROAD_HEIGHT": f"mean, number and standard deviation of the points within {options.top_layer_m:g} m "
+        f"of the cell's highest{spikes}; voids up to {options.fill_m:g} m filled linearly, with the number 0",
         "BRIDGES": f"mean per cell of points of {_classes(options.bridge_classes)}",
         "DOP": f"colour of the highest point; voids take the nearest within {options.dop_fill_m:g} m",
     }

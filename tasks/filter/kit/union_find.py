@@ -72,9 +72,25 @@ def members_of(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], 
     cells : int
         Number of cells of the grid.
     """
-    sizes = np.bincount(roots, minlength=cells)
-    number = np.cumsum(sizes > 0) - 1
-    return number[roots], sizes[sizes > 0]
+    member, count = _numbered(roots, cells)
+    return member, np.bincount(member, minlength=count)
+
+
+@compiled()
+def _numbered(roots: NDArray[np.int32], cells: int) -> tuple[NDArray[np.intp], int]:
+    """Return the number of each cell's cluster, in ascending order of roots, and that of clusters."""
+    number = np.zeros(cells, np.int32)
+    for root in roots:
+        number[root] = 1
+    count = 0
+    for root in range(cells):
+        if number[root]:
+            number[root] = count
+            count += 1
+    member = np.empty(len(roots), np.intp)
+    for k in range(len(roots)):
+        member[k] = number[roots[k]]
+    return member, count
 
 
 def clean(points: Bools, roots: Roots, least: float, keep: int | None) -> NDArray[np.int32]:

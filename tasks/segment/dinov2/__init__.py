@@ -1,1 +1,1 @@
-"""Segment roads by a frozen DINOv2 and a trained head, as in the paper."""
+"""Segment roads by DINOv2, as in the paper; here it is frozen and has a trained head."""

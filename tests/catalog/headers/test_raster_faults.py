@@ -66,6 +66,19 @@ def test_alpha_band_and_mask_are_no_heights(tmp_path):
     assert tile.layer("dsm").files == ("a.tif",)
 
 
+def test_bands_described_as_road_height_have_heights(tmp_path):
+    for name in ("dsm.tif", "dtm.tif"):
+        write(tmp_path / name, HEIGHTS)
+    bands(tmp_path / "road_height.tif", 3, "float32")
+    patterns = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_height": "road_height.tif"}
+    with pytest.raises(CatalogError, match="road_height.*has 3 bands"):
+        rasters.index(tmp_path, patterns, tile_size_m=20, min_cover=0)
+    with rasterio.open(tmp_path / "road_height.tif", "r+") as raster:
+        raster.descriptions = ("height", "count", "spread")
+    (tile,) = rasters.index(tmp_path, patterns, tile_size_m=20, min_cover=0).tiles
+    assert tile.layer("road_height").files == ("road_height.tif",)
+
+
 @pytest.mark.parametrize(
     ("numbers", "match"),
     [

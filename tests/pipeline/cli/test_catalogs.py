@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 
+import flexroad as library
 from flexroad.catalog import Catalog
 from tests.command_line import call
 from tests.make_rasters import write
@@ -67,3 +69,25 @@ def test_catalog_folder_not_matching_layout_fails(tmp_path):
     )
     assert "error: layout: no template for dsm" in error
     assert not Path(tmp_path / "c.json").exists()
+
+
+@pytest.mark.slow
+def test_production_fits_roads_to_layer_road_height(tmp_path):
+    heights = ground(5700000, 356000)
+    layers = {"dsm": heights + np.float32(0.1), "dtm": heights, "road_height": heights}
+    for name, values in layers.items():
+        write(tmp_path / f"{name}.tif", values, 356000, 5700000)
+    write(tmp_path / "road.tif", (np.abs(np.arange(60) - 30)[:, None] < 6) * np.ones((60, 60), np.uint8),
+          356000, 5700000)  # fmt: skip
+    catalog = tmp_path / "catalog.parquet"
+    words = [word for name in layers for word in (f"--{name.replace('_', '-')}", f"{name}.tif")]
+    flexroad("catalog", "rasters", tmp_path, *words, "--road-mask", "road.tif", "--tile-size", 60,
+             "-o", catalog)  # fmt: skip
+    for chosen, excess in (("auto", 0.1), ("dsm", 0.0)):
+        out = tmp_path / chosen
+        flexroad("run", "--config", "production", "--set", f"load.road_height={chosen}",
+                 "--catalog", catalog, "--out", out, "--executor", "serial")  # fmt: skip
+        row = library.open_run(out).metrics.iloc[0]
+        assert row.dsm_excess_m == pytest.approx(excess, abs=1e-4)
+        # Without a reference the DTM is the truth.
+        assert row.l2_road_m == pytest.approx(0.1 - excess, abs=0.02)

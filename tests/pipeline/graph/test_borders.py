@@ -142,6 +142,7 @@ def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
         ("fit", {"huber_m": 0.2}, True),
         ("ecsrc", {"verge_m": 3}, True),
         ("load", {"halo_m": 20}, False),
+        ("load", {"road_height": "dsm"}, True),
         ("sample", {"road_m": 2}, False),
     ):
         raw = {**NIGHTLY.raw, stage: {**NIGHTLY.raw[stage], **option}}

@@ -101,7 +101,7 @@ def test_rasters_larger_than_the_disk_raise(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2**30))
     assert grid((0, 0, 5000, 5000), tmp_path / "new" / "out").shape == (5000, 5000)
     with pytest.raises(
-        ConfigError, match=r"a.laz would need about 2.8 GiB .* 1.0 GiB are free; use larger cells"
+        ConfigError, match=r"a.laz would need about 3.9 GiB .* 1.0 GiB are free; use larger cells"
     ):
         grid((0, 0, 10_000, 10_000), tmp_path / "new" / "out")
 

@@ -148,6 +148,7 @@ def test_prepare_mesh_without_dop_writes_no_orthophoto(box, tmp_path):
         "catalog.parquet",
         "dsm.tif",
         "dtm.tif",
+        "road_height.tif",
     ]
 
 

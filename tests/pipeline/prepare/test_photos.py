@@ -46,6 +46,7 @@ def test_prepare_photos_reconstructs_the_rendered_hill(tmp_path):
         "dop.tif",
         "dsm.tif",
         "dtm.tif",
+        "road_height.tif",
     ]
     # Cells finer than the stereo resolves are made coarser, with a note.
     assert any("cells of 0.5 m and pixels of 0.5 m, not 0.5 m and 0.25 m" in note for note in published.notes)

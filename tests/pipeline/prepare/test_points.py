@@ -122,6 +122,7 @@ def test_prepare_points_gives_true_heights(tmp_path, unit, crs, metric, corner):
     assert valid.mean() > 0.95
     assert np.abs(dsm - truth)[valid].max() < 1e-4
     assert np.isfinite(dsm).all()
+    check_road_height(tmp_path / "out", dsm)
 
     dtm, _ = read(tmp_path / "out", "dtm")
     rows, cols = np.indices(dtm.shape)
@@ -136,6 +137,20 @@ def test_prepare_points_gives_true_heights(tmp_path, unit, crs, metric, corner):
     # The deck height of a cell is the mean of its points, not the height at its centre.
     assert np.abs(data.reference - plane - DECK_M)[deck].max() < 0.08 + WITHIN
     assert np.array_equal(data.reference[~deck], data.dtm[~deck])
+
+
+def check_road_height(out, dsm):
+    with rasterio.open(out / "road_height.tif") as file:
+        height, count, spread = file.read()
+        assert file.descriptions == ("height", "count", "spread")
+        assert file.units == ("m", None, "m")
+        assert file.tags()["LAYER"] == "road_height"
+    below = dsm - height
+    assert below.min() > -1e-4
+    assert below.max() < 0.25
+    assert np.array_equal(np.isnan(spread), count == 0)
+    assert np.abs(below[count == 1]).max() < 1e-4
+    assert (below[count > 5] > 0).mean() > 0.9
 
 
 def test_prepare_points_dop_has_colour_of_highest_point(tmp_path):
@@ -197,7 +212,8 @@ def test_prepare_points_with_workers_gives_the_same_rasters(plain, tmp_path, mon
     prepare(plain[0], tmp_path / "out", executor, ground="filter")
     check_same(tmp_path / "out", plain[1])
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"dsm.tif", "dtm.tif", "bridges.tif", "dop.tif", "catalog.parquet"}
+    rasters = {f"{name}.tif" for name in ("dsm", "dtm", "road_height", "bridges", "dop")}
+    assert names == {*rasters, "catalog.parquet"}
 
 
 def test_prepare_points_ground_auto_uses_classes_only_if_present(tmp_path):
@@ -394,3 +410,13 @@ def test_structures_of_ahn_are_bridges_only_if_told(tmp_path, classes, is_bridge
     noted = [note for note in result.notes if "--class-scheme ahn" in note]
     assert len(noted) == (not is_bridge)
     assert all(f"{(kind == 17).sum():,} points of class 26" in note for note in noted)
+
+
+def test_bridge_decks_of_las_that_are_not_used_are_noted(tmp_path):
+    xyz, kind, _ = world()
+    path = write_cloud(tmp_path / "a.las", xyz, kind, "EPSG:25832")
+    result, _ = prepare([path], tmp_path / "out", options=Options(bridge_classes=(26,)))
+    (noted,) = [note for note in result.notes if "--bridge-class 17" in note]
+    assert f"{(kind == 17).sum():,} points of class 17" in noted
+    result, _ = prepare([path], tmp_path / "used", options=Options(bridge_classes=(17, 26)))
+    assert not [note for note in result.notes if "--bridge-class" in note]

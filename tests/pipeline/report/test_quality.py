@@ -4,12 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+import yaml
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.quality import highest_error_estimates, over_tiles
+from flexroad.pipeline.report.quality import held_out, highest_error_estimates, over_tiles
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, metrics_frame, read_metrics
@@ -46,6 +47,29 @@ def test_over_tiles_gives_means_and_counts_flagged_tiles():
     row = over_tiles(metrics, ["flexroad"]).iloc[0]
     assert row["error estimate (m)"] == pytest.approx(0.3)
     assert row["flagged tiles"] == 2
+
+
+def test_held_out_weighs_tiles_by_their_squares():
+    metrics = rows([0.1, 0.2, 0.3])
+    metrics["holdout_squares"] = [10.0, 30.0, np.nan]
+    metrics["holdout_error_m"] = [0.01, 0.03, np.nan]
+    metrics["holdout_covered"] = [1.0, 0.8, np.nan]
+    row = held_out(metrics, ["flexroad"]).iloc[0]
+    assert row["withheld squares"] == 40
+    assert row["mean difference (m)"] == pytest.approx(0.025)
+    assert row["within the 90% interval (%)"] == pytest.approx(85)
+    assert held_out(rows([0.1]), ["flexroad"]).empty
+
+
+def test_run_with_holdout_fits_twice_and_reports_its_squares(survey, tmp_path, executor):
+    options = {"extends": "nightly", "assess": {"holdout": 0.5}}
+    (tmp_path / "held.yaml").write_text(yaml.safe_dump(options))
+    run = Run.create(tmp_path / "run", load_config(tmp_path / "held.yaml"), Catalog.read(survey))
+    run_tiles(run, executor)
+    table = read_metrics(run.path)
+    assert table.holdout_squares.sum() > 5
+    assert table.holdout_error_m.dropna().between(0.001, 0.3).all()
+    assert gather(run).held_out["withheld squares"][0] == table.holdout_squares.sum()
 
 
 def test_tables_without_error_estimates_are_empty():

@@ -50,6 +50,16 @@ def test_true_mask_changes_only_evaluation(survey):
         assert {stage for stage in nodes if nodes[stage] != true[variant][stage]} == {"evaluate"}
 
 
+def test_literal_changes_only_the_nurbs_and_what_follows(survey):
+    tile = Catalog.read(survey).tiles[0]
+    ours, literal = (tile_graph(tile, load_config(name)).variants for name in ("ablation", "literal"))
+    assert ours.keys() == literal.keys()
+    for variant, nodes in ours.items():
+        changed = {stage for stage in nodes if nodes[stage] != literal[variant][stage]}
+        same = variant in ("plane", "rgt", "wo_nurbs")
+        assert changed == (set() if same else {"fit", "sample", "evaluate", "assess"}), variant
+
+
 @pytest.fixture(scope="module")
 def one_tile(tmp_path_factory):
     from flexroad.pipeline.benchmark.scenes import write_scenes

@@ -17,7 +17,12 @@ from flexroad.pipeline.worker.evaluator import Evaluator
 
 CONFIG = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 5},
-    "variants": {"plane": {"fit": "plane"}, "raster": {"fit": "raster"}, "flexroad": {}},
+    "variants": {
+        "plane": {"fit": "plane"},
+        "raster": {"fit": "raster"},
+        "flexroad": {},
+        "moving": {"fit": {"plan": "moving"}},
+    },
 }
 
 
@@ -52,8 +57,8 @@ def test_codec_restores_every_result_exactly(evaluator):
             assert same(getattr(value, field.name), getattr(back, field.name)), (node.stage, field.name)
         kinds.add(type(value).__name__)
     assert kinds == {
-        "RoadMask", "RoadClusters", "PlaneSurface", "RasterSurface", "NurbsSurface", "Mesh", "Metrics",
-            "Quality",
+        "RoadMask", "RoadClusters", "PlaneSurface", "RasterSurface", "NurbsSurface", "MovingNurbs", "Mesh",
+            "Metrics", "Quality",
     }  # fmt: skip
 
 

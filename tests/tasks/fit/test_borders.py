@@ -59,13 +59,13 @@ def frame_of(world, tile):
     return Frame(*parts)
 
 
-def fit_tiles(world, halo_m=50):
+def fit_tiles(world, halo_m=50, options=OPTIONS):
     """Return the surfaces of the four tiles by (column, row), each fitted with the ground around it alone."""
     surfaces = {}
     for _, tile in ALL.tiles(250):
         data = part(world, tile.buffered(halo_m), tile)
         key = round(tile.west - ALL.west) // 250, round(tile.south - ALL.south) // 250
-        surfaces[key] = smoothing_spline.fit(data, filtered(data)[1], OPTIONS, frame_of(world, tile))
+        surfaces[key] = smoothing_spline.fit(data, filtered(data)[1], options, frame_of(world, tile))
     return surfaces
 
 
@@ -125,8 +125,9 @@ def test_void_on_corner_is_bridged_as_by_one_fit_of_all(stratum):
     assert off[~void].mean() < 0.5e-3
 
 
-def test_neighbours_meet_exactly():
-    surfaces = fit_tiles(made_world("rural"))
+@pytest.mark.parametrize("steps", [False, True])
+def test_neighbours_meet_exactly(steps):
+    surfaces = fit_tiles(made_world("rural"), options=smoothing_spline.Options(steps=steps))
     along = np.random.default_rng(0).uniform(0, 250, 500)
     for one, other, x, y in (
         ((0, 0), (1, 0), np.full(500, 500250.0), 5600000 + along),

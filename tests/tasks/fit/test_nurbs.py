@@ -155,6 +155,47 @@ def test_minimise_returns_variables_of_lowest_loss(engine):
     assert loss_function(best)[0] == pytest.approx(min(losses), rel=1e-12)
 
 
+def test_minimise_with_last_returns_variables_of_last_step():
+    loss_function, at = random_objective()
+    schedule = adam.Schedule(5.0, 20, 0, 20, last=True)
+    result, losses = adam.minimise(loss_function, at, np.full((2, 1, 1), 2.0), schedule)
+    assert loss_function(result)[0] == losses[-1] > min(losses)
+
+
+def test_fit_unbounded_weights_exceed_the_bounds():
+    data, clusters, _ = tile(noise=1.0)
+    changes = {"learning_rate": 1.0, "iterations": 60, "stop_tolerance": 0}
+    softplus = fitted(data, clusters, weights="softplus", **changes)
+    assert (softplus.W.min() > 0, softplus.W.max() > 10) == (True, True)
+    unbounded = fitted(data, clusters, weights="unbounded", plan="moving", **changes)
+    assert unbounded.W.min() < 0
+
+
+def test_fit_moving_plan_has_the_heights_of_the_fixed_plan():
+    data, clusters, _ = tile(noise=0.1)
+    fixed, moving = (fitted(data, clusters, weights="softplus", plan=plan) for plan in ("fixed", "moving"))
+    np.testing.assert_array_equal(on_cells(moving, data), on_cells(fixed, data))
+
+
+def test_fit_level_start_without_steps_is_level():
+    data, clusters, _ = tile()
+    heights = on_cells(fitted(data, clusters, start="level", iterations=0), data)
+    np.testing.assert_allclose(heights, heights[0, 0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"weights": "unbounded"},
+        {"weights": "softplus", "engine": "torch"},
+        {"result": "last", "engine": "torch"},
+    ],
+)
+def test_options_that_no_engine_has_raise(changes):
+    with pytest.raises(ValidationError, match="need"):
+        options(**changes)
+
+
 @pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_fit_free_weights_stay_within_bounds(engine):
     data, clusters, _ = tile(noise=1.0)

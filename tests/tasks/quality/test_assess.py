@@ -4,10 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.fit import nurbs, plane
 from flexroad.tasks.quality.assess import NO_ROAD, Options, assess
+from flexroad.tasks.quality.estimate import FACTOR, LEAST_M
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Quality, RoadClusters, RoadMask, TileData
@@ -21,7 +23,8 @@ NOISE = 0.05 * np.random.default_rng(4).standard_normal(GRID.shape)
 CROWN = STREET & (np.hypot(ROW - 55, COL - 60) < 9)
 DOME = 5 + np.random.default_rng(5).uniform(-2, 2, GRID.shape)
 FIT = nurbs.Options(control_points=(18, 16), weights="unit")
-FLOATS = [field.name for field in fields(Quality) if field.name not in ("flags", "support")]
+OTHERS = ("flags", "support", "bounded_weights")
+FLOATS = [field.name for field in fields(Quality) if not field.name.startswith(("holdout", *OTHERS))]
 
 
 class GivenHeights:
@@ -64,8 +67,8 @@ def test_assess_figures_equal_hand_computed_values():
     assert quality.edge_step_m == pytest.approx(0.3, abs=0.01)
     assert quality.off_dtm_m == pytest.approx(1.1)
     assert quality.off_dtm_road == 1
-    # The DSM is nearer than the DTM, and it has no scatter.
-    assert quality.error_estimate_m == pytest.approx(0.1)
+    # The street was fitted to the DSM.
+    assert quality.error_estimate_m == pytest.approx(LEAST_M + 0.1 * FACTOR)
     assert quality.curvature_per_m == pytest.approx(0, abs=0.01)
 
 
@@ -127,7 +130,9 @@ def test_assess_error_estimate_grows_with_inferred_cells():
     data = tile(dsm=np.where(CROWN, TRUTH + DOME, TRUTH + NOISE))
     valid = assessed(data, None, kept=STREET & ~CROWN)
     inferred = assessed(data, None, kept=STREET & ~CROWN, dtm_invalid=CROWN)
-    assert inferred.error_estimate_m > valid.error_estimate_m + 0.3 * CROWN.sum() / STREET.sum() - 0.01
+    away = distance_transform_edt(CROWN | ~STREET)[CROWN]
+    rise = (away**2 / 200).sum() / STREET.sum()
+    assert inferred.error_estimate_m == pytest.approx(valid.error_estimate_m + rise, abs=0.01)
 
 
 def test_assess_weights_at_bound_are_counted():
@@ -145,7 +150,7 @@ def test_assess_plane_has_all_figures_but_weights():
     quality = assessed(tile(), flat)
     assert np.isnan(quality.bounded_weights)
     assert "error-estimate" in quality.flags
-    assert np.isfinite([getattr(quality, name) for name in FLOATS if name != "bounded_weights"]).all()
+    assert np.isfinite([getattr(quality, name) for name in FLOATS]).all()
 
 
 def test_assess_without_road_or_data():

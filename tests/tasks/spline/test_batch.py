@@ -107,6 +107,32 @@ def test_batch_with_other_options_equals_fit(changes):
 
 
 @pytest.mark.slow
+def test_batch_of_whole_tile_equals_fit():
+    """Of 250 m, with a part beside the road that the fit hardly holds."""
+    grid = Grid(TILE.crs, TILE.west, TILE.north, 1.0, 250, 250)
+    scene = make_scene(grid, 4, "suburban")
+    data = TileData("made", grid, grid, scene.dsm, scene.dtm)
+    clusters = RoadClusters(grid, scene.road_mask.astype(np.int32))
+    (surface,) = smoothing_spline.fit_batch([(data, clusters, None)], OPTIONS, Engine())
+    at = grid.eastings, grid.northings
+    expected = smoothing_spline.fit(data, clusters, OPTIONS).lattice(*at)
+    assert 1e3 * np.abs(surface.lattice(*at) - expected).max() < MOST_MM
+
+
+@pytest.mark.slow
+def test_fit_with_engine_torch_is_a_batch_of_one():
+    data, clusters, frame = framed(made("rural", 4))
+    torch_options = OPTIONS.model_copy(update={"engine": "torch"})
+    (expected,) = smoothing_spline.fit_batch([(data, clusters, frame)], OPTIONS, Engine())
+    assert np.array_equal(smoothing_spline.fit(data, clusters, torch_options, frame).A, expected.A)
+
+
+def test_engine_torch_with_high_degree_is_an_error():
+    with pytest.raises(ValueError, match="engine torch needs degree 3 or less, not 5; choose engine numba"):
+        smoothing_spline.Options(engine="torch", degree=5)
+
+
+@pytest.mark.slow
 def test_l1_has_the_loss_of_fit():
     """L1 has no unique minimum, so surfaces can differ where the loss does not."""
     options = OPTIONS.model_copy(update={"huber_m": 0.0})

@@ -111,6 +111,22 @@ def test_irls_wide_huber_equals_least_squares():
     np.testing.assert_allclose(result.z.ravel(), exact, atol=1e-4)
 
 
+@pytest.mark.parametrize(("huber_m", "more"), [(0.003, 5), (0.1, 0), (1.0, 0)])
+def test_irls_huber_near_newton_reaches_same_minimum_in_few_steps(huber_m, more, monkeypatch):
+    """Also where nearly all differences are above the limit, so that Newton's steps are too long."""
+    spline_space = space(7, 8, (24, 20))
+    bending = bending_energy(np.full((24, 20), 1e-3), spline_space)
+    loss = convex_loss(huber_m=huber_m, bending=bending)
+    start = np.zeros(loss.shape)
+    fast, exact = (irls.minimise(loss, start, 200, tolerance) for tolerance in (1e-8, 0.0))
+    monkeypatch.setattr(irls, "OUTLIERS", 1.0)
+    plain, slow = (irls.minimise(loss, start, 200, tolerance) for tolerance in (1e-8, 0.0))
+    assert len(fast.losses) <= len(plain.losses) + more
+    assert fast.losses[-1] == pytest.approx(slow.losses[-1], rel=1e-7)
+    np.testing.assert_allclose(exact.z, slow.z, atol=1e-3)
+    assert (np.diff(fast.losses) <= 0).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, 2, 3, 6])
 def test_irls_reaches_loss_of_long_adam_run(degree):

@@ -36,7 +36,7 @@ def test_solve_equals_dense_solution(seed, p, m, n, held_share):
     grids = Multigrid((m, n), p, held)
     stencil[:, 0, 0, p : p + m] += 1e-3
     matrix += 1e-3 * np.eye(m * n)
-    solution = grids.points(grids.solve(stencil, grids.lines(right), 1e-10, True))
+    solution = from_lines(grids.solve(stencil, to_lines(right, p), 1e-10, True), m, p)
     free, expected = ~held.ravel(), np.zeros(m * n)
     expected[free] = np.linalg.solve(matrix[np.ix_(free, free)], right.ravel()[free])
     np.testing.assert_allclose(solution.ravel(), expected, atol=1e-4 + 1e-6 * np.abs(expected).max())
@@ -59,7 +59,7 @@ def test_solve_with_indefinite_matrix_raises():
     stencil[:, 0, 0, 3:12] = -1.0
     grids = Multigrid((9, 9), 3, None)
     with pytest.raises(TaskError, match="control point 1 of the surface is undetermined"):
-        grids.solve(stencil, grids.lines(np.ones((9, 9))), 1e-6, True)
+        grids.solve(stencil, to_lines(np.ones((9, 9)), 3), 1e-6, True)
 
 
 def test_solve_undetermined_points_keep_their_height():
@@ -68,6 +68,6 @@ def test_solve_undetermined_points_keep_their_height():
     grids = Multigrid((20, 20), 3, None)
     right = np.zeros((20, 20))
     right[:, :5] = 1.0
-    solution = grids.points(grids.solve(stencil, grids.lines(right), 1e-8, True))
+    solution = from_lines(grids.solve(stencil, to_lines(right, 3), 1e-8, True), 20, 3)
     assert np.isfinite(solution).all()
     np.testing.assert_array_equal(solution[:, 15:], 0.0)

@@ -9,6 +9,7 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.tasks import TaskError
 from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
 from flexroad.tasks.synthetic.network import Plan
+from flexroad.tasks.synthetic.scene import true_height
 from flexroad.tasks.synthetic.strata import STRATA, stratum_at
 
 CLEAN = SceneOptions(density=0, mask_errors=0, dsm_noise_m=(0, 0), dtm_noise_m=0)
@@ -47,6 +48,12 @@ def test_make_scene_depends_on_seed():
         assert np.array_equal(layer, same.layers[name])
         assert not np.array_equal(layer, other.layers[name])
     assert np.array_equal(first.kind, same.kind)
+
+
+def test_true_height_equals_reference_of_scene():
+    grid, options = Grid("EPSG:32632", 500_000, 5_600_060, 1.0, 60, 60), SceneOptions(slope=0.1)
+    scene = make_scene(grid, 3, "urban", options)
+    np.testing.assert_array_equal(true_height(grid, 3, "urban", options), scene.reference)
 
 
 @pytest.mark.parametrize("seed", [1, 3])

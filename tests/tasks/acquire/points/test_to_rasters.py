@@ -72,6 +72,9 @@ def within(points: Points, where: Grid, rim_m: float) -> Points:
 def check_equal(result: Rasters, expected: Rasters, cut=np.s_[:, :], pixels=np.s_[:, :]) -> None:
     np.testing.assert_allclose(result.dsm, expected.dsm[cut], rtol=0, atol=1e-9)
     np.testing.assert_allclose(result.dtm, expected.dtm[cut], rtol=0, atol=1e-8)
+    for name in ("height", "count", "spread"):
+        values, of_whole = getattr(result.top, name), getattr(expected.top, name)[cut]
+        np.testing.assert_allclose(values, of_whole, rtol=0, atol=1e-7)
     decks = expected.bridges[cut]
     assert (result.bridges is None) == np.isnan(decks).all()
     if result.bridges is not None:
@@ -121,6 +124,13 @@ def test_rasterise_gives_true_heights():
     lake = np.hypot(x - 30, y - 12) < 5
     assert np.isnan(rasters.dtm[lake]).all()
     assert np.isnan(rasters.dsm[lake]).all()
+    assert np.array_equal(np.isnan(rasters.top.height), np.isnan(rasters.dsm))
+    filled = (rasters.top.count == 0) & np.isfinite(rasters.dsm)
+    assert filled.any()
+    assert np.isnan(rasters.top.spread[filled]).all()
+    plain = np.abs(rasters.dsm - truth) < 0.2
+    assert np.mean((rasters.dsm - truth)[plain]) > 0.04
+    assert abs(np.mean((rasters.top.height - truth)[plain])) < 0.005
     assert np.nanmax(np.abs(rasters.dtm - truth)) < 0.15
     assert np.nanmax(np.abs((rasters.bridges - truth)[deck])) < 5.1
     np.testing.assert_allclose((rasters.bridges - truth)[deck & ~lake], 5, atol=0.1)
@@ -183,6 +193,9 @@ def test_tags_describe_processing():
         "highest point per cell; single points 5 m above all around dropped; voids up to 3 m filled linearly"
     )
     assert "points of classes 2, 8" in described["DTM"]
+    assert described["ROAD_HEIGHT"].startswith(
+        "mean, number and standard deviation of the points within 0.25 m"
+    )
     filtered = tags(Options(ground="filter", dtm="mean", filter={"radius_m": 20, "slope": 0.3}))
     assert "mean per cell of slope-filtered points (Vosselman 2000: radius 20 m, " in filtered["DTM"]
     assert "dropped" not in filtered["DSM"]

@@ -1,0 +1,107 @@
+"""Estimated error of a surface, cell by cell: what it leaves of the heights that it was fitted to.
+
+Noise of single cells averages out in a smooth surface. What remains is the misfit of larger pieces of ground,
+so residuals are first averaged over squares; where a surface misses the heights around a place, it also
+misses those that nobody measured. The two constants were chosen on squares of 5 m that were withheld from DSM
+and DTM of eight places, so that 90% of the squares are within the interval (docs/quality.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+
+from flexroad.tasks.roads.distances import distances, filled
+from flexroad.tasks.roads.dtm_validity import AGREE_M, rise
+from flexroad.tasks.types import Bools, Floats
+
+SQUARE_M, AROUND_M = 5.0, 9.0
+"""Sides of the squares over which residuals, and then their absolute values, are averaged (m)."""
+LEAST_M, FACTOR = 0.0075, 1.8
+"""The estimate of a surface without such residuals (m), and its growth with them."""
+INTERVAL = 2.06
+"""Half width of the 90% interval over the mean absolute error, of a normal distribution."""
+MIN_SHARE = 0.2
+"""Smallest share of cells with a residual in a square that counts."""
+SCATTER_M = 5.0
+"""Side of the square over which the scatter of the DSM is taken (m); smaller than a tree crown."""
+
+
+def error_estimate(
+    residual: Floats, off_dtm: Floats, scatter: Floats, kept: Bools, road: Bools, cell: float
+) -> Floats:
+    """Return the estimated mean absolute error of the surface around each cell, ``(H, W)``, m.
+
+    It grows with the residuals of the cells of the same class (road or not) around. Away from any height it
+    grows by the height that a road may gain since the nearest one. On kept cells it
+    is at least the smaller of the DSM's scatter and the distance to the DTM: a tree crown that the filter
+    kept has both, a bridge deck only the second. Where there is no height at all, it is `AGREE_M`.
+
+    Parameters
+    ----------
+    residual : (H, W) array
+        Surface minus the height it was fitted to (m); NaN where none entered the fit.
+    off_dtm : (H, W) array
+        Surface minus DTM (m).
+    scatter : (H, W) array
+        The cells' `scatter` (m).
+    kept : (H, W) array of bool
+        Road cells that the filter kept.
+    road : (H, W) array of bool
+        Road cells.
+    cell : float
+        Size of a cell (m).
+    """
+    estimate = np.empty_like(residual)
+    for cells in (road, ~road):
+        estimate[cells] = _unexplained(residual, cells, cell)[cells]
+    return np.where(kept, np.fmax(estimate, np.fmin(scatter, np.abs(off_dtm))), estimate)
+
+
+def deviation(off_dsm: Floats, off_dtm: Floats, scatter: Floats, kept: Bools, inferred: Bools) -> Floats:
+    """Return the distance of the surface to the nearer of DSM and DTM in each cell, ``(H, W)``, m.
+
+    The DSM counts on kept cells, at least with its `scatter`; the DTM where it supports the surface. It is
+    NaN where neither does.
+    """
+    by_scan = np.where(kept, np.maximum(np.abs(off_dsm), scatter), np.nan)
+    by_dtm = np.where(inferred, np.nan, np.abs(off_dtm))
+    return np.fmin(by_scan, by_dtm)
+
+
+def scatter(dsm_above_dtm: Floats, kept: Bools, cell: float) -> Floats:
+    """Return the standard deviation of DSM minus DTM on kept cells around each cell, ``(H, W)``, m.
+
+    It is small on roads and bridge decks and large in tree crowns; 0 where no kept cell is near.
+    """
+    valid, size = kept & np.isfinite(dsm_above_dtm), _width(SCATTER_M, cell)
+    mean, _ = _mean_around(dsm_above_dtm, valid, size)
+    square, _ = _mean_around(dsm_above_dtm**2, valid, size)
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
+
+
+def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
+    """Return the estimate from the residuals of some cells around each cell, ``(H, W)``, m."""
+    valid = cells & np.isfinite(residual)
+    misfit, share = _mean_around(residual, valid, _width(SQUARE_M, cell))
+    misfit, share = _mean_around(np.abs(misfit), valid & (share >= MIN_SHARE), _width(AROUND_M, cell))
+    if not (share > 0).any():
+        return np.full(residual.shape, AGREE_M)
+    estimate = filled(np.where(share > 0, LEAST_M + FACTOR * misfit, np.nan), cells)
+    away = cells & ~valid
+    estimate[away] += rise(distances(away, valid) * cell)
+    return estimate
+
+
+def _mean_around(values: Floats, valid: Bools, size: int) -> tuple[Floats, Floats]:
+    """Return the mean of the valid values in a square around each cell, and their share of the square."""
+    share = scipy.ndimage.uniform_filter(valid.astype(np.float64), size)
+    total = scipy.ndimage.uniform_filter(np.where(valid, values, 0.0), size)
+    # Less than half a cell is a rounding error of the filter.
+    there = share * size**2 > 0.5
+    return total / np.where(there, share, 1.0), np.where(there, share, 0.0)
+
+
+def _width(side_m: float, cell: float) -> int:
+    """Return the odd number of cells that is nearest to a length."""
+    return 2 * max(1, round(side_m / cell / 2)) + 1

@@ -1,0 +1,120 @@
+"""Check the error estimate: squares of road are withheld, and a fit without them is compared with them.
+
+The intervals of `quality.estimate` should cover 90% of the squares, summed over many tiles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.metrics.statistics import mean
+from flexroad.tasks.quality.compared import compare, heights_fitted
+from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M
+from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
+
+INSET_M = 15.0
+"""Distance of the squares from the tile's border (m): heights there also shape the fixed border."""
+MIN_CELLS = 5
+"""Smallest number of kept road cells of a square; the mean of fewer is noise."""
+
+Refit = Callable[[TileData, RoadClusters], Surface]
+"""Fits data of the tile as its surface was fitted."""
+
+
+@dataclass(frozen=True)
+class Holdout:
+    """The fit without the withheld squares, compared with their mean heights."""
+
+    holdout_squares: float
+    """Number of the squares; NaN if none were to be withheld."""
+    holdout_error_m: float
+    """Mean absolute difference of surface and heights."""
+    holdout_covered: float
+    """Share of the squares whose difference is within the 90% interval of the estimate."""
+
+
+def holdout(
+    data: TileData,
+    road: RoadMask,
+    clusters: RoadClusters,
+    refit: Refit | None,
+    agree_m: float,
+    share: float,
+) -> Holdout:
+    """Fit without a share of the road's squares, and compare the surface and its error estimate with them.
+
+    Parameters
+    ----------
+    data, road, clusters
+        As in `tasks.quality.assess.assess`.
+    refit : callable
+        The fit; not needed if ``share`` is 0.
+    agree_m : float
+        Largest difference between two heights of the same ground (m).
+    share : float
+        Share of the squares that are withheld, from 0 to 1.
+    """
+    if not share or refit is None:
+        return Holdout(np.nan, np.nan, np.nan)
+    window, kept = data.grid.window(data.core), clusters.mask & np.isfinite(data.dsm)
+    squares = withheld_squares(kept[window], data.core, share)
+    if not (squares >= 0).any():
+        return Holdout(0.0, np.nan, np.nan)
+    away = np.zeros(data.grid.shape, np.bool_)
+    away[window] = squares >= 0
+    rest = _without(data, away)
+    try:
+        surface = refit(rest, clusters)
+    except TaskError:
+        # Too few heights are left for a second fit; the tile has its surface all the same.
+        return Holdout(0.0, np.nan, np.nan)
+    cells = compare(rest, road, clusters, surface, agree_m)
+    off = cells.height - heights_fitted(data, clusters)[window]
+    counted = (squares >= 0) & kept[window]
+    _, number = np.unique(squares[counted], return_inverse=True)
+    count = np.bincount(number)
+    difference = np.abs(np.bincount(number, off[counted]) / count)
+    estimate = np.bincount(number, cells.estimate[counted]) / count
+    return Holdout(len(count), mean(difference), mean(difference <= INTERVAL * estimate))
+
+
+def withheld_squares(kept: Bools, core: Grid, share: float) -> NDArray[np.int64]:
+    """Return the number of the withheld square in each cell of the core, ``(H, W)``; -1 in all others.
+
+    Squares lie at multiples of their side in easting and northing. Which ones are withheld follows from their
+    position alone, so it does not depend on how land is cut into tiles.
+    """
+    west, south, east, north = core.bounds
+    x, y = np.meshgrid(core.eastings, core.northings)
+    column, row = (np.floor(axis / SQUARE_M).astype(np.int64) for axis in (x, y))
+    inside = (np.minimum(x - west, east - x) > INSET_M) & (np.minimum(y - south, north - y) > INSET_M)
+    chosen = inside & (_random(column, row) < share)
+    number = np.where(chosen, column * 2**31 + row, -1)
+    present, cells = np.unique(np.where(kept, number, -1), return_counts=True)
+    enough = present[(cells >= MIN_CELLS) & (present >= 0)]
+    return np.where(np.isin(number, enough), number, -1)
+
+
+def _random(column: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return a number from 0 to 1 for each square that looks random (splitmix64)."""
+    value = (column.astype(np.uint64) << np.uint64(32)) ^ row.astype(np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        value = (value ^ (value >> np.uint64(shift))) * np.uint64(factor)
+    return (value ^ (value >> np.uint64(31))) / 2.0**64
+
+
+def _without(data: TileData, away: Bools) -> TileData:
+    """Return the data without the heights of some cells."""
+    top = data.road_height
+    return replace(
+        data,
+        dsm=np.where(away, np.nan, data.dsm),
+        dtm=np.where(away, np.nan, data.dtm),
+        road_height=None if top is None else np.where(away, np.nan, top),
+    )

@@ -1,0 +1,86 @@
+"""Distances from cells to the nearest cell of a mask, computed only where they are wanted.
+
+A search from a cell goes row by row away from it and ends where no row can be nearer. Gaps in rasters are
+mostly narrow, so it is much faster than a distance transform of the whole raster, and as exact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Bools, Floats
+
+
+def distances(wanted: Bools, mask: Bools) -> Floats:
+    """Return the distance from each wanted cell to the nearest cell of the mask, ``(n,)``, in cells.
+
+    Parameters
+    ----------
+    wanted, mask : (H, W) array of bool
+        The result is in row-major order of the wanted cells, and inf if the mask is empty.
+    """
+    squares, _ = _nearest(np.flatnonzero(wanted), columns_aside(mask))
+    return np.asarray(np.sqrt(squares))
+
+
+def filled(values: Floats, wanted: Bools | None = None) -> Floats:
+    """Return a raster with NaN replaced by the nearest value, in the wanted cells only if these are given.
+
+    Of several equally near, it is the one farthest to the west, then to the north.
+    """
+    missing = np.isnan(values)
+    holes = missing if wanted is None else missing & wanted
+    if not holes.any() or missing.all():
+        return values
+    result = values.copy()
+    result[holes] = values.ravel()[_nearest(np.flatnonzero(holes), columns_aside(~missing))[1]]
+    return result
+
+
+@compiled()
+def columns_aside(mask: Bools) -> NDArray[np.int32]:
+    """Return the column of the nearest cell of a mask in the same row minus the own column, ``(H, W)``.
+
+    In rows without such a cell its absolute value is larger than any distance in the grid.
+    """
+    rows, cols = mask.shape
+    aside = np.empty((rows, cols), np.int32)
+    for r in range(rows):
+        last = -(rows + cols)
+        for c in range(cols):
+            if mask[r, c]:
+                last = c
+            aside[r, c] = last - c
+        last = cols + rows + cols
+        for c in range(cols - 1, -1, -1):
+            if mask[r, c]:
+                last = c
+            if last - c < -aside[r, c]:
+                aside[r, c] = last - c
+    return aside
+
+
+@compiled()
+def _nearest(cells: NDArray[np.intp], aside: NDArray[np.int32]) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the squared distance from each cell to the nearest one of the mask, and that one's flat index.
+
+    Where there is none, they are inf and the cell itself. Of several equally near, the first by column and
+    then by row counts.
+    """
+    rows, cols = aside.shape
+    squares, found = np.full(len(cells), np.inf), cells.copy()
+    for k in range(len(cells)):
+        r, c, nearest = cells[k] // cols, cells[k] % cols, 2 * cols
+        for down in range(rows):
+            if down * down > squares[k]:
+                break
+            for row in (r - down, r + down):
+                col = c + aside[row, c] if 0 <= row < rows else -1
+                if not 0 <= col < cols:
+                    continue
+                square = float(down * down + (col - c) ** 2)
+                if square < squares[k] or (square == squares[k] and col < nearest):
+                    squares[k], found[k], nearest = square, row * cols + col, col
+    return squares, found

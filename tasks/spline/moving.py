@@ -1,0 +1,132 @@
+"""NURBS surfaces whose plan moves with the weights: the paper's S(u, v) in space (Eq. nurbs), as it stands.
+
+Control points have fixed places in plan. With weights that differ, the point S(u, v) is not at the place that
+belongs to (u, v): x and y are rational splines like the height. The fit compares heights with the rasters at
+(u, v), as the paper's R^S does, and takes no notice of the place of S(u, v). The mesh has its vertices there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.spline.objective import Objective
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats
+
+DECIMALS = 6
+"""Decimals of a metre that places are rounded to: what lies on the tile's edge stays exactly on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingNurbs:
+    """A NURBS in space; satisfies `tasks.types.Surface`, where places stand for their parameters (u, v).
+
+    `height` at a place is that of S(u, v), where u and v are affine in the place: a value of the paper's R^S,
+    not the height of the surface above the place. `moved` says where S(u, v) is in plan.
+    """
+
+    crs: str
+    bounds: Bounds
+    """The domain: west, south, east, north (m)."""
+    degree: tuple[int, int]
+    """Degree along u and v."""
+    knots_u: Floats
+    knots_v: Floats
+    A: Floats
+    """Weight times height above the datum, ``(m, n)``, m; row 0 in the south."""
+    W: Floats
+    """Weights, ``(m, n)``."""
+    X: Floats
+    """Weight times easting of the control points from the origin, ``(m, n)``, m."""
+    Y: Floats
+    """Weight times northing of the control points from the origin, ``(m, n)``, m."""
+    datum: float
+    """Height that heights in ``A`` are relative to (m)."""
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) that ``X`` and ``Y`` are relative to."""
+
+    def height(self, easting: Floats, northing: Floats) -> Floats:
+        """Return the heights (m) of S at the parameters of scattered places."""
+        return self._graph.height(easting, northing)
+
+    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return the heights (m) of S at the parameters of every pair, ``(northings, eastings)``."""
+        return self._graph.lattice(eastings, northings)
+
+    def normal(self, easting: Floats, northing: Floats) -> Floats:
+        """Return upward unit normals of the heights over the parameters at scattered places, ``(..., 3)``."""
+        return self._graph.normal(easting, northing)
+
+    def moved(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
+        """Return easting and northing (m from the origin) of S at the parameters of scattered places."""
+        x, y = (replace(self._graph, A=xw, datum=0.0).height(easting, northing) for xw in (self.X, self.Y))
+        return x.round(DECIMALS), y.round(DECIMALS)
+
+    @property
+    def _graph(self) -> NurbsSurface:
+        return NurbsSurface(
+            self.crs, self.bounds, self.degree, self.knots_u, self.knots_v, self.A, self.W, self.datum,
+            self.origin,
+        )  # fmt: skip
+
+
+def moving(surface: NurbsSurface, uniform: bool = False) -> MovingNurbs:
+    """Return a surface with the same control heights and weights whose control points stay where they are.
+
+    Parameters
+    ----------
+    uniform : bool
+        Whether the control points have equal distances in plan; else they are at the Greville abscissae,
+        where S(u, v) with unit weights is at the place of (u, v).
+    """
+    west, south, east, north = surface.bounds
+    x, y = surface.control_points[..., 0], surface.control_points[..., 1]
+    if uniform:
+        m, n = surface.W.shape
+        x, y = np.meshgrid(np.linspace(west, east, n), np.linspace(south, north, m))
+    (east_0, north_0), w = surface.origin, surface.W
+    return MovingNurbs(
+        surface.crs, surface.bounds, surface.degree, surface.knots_u, surface.knots_v, surface.A, w,
+        w * (x - east_0), w * (y - north_0), surface.datum, surface.origin,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights without bounds, as a function of the variables of the fit."""
+
+    start: float
+    """Variable of the weight 1."""
+    value: Callable[[Floats], Floats]
+    """The weights of the variables."""
+    slope: Callable[[Floats], Floats]
+    """Derivatives of the weights by the variables."""
+
+    def loss(self, objective: Objective) -> Callable[[Floats], tuple[float, Floats]]:
+        """Return the loss (m) and its gradient as a function of heights and variables, ``(2, m, n)``."""
+
+        def at(variables: Floats) -> tuple[float, Floats]:
+            loss, by_z, by_w = objective.by_weight(variables[0], self.value(variables[1]))
+            return loss, np.stack([by_z, by_w * self.slope(variables[1])])
+
+        return at
+
+
+def _softplus(s: Floats) -> Floats:
+    return np.asarray(np.logaddexp(0.0, s))
+
+
+def _logistic(s: Floats) -> Floats:
+    return np.asarray(np.exp(-np.logaddexp(0.0, -s)))
+
+
+WEIGHTS = {
+    "softplus": Weights(math.log(math.e - 1), _softplus, _logistic),
+    "unbounded": Weights(1.0, np.asarray, np.ones_like),
+}
+"""By the names of the option ``weights``."""

@@ -1,0 +1,351 @@
+"""Errors at points and cells withheld from DSM and DTM: both configurations, real places and made scans.
+
+Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place, the place is prepared and run, and
+the surface is compared with what was taken out. Points count if they are ground: by their class or, without
+classes, within 0.3 m of the terrain model of all points. Of Autzen, the ground points of another
+classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,
+which is a second truth. Made scans have a scanner's noise, and are compared with the true surface.
+
+Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...]``; each NAME is a
+further configuration, production with options: ``--set soft=fit.bending_m3=20``. Real places need
+FLEXROAD_REAL_DATA.
+Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import rasterio
+from scipy.spatial import cKDTree
+
+import flexroad
+from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.sources import prepared, rasters
+from flexroad.pipeline.cli.main import main as command
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
+from flexroad.tasks.synthetic import SceneOptions, make_scene
+from flexroad.tasks.synthetic.points import DECK, GROUND, scan
+from flexroad.tasks.types import Bools, Floats
+
+SIDE_M, SHARE, SEED = 5.0, 0.06, 7
+"""Side of the squares, and the share of them that is withheld."""
+NEAR_M = 0.3
+"""Points without classes are ground within this distance of the terrain model of all points."""
+FOOT_M, SAME_M = 0.3048, 0.02
+AROUND_M, PLANE_M, FEWEST = 1.5, 0.25, 10
+"""Points up to this far in plan and height from a place make its plane (m), if there are so many."""
+CONFIGS = {
+    "paper": ("paper", ()),
+    "dsm": ("production", ("load.road_height=dsm",)),
+    "production": ("production", ()),
+}
+"""Configurations: the paper's, production fitted to the DSM, and production."""
+DRAWS = 2000
+Figure = Callable[[Floats], Floats]
+Configs = dict[str, tuple[str, Sequence[str]]]
+"""Name -> shipped configuration, and options that are set."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What was withheld."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    road: Bools
+    square: Floats
+    """Number of the square of each point: errors in a square are alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A catalog of which parts were withheld, and these parts by name."""
+
+    catalog: Path
+    truths: dict[str, Truth]
+
+
+def squares(x: Floats, y: Floats) -> tuple[Floats, Bools]:
+    """Return the number of the square of each point, and whether it is withheld."""
+    column, row = (np.floor(np.asarray(axis) / SIDE_M).astype(np.int64) for axis in (x, y))
+    number = column * 10**7 + row
+    # A hash of the number: which squares are withheld does not depend on the others.
+    mixed = ((number * np.int64(2654435761) + SEED) ^ (number >> 7)) % 1_000_003
+    mixed = (mixed * 48271 + SEED) % 1_000_003
+    return number, mixed < SHARE * 1_000_003
+
+
+def bilinear(path: Path, x: Floats, y: Floats, nearest: bool = False) -> Floats:
+    """Return the values of a raster at points."""
+    from scipy.ndimage import map_coordinates
+
+    with rasterio.open(path) as raster:
+        values = raster.read(1).astype(np.float64)
+        columns, rows = ~raster.transform * (np.asarray(x), np.asarray(y))
+    at = (np.asarray(rows) - 0.5, np.asarray(columns) - 0.5)
+    found: Floats = map_coordinates(values, at, order=0 if nearest else 1, mode="nearest")
+    return found
+
+
+def call(*words: object) -> None:
+    """Run a command of the program, without its output."""
+    before, sys.argv = sys.argv, ["flexroad", *map(str, words)]
+    try:
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+            command()
+    except SystemExit as end:
+        if end.code:
+            raise SystemExit(f"failed: flexroad {' '.join(map(str, words))}") from end
+    finally:
+        sys.argv = before
+
+
+def scanned(
+    files: Sequence[Path],
+    roads: Sequence[object],
+    options: Sequence[object],
+    folder: Path,
+    unit: float = 1.0,
+    others: Path | None = None,
+) -> Place:
+    """Withhold points of a scan and prepare it without them."""
+    call("prepare", "points", *files, *options, *roads, "-o", folder / "whole", "--workers", 1)
+    clouds = [laspy.read(file) for file in files]
+    x, y, z = (np.concatenate([np.asarray(cloud[a]) for cloud in clouds]) * unit for a in "xyz")
+    kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
+    number, out = squares(x, y)
+    extra = _other_ground(others, x, y, z) if others else None
+    gone = out if extra is None else out | extra
+    start = 0
+    for file, cloud in zip(files, clouds, strict=True):
+        kept = ~gone[start : start + len(cloud.points)]
+        start += len(cloud.points)
+        left = laspy.LasData(cloud.header, cloud.points[kept])
+        (folder / "points").mkdir(exist_ok=True)
+        left.write(folder / "points" / file.name)
+    kept_files = [folder / "points" / file.name for file in files]
+    call("prepare", "points", *kept_files, *options, *roads, "-o", folder / "left", "--workers", 1)
+    dtm, mask = folder / "whole" / "dtm.tif", folder / "whole" / "road_mask.tif"
+    has_classes = (kind == GROUND).mean() > 0.01
+    ground = np.isin(kind, (GROUND, DECK)) if has_classes else np.abs(bilinear(dtm, x, y) - z) < NEAR_M
+
+    def truth(chosen: Bools) -> Truth:
+        road = bilinear(mask, x[chosen], y[chosen], nearest=True) > 0
+        return Truth(x[chosen], y[chosen], z[chosen], road, number[chosen])
+
+    truths = {"squares": truth(out & ground)}
+    if extra is not None:
+        other = truth(extra)
+        truths["other classification"] = other
+        level = plane_at(np.column_stack([x, y, z])[~extra], np.column_stack([other.x, other.y, other.z]))
+        truths["plane around these"] = replace(other, z=level)
+    return Place(folder / "left" / "catalog.parquet", truths)
+
+
+def plane_at(points: Floats, places: Floats) -> Floats:
+    """Return the height of the plane through the points around each place, NaN with fewer than `FEWEST`."""
+    levels = np.full(len(places), np.nan)
+    near = cKDTree(points[:, :2]).query_ball_point(places[:, :2], AROUND_M)
+    for number, (place, found) in enumerate(zip(places, near, strict=True)):
+        offset = points[found] - place
+        offset = offset[np.abs(offset[:, 2]) < PLANE_M]
+        if len(offset) >= FEWEST:
+            terms = np.column_stack([np.ones(len(offset)), offset[:, :2]])
+            levels[number] = place[2] + np.linalg.lstsq(terms, offset[:, 2], rcond=None)[0][0]
+    return levels
+
+
+def _other_ground(file: Path, x: Floats, y: Floats, z: Floats) -> Bools:
+    """Return which points are ground in another classification of the same survey."""
+    cloud = laspy.read(file)
+    ground = np.asarray(cloud.classification) == GROUND
+    points = np.column_stack([np.asarray(cloud[axis])[ground] * FOOT_M for axis in "xyz"])
+    distance, _ = cKDTree(points).query(np.column_stack([x, y, z]), distance_upper_bound=SAME_M)
+    return np.isfinite(distance)
+
+
+def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path) -> Place:
+    """Withhold cells of a town's DSM, with canopies, and DTM; truth is its DTM, and road is paved ground."""
+    zipfile.ZipFile(archive).extractall(folder)
+    root = folder / archive.stem
+    paths = {layer: next(root.glob(pattern)) for layer, pattern in patterns.items()}
+    with rasterio.open(paths["dtm"]) as raster:
+        profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
+        columns, rows = np.meshgrid(np.arange(raster.width), np.arange(raster.height))
+        x, y = (
+            np.asarray(axis).reshape(rows.shape) for axis in raster.transform * (columns + 0.5, rows + 0.5)
+        )
+    layers = {}
+    for name, path in paths.items():
+        with rasterio.open(path) as raster:
+            layers[name] = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+    dtm = layers["dtm"]
+    dsm = np.fmax(layers["dsm"], dtm + np.nan_to_num(layers["canopy"]))
+    number, out = squares(x, y)
+    for name, heights in (("left_dsm.tif", dsm), ("left_dtm.tif", dtm)):
+        with rasterio.open(root / name, "w", **profile) as raster:
+            raster.write(np.where(out | np.isnan(heights), -9999.0, heights), 1)
+    files = {"dsm": "left_dsm.tif", "dtm": "left_dtm.tif", "road_mask": patterns["cover"]}
+    Catalog(rasters.index(root, files, road_values=(1,), crs=crs).tiles).write(folder / "catalog.parquet")
+    there = out & np.isfinite(dtm) & (layers["cover"] != 4)
+    truth = Truth(x[there], y[there], dtm[there], layers["cover"][there] == 1, number[there])
+    return Place(folder / "catalog.parquet", {"squares": truth})
+
+
+def made(stratum: str, folder: Path) -> Place:
+    """Withhold points of a made scan of two by two tiles; the true surface is the truth."""
+    whole = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
+    options = SceneOptions(dsm_noise_m=(0.0, 0.0))
+    scene = make_scene(whole, SEED, stratum, options)
+    points = scan(scene, per_m2=8, noise_m=0.03, seed=SEED)
+    left = rasterise(points[~squares(points.easting, points.northing)[1]], whole, Options(), None)
+    layers = {
+        "dsm": left.dsm, "dtm": left.dtm, "road_height": left.top.height, "road_mask": scene.road_mask,
+        "reference": scene.reference, "reference_road": scene.reference_road,
+    }  # fmt: skip
+    for name, tile in whole.tiles(250):
+        cut = whole.window(tile)
+        prepared.write_tile(folder, name, tile, {layer: values[cut] for layer, values in layers.items()})
+    Catalog(tuple(prepared.index(folder))).write(folder / "catalog.parquet")
+    x, y = np.meshgrid(whole.eastings, whole.northings)
+    number, out = squares(x, y)
+    z, road = scene.reference, scene.reference_road
+    return Place(
+        folder / "catalog.parquet", {"squares": Truth(x[out], y[out], z[out], road[out], number[out])}
+    )
+
+
+def places(data: Path | None, roads: Path) -> dict[str, Callable[[Path], Place]]:
+    """Return the places by name; each makes its data in a folder."""
+    found: dict[str, Callable[[Path], Place]] = {
+        f"made, {stratum}": lambda folder, stratum=stratum: made(stratum, folder)
+        for stratum in ("urban", "suburban", "rural")
+    }
+    if data is None:
+        return found
+    where = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
+    drawn = data / "autzen" / "roads" / "autzen_north_roads.gpkg"
+    found["Autzen north"] = lambda folder: scanned(
+        [data / "autzen" / "autzen_north.laz"],
+        ["--roads", drawn, "--roads-layer", "road_polygons", "--roads-where", where],
+        ["--crs", "EPSG:2994"], folder, FOOT_M, data / "autzen" / "autzen-thin.las",
+    )  # fmt: skip
+    found["IGN"] = lambda folder: scanned(
+        sorted((data / "ign_crops" / "l93_770500_6277500").glob("*.la[sz]")),
+        ["--roads", roads / "ign_l93.geojson"], ["--cell", 0.5], folder,
+    )  # fmt: skip
+    found["Brighton Beach"] = lambda folder: scanned(
+        [data / "brighton_beach" / "model.laz"],
+        ["--roads", roads / "brighton_beach.geojson"], ["--cell", 0.5, "--dop-cell", 0.25], folder,
+    )  # fmt: skip
+    barbican = {
+        "dsm": "dsm_barb*.tif",
+        "dtm": "dem_barb*.tif",
+        "canopy": "cdsm_barb*.tif",
+        "cover": "landcover*.tif",
+    }
+    found["Barbican"] = lambda folder: town(data / "umep" / "London_BNG.zip", "EPSG:27700", barbican, folder)
+    gothenburg = {
+        "dsm": "DSM_KR*.tif",
+        "dtm": "DEM_KR*.tif",
+        "canopy": "CDSM_KR*.asc",
+        "cover": "landcover.tif",
+    }
+    found["Gothenburg"] = lambda folder: town(
+        data / "umep" / "Goteborg_SWEREF99_1200.zip", "EPSG:3007", gothenburg, folder
+    )
+    return found
+
+
+def run(place: Place, config: str, options: Sequence[str], folder: Path) -> flexroad.RunView:
+    """Run a configuration over a place, FlexRoad alone."""
+    file = folder.with_suffix(".yaml")
+    file.write_text(f"extends: {config}\nvariants: {{flexroad: {{}}}}\n")
+    chosen = [word for option in options for word in ("--set", option)]
+    call("run", "--config", file, *chosen, "--executor", "serial",
+         "--catalog", place.catalog, "--out", folder, "--allow", place.catalog.anchor)  # fmt: skip
+    return flexroad.open_run(folder, allow=[place.catalog.anchor])
+
+
+def interval(values: Floats, groups: Floats, figure: Figure) -> tuple[float, float, float]:
+    """Return a figure, a function of sums of values, and its interval by a bootstrap over groups."""
+    _, index = np.unique(groups, return_inverse=True)
+    sums = np.column_stack([np.bincount(index, value) for value in np.atleast_2d(values)])
+    draws = np.random.default_rng(0).integers(0, len(sums), (DRAWS, len(sums)))
+    low, high = np.percentile(figure(sums[draws].sum(axis=1).T), [2.5, 97.5])
+    return float(figure(sums.sum(axis=0)[:, None])[0]), float(low), float(high)
+
+
+def mean_of(values: Floats, groups: Floats) -> str:
+    """Return the mean of values and its interval as text."""
+    if not len(values):
+        return "-"
+    one = np.ones_like(values)
+    mean, low, high = interval(np.stack([values, one]), groups, lambda sums: sums[0] / sums[1])
+    return f"{mean:+.4f} ({low:+.4f} {high:+.4f})"
+
+
+def rmse_of(errors: Floats, groups: Floats) -> str:
+    rmse, low, high = interval(
+        np.stack([errors**2, np.ones_like(errors)]), groups, lambda sums: np.sqrt(sums[0] / sums[1])
+    )
+    return f"{rmse:.4f} ({low:.4f} {high:.4f})"
+
+
+def by_ground(held: str, truth: Truth, error: Floats) -> Iterator[tuple[str, Floats, Floats]]:
+    """Yield a title, the errors that are known, and their squares, for road and terrain."""
+    for ground, cells in (("road", truth.road), ("terrain", ~truth.road)):
+        there = cells & np.isfinite(error)
+        if there.any():
+            yield f"  {held}, {ground}:", error[there], truth.square[there]
+
+
+def compare(name: str, place: Place, folder: Path, configs: Configs) -> None:
+    """Print the figures of each configuration, and what production changes."""
+    errors: dict[tuple[str, str], Floats] = {}
+    for config, (base, options) in configs.items():
+        view = run(place, base, options, folder / config)
+        number, faces = np.arange(len(view.metrics)), view.metrics.triangles.to_numpy(np.float64)
+        mad = view.metrics.mad_road_deg.to_numpy()
+        seen = np.isfinite(mad)
+        print(f"{name}, {config}: MAD {mean_of(mad[seen], number[seen])} deg, T {mean_of(faces, number)}")
+        for held, truth in place.truths.items():
+            errors[config, held] = view.height(truth.x, truth.y) - truth.z
+            for title, error, group in by_ground(held, truth, errors[config, held]):
+                l2, bias = mean_of(np.abs(error), group), mean_of(error, group)
+                where = f"{error.size} in {np.unique(group).size} squares"
+                print(f"{title} {where}: L2 {l2} RMSE {rmse_of(error, group)} bias {bias}", flush=True)
+    for held, truth in place.truths.items():
+        for other in (config for config in configs if config != "production"):
+            gain = np.abs(errors["production", held]) - np.abs(errors[other, held])
+            for title, change, group in by_ground(held, truth, gain):
+                print(f"{title} L2 of production minus {other} {mean_of(change, group)}", flush=True)
+
+
+def main(words: list[str]) -> None:
+    given = [words[k + 1] for k, word in enumerate(words) if word == "--set"]
+    names = [word for k, word in enumerate(words) if word != "--set" and (not k or words[k - 1] != "--set")]
+    configs: Configs = dict(CONFIGS)
+    for text in given:
+        name, _, option = text.partition("=")
+        configs[name] = ("production", (*configs.get(name, ("", ()))[1], option))
+    data = os.environ.get("FLEXROAD_REAL_DATA")
+    there = places(Path(data) if data else None, Path(__file__).parents[1] / "real" / "roads")
+    for name in names or there:
+        with tempfile.TemporaryDirectory() as folder:
+            compare(name, there[name](Path(folder)), Path(folder), configs)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

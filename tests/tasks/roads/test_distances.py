@@ -1,0 +1,35 @@
+"""Distances to the nearest cell of a mask, against scipy's distance transform."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from flexroad.tasks.roads.distances import distances, filled
+
+
+@pytest.mark.parametrize("shape", [(40, 37), (1, 30), (30, 1)])
+@pytest.mark.parametrize("share", [0.0005, 0.02, 0.5, 1.0])
+def test_distances_random_mask_equal_distance_transform(shape, share):
+    rng = np.random.default_rng(7)
+    mask, wanted = rng.random(shape) < share, rng.random(shape) < 0.6
+    mask[rng.integers(shape[0]), rng.integers(shape[1])] = True
+    np.testing.assert_array_equal(distances(wanted, mask), distance_transform_edt(~mask)[wanted])
+
+
+def test_distances_empty_mask_are_infinite():
+    assert np.isinf(distances(np.ones((3, 4), bool), np.zeros((3, 4), bool))).all()
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.9])
+def test_filled_gaps_equal_feature_transform(share):
+    """Also where several values are equally near."""
+    rng = np.random.default_rng(3)
+    values = rng.permutation(60 * 41).reshape(60, 41).astype(float)
+    missing = rng.random(values.shape) >= share
+    gaps = np.where(missing, np.nan, values)
+    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    np.testing.assert_array_equal(filled(gaps), values[tuple(nearest)])
+
+
+def test_filled_raster_without_any_value_stays_empty():
+    assert np.isnan(filled(np.full((3, 4), np.nan))).all()

@@ -1,0 +1,136 @@
+"""Kerbs and walls beside a straight road: both sides have their own height."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexroad.catalog.grid import Grid
+from flexroad.pipeline.store import codec
+from flexroad.tasks import sample
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.metrics.mesh_check import check
+from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+
+GRID = Grid("EPSG:25832", 500000.0, 5600060.0, 1.0, 60, 60)
+ROWS = np.arange(60)[:, None] * np.ones(60)
+ROAD = np.abs(ROWS - 29.5) < 5
+EDGE = np.abs(np.abs(ROWS - 29.5) - 5) < 1
+"""The cells within 1 m of the edges of the road."""
+VERGE = (np.abs(ROWS - 29.5) < 10) & ~ROAD
+
+
+def tile(height, noise_m=0.02):
+    """Return a level road between steps, its filtered road, and the true heights; the DTM is smoothed."""
+    beyond = np.clip(np.abs(ROWS - 29.5) - 4.5, 0, None)
+    truth = 100 + np.where(ROAD, 0.0, height)
+    smoothed = 100 + height * np.clip(beyond / 2, 0, 1)
+    dsm = truth + noise_m * np.random.default_rng(0).standard_normal(GRID.shape)
+    clusters = RoadClusters(GRID, ROAD.astype(np.int32), VERGE)
+    return TileData("t", GRID, GRID, dsm, smoothed), clusters, truth
+
+
+def fitted(data, clusters, steps=True):
+    return smoothing_spline.fit(data, clusters, smoothing_spline.Options(steps=steps))
+
+
+def heights(surface):
+    return surface.lattice(GRID.eastings, GRID.northings)
+
+
+def inner(cells):
+    result = np.zeros_like(cells)
+    result[1:-1, 1:-1] = cells[1:-1, 1:-1]
+    return result
+
+
+@pytest.mark.parametrize("height", [0.12, -0.12, 4.0, -4.0])
+def test_steps_error_at_edge_is_halved_and_road_unchanged(height):
+    data, clusters, truth = tile(height)
+    smooth, stepped = fitted(data, clusters, steps=False), fitted(data, clusters)
+    before, after = (np.abs(heights(s) - truth)[inner(EDGE)].mean() for s in (smooth, stepped))
+    assert after < before / 2
+    assert np.array_equal(stepped.A, smooth.A)
+    assert np.array_equal(heights(stepped)[ROAD], heights(smooth)[ROAD])
+    assert np.abs(heights(stepped) - truth)[inner(VERGE)].mean() < 0.03
+
+
+def test_steps_on_level_ground_are_noise():
+    data, clusters, truth = tile(0.0)
+    assert np.abs(heights(fitted(data, clusters)) - truth)[inner(VERGE)].max() < 0.05
+
+
+def test_steps_hidden_cells_are_on_their_side_of_wall():
+    data, clusters, truth = tile(4.0)
+    hedge, car = (slice(22, 25), slice(20, 23)), (slice(25, 28), slice(40, 43))
+    data.dsm[hedge] += 3.0
+    data.dsm[car] = 101.6
+    clusters.labels[car] = 0
+    clusters.dtm_invalid[car] = True
+    found = heights(fitted(data, clusters))
+    assert np.abs(found - truth)[car].max() < 0.1
+    rim = np.s_[22:24, [20, 22]]
+    assert np.abs(found - truth)[rim].max() < 0.5
+
+
+def test_steps_along_border_are_zero():
+    """Neighbours meet there: the heights are those of the common spline."""
+    data, clusters, _ = tile(4.0)
+    surface = fitted(data, clusters)
+    west, south, east, north = GRID.bounds
+    along = np.linspace(0, 60, 241)
+    for x, y in ((west, south + along), (east, south + along), (west + along, south), (west + along, north)):
+        x, y = np.broadcast_arrays(x, y)
+        assert surface.height(x, y).tobytes() == surface.smooth(x, y).tobytes()
+
+
+def test_steps_height_equals_lattice():
+    data, clusters, _ = tile(4.0)
+    surface = fitted(data, clusters)
+    x, y = np.meshgrid(GRID.eastings, GRID.northings)
+    np.testing.assert_allclose(surface.height(x, y), heights(surface), rtol=0, atol=1e-9)
+
+
+def test_steps_without_verge_are_zero():
+    data, clusters, _ = tile(4.0)
+    surface = fitted(data, RoadClusters(GRID, clusters.labels))
+    assert not surface.steps.any()
+
+
+def test_stepped_surface_is_stored_without_loss():
+    data, clusters, _ = tile(4.0)
+    surface = fitted(data, clusters)
+    restored, _ = codec.decode(codec.encode(surface, {}))
+    assert type(restored) is type(surface)
+    assert isinstance(restored, NurbsSurface)
+    assert heights(restored).tobytes() == heights(surface).tobytes()
+
+
+@pytest.mark.parametrize("height", [0.12, 4.0, -4.0])
+def test_mesh_has_edges_of_steps(height):
+    data, clusters, truth = tile(height)
+    nothing = np.zeros_like(ROAD)
+    road = RoadMask(GRID, GRID, ROAD, nothing)
+    errors = []
+    for steps in (False, True):
+        mesh = sample.sample(fitted(data, clusters, steps), road, clusters, sample.Options())
+        check(mesh)
+        errors.append(np.abs(drape(mesh, GRID) + mesh.origin[2] - truth)[EDGE & (np.abs(ROWS.T - 29.5) < 27)])
+    assert errors[1].mean() < errors[0].mean() / 2
+    assert errors[1].max() < max(0.1, abs(height) / 10)
+
+
+def test_steps_are_measured_from_the_heights_that_the_road_is_fitted_to():
+    data, clusters, truth = tile(0.0, noise_m=0.0)
+    lifted = replace(data, dsm=data.dsm + 0.05, road_height=truth)
+    assert np.abs(heights(fitted(lifted, clusters)) - truth)[inner(ROAD | VERGE)].max() < 1e-3
+
+
+def test_steps_are_refused_by_adaptive_sampling():
+    data, clusters, _ = tile(0.12)
+    road = RoadMask(GRID, GRID, ROAD, np.zeros(GRID.shape, bool))
+    with pytest.raises(TaskError, match="adaptive has no edges at steps; use dynamic"):
+        sample.sample(fitted(data, clusters), road, clusters, sample.Options(method="adaptive"))
