@@ -34,6 +34,8 @@ FORGET_KEYS_EVERY = 1000
 """Number of jobs after which Dask's cache of key names is cleared: it has 0.4 KB for each job."""
 TICK_S = 1.0
 """Interval between checks of the scheduler and the workers (s)."""
+LONGEST_STEP_S = 5 * TICK_S
+"""Longest time between two checks that counts as waiting (s): a clock jumps when a machine was suspended."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,8 @@ class Session(Generic[J, R]):
         self.workers: dict[str, int] = {}
         """Number of threads by worker address, at ``checked_at``."""
         self.checked_at = 0.0
-        self.no_worker_since: float | None = None
-        """Time of the first check without workers; None if there are workers."""
+        self.without_worker_s: float | None = None
+        """Time for which checks found no workers (s); None if there are workers."""
 
     def results(self) -> Iterator[R]:
         """Yield results as jobs finish, until nothing is left to do.
@@ -186,8 +188,11 @@ class Session(Generic[J, R]):
             self.workers = self.client.nthreads()
         except OSError as error:
             raise self._cluster_lost() from error
-        self.checked_at = time.monotonic()
-        self._wait_for_workers()
+        now = time.monotonic()
+        # A machine that was stopped for an hour did not wait for an hour.
+        since_last_check = min(now - self.checked_at, LONGEST_STEP_S)
+        self.checked_at = now
+        self._wait_for_workers(since_last_check)
         for future, flight in list(self.in_flight.items()):
             worker = flight.reserved_worker
             if worker and worker not in self.workers and not future.done():
@@ -200,14 +205,16 @@ class Session(Generic[J, R]):
         needed = {name for flight in self.in_flight.values() for name in flight.resources or ()}
         return bool(self.workers) and (not needed or needed <= declared(self.client))
 
-    def _wait_for_workers(self) -> None:
+    def _wait_for_workers(self, since_last_check: float) -> None:
         if self._able():
-            self.no_worker_since = None
-        elif self.no_worker_since is None:
-            self.no_worker_since = self.checked_at
+            self.without_worker_s = None
+        elif self.without_worker_s is None:
+            self.without_worker_s = 0.0
             self.say(f"no worker{self._missing()} is left; waiting up to {self.patience_s:g} s for one")
-        elif self.checked_at > self.no_worker_since + self.patience_s:
-            raise ClusterLost(f"no worker{self._missing()} was left for {self.patience_s:g} s")
+        else:
+            self.without_worker_s += since_last_check
+            if self.without_worker_s > self.patience_s:
+                raise ClusterLost(f"no worker{self._missing()} was left for {self.patience_s:g} s")
 
     def _missing(self) -> str:
         return " with the resource GPU" if self.workers else ""
