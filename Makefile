@@ -117,7 +117,7 @@ lint: $(STAMP) ## Check style and types
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP) ## Print the stages beside their floors, peers and starts; one other benchmark: make bench BENCH=scale
+bench: $(STAMP) ## Print the stages beside their floors, peers, starts and make reproduce; one other benchmark: make bench BENCH=scale
 	@$(BIN)/python -m tests.bench $(BENCH)
 
 speed: $(STAMP) ## Measure the tables and the plot of docs/speed.md anew

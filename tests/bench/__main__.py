@@ -1,4 +1,4 @@
-"""``make bench``: the table of stages and floors, peers, and the start of commands; then what else there is.
+"""``make bench``: stages and floors, peers, start of commands, ``make reproduce``; then what else there is.
 
 Usage: ``python -m tests.bench [NAME ... | all]``; a name is that of a file, without ``bench_``.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from flexroad.pipeline import ONE_THREAD
 
 FOLDER = Path(__file__).parent
-FIRST = ("tile", "peers", "start")
+FIRST = ("tile", "peers", "start", "reproduce")
 """Benchmarks that run without a name; the others take minutes, need real data, or answer one question."""
 
 

@@ -2,16 +2,13 @@
 
 Targets: ``flexroad --help`` at most 5, ``flexroad config show`` at most 8, a run with nothing to do over ten
 tiles at most 15, a rerun of one tile at most 25, all with the default number of workers. Two workers must not
-take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``. The commands of
-``make reproduce``, one by one: ``bench_start.py --reproduce [TILES]``.
+take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import resource
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -21,7 +18,6 @@ from pathlib import Path
 from flexroad.catalog import Catalog
 from flexroad.pipeline import ONE_THREAD
 
-ROOT = Path(__file__).parents[2]
 ROUNDS = 7
 SMALL_TILES = 48
 FLEXROAD = [sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()"]
@@ -100,30 +96,9 @@ def tiles() -> None:
                 print(f"{name:32}{time.perf_counter() - begin:8.1f}{cpu:8.1f}")
 
 
-def reproduce(number: int) -> None:
-    """Print the CPU time of each command of ``make reproduce``."""
-    listed = subprocess.run(
-        ["make", "-n", "-o", ".venv/.installed", "reproduce", f"TILES={number}"],
-        check=True,
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    ).stdout.replace("\\\n", " ")
-    total = 0.0
-    with tempfile.TemporaryDirectory() as scratch:
-        for command in re.findall(r"flexroad ([^;&\n]+)", listed):
-            words = [word.replace("runs/", f"{scratch}/") for word in shlex.split(command)]
-            spent = cpu_s([*FLEXROAD, *words])
-            total += spent
-            print(f"{' '.join(shlex.split(command)[:9])[-60:]:62}{spent:8.1f}", flush=True)
-    print(f"{f'make reproduce TILES={number}':62}{total:8.1f}")
-
-
 def main() -> None:
     if "--tiles" in sys.argv:
         tiles()
-    elif "--reproduce" in sys.argv:
-        reproduce(int(sys.argv[2]) if len(sys.argv) > 2 else 24)
     else:
         start()
 

@@ -16,6 +16,7 @@ from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import basis_matrix, uniform_knots
 from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.types import RoadMask, TileData
+from tests import exact_fit
 
 AROUND_M = 100
 FILTER = planar.Options(verge_m=5)
@@ -123,6 +124,21 @@ def test_void_on_corner_is_bridged_as_by_one_fit_of_all(stratum):
     off = np.abs(at_cells(joined(fit_tiles(world))) - at_cells(fit_together(world)))
     assert off[void].max() < 0.010
     assert off[~void].mean() < 0.5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stratum", ["urban", "rural"])
+def test_tile_within_borders_equals_literal_fit(monkeypatch, stratum):
+    world, tile = made_world(stratum), Grid("EPSG:25832", 500000, 5600500, 1.0, 250, 250)
+    data = part(world, tile.buffered(50), tile)
+
+    def heights():
+        surface = smoothing_spline.fit(data, filtered(data)[1], OPTIONS, frame_of(world, tile))
+        return surface.lattice(tile.eastings, tile.northings)
+
+    ours = heights()
+    monkeypatch.setattr(smoothing_spline, "_minimum", exact_fit.minimum)
+    assert np.abs(heights() - ours).max() < 1e-3
 
 
 @pytest.mark.parametrize("steps", [False, True])
