@@ -100,7 +100,7 @@ class BorderStages:
         clusters = stage_function("ecsrc", self.ecsrc)(data, road, self.ecsrc)
         module: Any = stage_module(self.fit)
         if border.kind == "corner":
-            corner: Corner = module.corner(data, clusters, border, self.fit)
+            corner: Corner = module.corner(data, road, clusters, border, self.fit)
             return corner
         edge: Edge = module.edge(data, road, clusters, border, ends, self.fit)
         return edge

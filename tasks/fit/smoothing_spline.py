@@ -225,17 +225,16 @@ def acting_m(options: Options) -> float:
     return options.degree * options.spacing_m
 
 
-def corner(data: TileData, clusters: RoadClusters, border: Border, options: Options) -> Corner:
+def corner(
+    data: TileData, road: RoadMask, clusters: RoadClusters, border: Border, options: Options
+) -> Corner:
     """Fit the control points that act on a corner of tiles to the ground around it.
 
     Parameters
     ----------
-    data : TileData
-        The cells of ``border.grid``.
-    clusters : RoadClusters
-        The filtered road there.
+    data, road, clusters : TileData, RoadMask, RoadClusters
+        The cells of ``border.grid``, their road mask and the filtered road.
     """
-    from flexroad.tasks.roads.extent import beyond_extent
     from flexroad.tasks.roads.road_height import with_road_heights
     from flexroad.tasks.spline.frame import Corner, rounded
 
@@ -245,7 +244,7 @@ def corner(data: TileData, clusters: RoadClusters, border: Border, options: Opti
     held = np.full((2 * j + p, 2 * k + p), np.nan)
     z = _control_heights(data, clusters, lattice, border.cell, (-k, k), (-j, j), held, _precise(options))
     row, col = border.cell
-    around = beyond_extent(data)[row - 1 : row + 1, col - 1 : col + 1]
+    around = road.outside[row - 1 : row + 1, col - 1 : col + 1]
     return Corner(rounded(z[j : j + p, k : k + p]), around)
 
 

@@ -116,7 +116,7 @@ def assess(
     Quality
         Figures over the road cells of the core; NaN where the tile or the surface has no such data.
     """
-    cells = compare(data, road, clusters, surface, options.agree_m)
+    cells = compare(data, road, clusters, surface, options.agree_m, only_road=True)
     on_road, kept, classes, height = cells.on_road, cells.kept, cells.classes, cells.height
     estimate, cell = cells.estimate, data.core.cell
     residuals, to_dtm = _finite(cells.off_dsm[kept]), _finite(cells.off_dtm[on_road])

@@ -74,7 +74,7 @@ def holdout(
     except TaskError:
         # Too few heights are left for a second fit; the tile has its surface all the same.
         return Holdout(0.0, np.nan, np.nan)
-    cells = compare(rest, road, clusters, surface, agree_m)
+    cells = compare(rest, road, clusters, surface, agree_m, only_road=True)
     off = cells.height - heights_fitted(data, clusters)[window]
     counted = (squares >= 0) & kept[window]
     _, number = np.unique(squares[counted], return_inverse=True)

@@ -48,7 +48,7 @@ def border_part(world, border, ends, options=OPTIONS):
     data = part(world, border.grid, border.grid)
     road, clusters = filtered(data)
     if border.kind == "corner":
-        return smoothing_spline.corner(data, clusters, border, options)
+        return smoothing_spline.corner(data, road, clusters, border, options)
     return smoothing_spline.edge(data, road, clusters, border, ends, options)
 
 

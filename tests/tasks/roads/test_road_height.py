@@ -114,7 +114,7 @@ def surface_of(data):
         around = part_of(data, border.grid)
         road, clusters = filtered(around)
         if number < 4:
-            parts.append(smoothing_spline.corner(around, clusters, border, options))
+            parts.append(smoothing_spline.corner(around, road, clusters, border, options))
         else:
             ends = [parts[end] for end in ENDS[number - 4]]
             parts.append(smoothing_spline.edge(around, road, clusters, border, ends, options))
