@@ -44,11 +44,15 @@ def _points_options(
     slope: float | None, radius: float | None, fill: float | None, void: float | None, **more: Any
 ) -> Options:
     """Return the options for making rasters of points; None keeps a default."""
-    from flexroad.tasks.acquire.points.ground_filter import Options as Filter
+    from flexroad.tasks.acquire.points import ground_filter, morphological
     from flexroad.tasks.acquire.points.to_rasters import Options
 
-    ground_filter = Filter(**_given(slope=slope, radius_m=radius))
-    return Options(filter=ground_filter, **_given(fill_m=fill, void_m=void, **more))
+    given = _given(slope=slope, radius_m=radius)
+    if more.get("ground") == "morphological":
+        more["morphological"] = morphological.Options(**given)
+    else:
+        more["filter"] = ground_filter.Options(**given)
+    return Options(**_given(fill_m=fill, void_m=void, **more))
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -96,10 +100,10 @@ def prepare_points(
     ],
     output: Out,
     ground: Annotated[
-        Literal["auto", "classes", "filter"],
+        Literal["auto", "classes", "filter", "morphological"],
         typer.Option(
             rich_help_panel=options.GROUND,
-            help="How ground is identified; auto: by classes if all files have them.",
+            help="How ground is identified; auto: by classes if all files have them, else by filter.",
         ),
     ] = "auto",
     ground_class: Annotated[
@@ -156,6 +160,7 @@ def prepare_points(
         void,
         despike_m=despike,
         dtm=dtm,
+        ground=ground if ground == "morphological" else None,
         ground_classes=ground_class,
         bridge_classes=bridge_class or BRIDGE_CLASSES[class_scheme],
     )

@@ -141,7 +141,7 @@ Slope = Annotated[
         min=0,
         metavar="NUMBER",
         rich_help_panel=options.GROUND,
-        help="Ground filter: steepest slope of the ground; 0.35 is 35 %.",
+        help="Ground filter: steepest slope of the ground; 0.35 is 35 %, the slope filter's default.",
     ),
 ]
 Radius = Annotated[

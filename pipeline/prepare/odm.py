@@ -171,8 +171,7 @@ def _resample_photo(writer: RasterWriter, path: Path, frame: MetricTransform) ->
 def _filter_ground(writer: RasterWriter, options: to_rasters.Options) -> None:
     """Write a DTM made from the DSM: the heights of its ground cells, with voids interpolated."""
     slope = options.filter
-    reach = slope.radius_m + (slope.low_radius_m if slope.low_m is not None else 0)
-    reach += fill_voids.reach_m(options.void_m, writer.grid.cell)
+    reach = slope.reach_m + fill_voids.reach_m(options.void_m, writer.grid.cell)
     side = BLOCK + 2 * reach / writer.grid.cell
     cells = min(side**2, writer.grid.width * writer.grid.height)
     memory.check(

@@ -30,7 +30,7 @@ from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWrite
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, reach_m, tags
 
-Ground = Literal["auto", "classes", "filter"]
+Ground = Literal["auto", "classes", "filter", "morphological"]
 MIN_GROUND = 0.01
 """A file with a smaller share of ground points is taken as not classified."""
 DENSE, DENSE_CONFIDENCE = 50.0, 3.0
@@ -69,8 +69,9 @@ def prepare_points(
     log : Callable[[str], None]
         Called with lines of progress.
     ground : str
-        How ground points are identified: ``classes``, ``filter`` or ``auto``. With ``auto``, classes are used
-        if in every file at least `MIN_GROUND` of the points, but not all, have a ground class.
+        How ground points are identified: ``classes``, ``filter``, ``morphological`` or ``auto``. With
+        ``auto``, classes are used if in every file at least `MIN_GROUND` of the points, but not all, have a
+        ground class.
 
     Raises
     ------
@@ -90,9 +91,8 @@ def prepare_points(
     names = some([str(cloud.path) for cloud in clouds])
     check_disk(out, RECORD.itemsize * sum(cloud.points for cloud in clouds), f"the points of {names}", FEWER)
     with scratch_folder(out) as folder:
-        farthest = max(
-            reach_m(_with_method(options, method), common.cell_m) for method in ("classes", "filter")
-        )
+        possible = ("classes", "filter") if ground == "auto" else (ground,)
+        farthest = max(reach_m(_with_method(options, method), common.cell_m) for method in possible)
         bucketed = bucket_points(clouds, frame, folder, block_edge_of(clouds, frame, farthest, step), log)
         method, notes = _ground(clouds, bucketed, options, ground)
         options, dense = _for_density(_with_method(options, method), bucketed)
@@ -155,8 +155,8 @@ def _ground(
     classes = list(options.ground_classes)
     share = [kinds[classes].sum() / max(1, kinds.sum()) for kinds in bucketed.kinds]
     class_names = _classes(classes)
-    if requested == "filter":
-        return "filter", ()
+    if requested in ("filter", "morphological"):
+        return requested, ()
     if requested == "classes":
         if not any(share):
             raise CatalogError(

@@ -1,4 +1,4 @@
-"""The ground filter compared with CSF and PDAL's PMF and SMRF, with default options, on real and made clouds.
+"""Ground filters compared with CSF and PDAL's PMF and SMRF, with default options, on real and made clouds.
 
 Real clouds are read from the folder FLEXROAD_REAL_DATA, PDAL is used if it is on the path; both are optional.
 Ground is class 2. Noise (class 7) is removed first. Class 1 (unclassified) is filtered but not scored; all
@@ -21,7 +21,8 @@ import laspy
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from flexroad.tasks.acquire.points.ground_filter import Options, ground, ground_cells
+from flexroad.tasks.acquire.points import morphological
+from flexroad.tasks.acquire.points.ground_filter import Options, ground
 from flexroad.tasks.synthetic import Scene, gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import Bools, Floats
@@ -55,7 +56,9 @@ Filter = Callable[[Floats], Bools]
 
 def main() -> None:
     cases = [*real(), *made()]
-    peers = {"FlexRoad": ours(Options()), **csf(), **pdal("pmf"), **pdal("smrf")}
+    both = {"slope": ours(Options()), "opening": opening(morphological.Options())}
+    peers = {**both, **csf(), **pdal("pmf"), **pdal("smrf")}
+    # The first call compiles.
     ours(Options())(cases[-1].points)
     print(f"{'':22} {'':9} {'type I':>7} {'type II':>7} {'total':>7} {'kappa':>6} {'s per M':>8}")
     for case in cases:
@@ -101,25 +104,43 @@ def sensitivity(cases: list[Case]) -> None:
 
 
 def choice() -> None:
-    """Print the error of a terrain model of the ground by slope; the default slope was chosen from this."""
+    """Print the error of a terrain model of the ground by slope; the default slopes were chosen from this."""
     places = gerod.survey(TILES, CHOSEN_ON)
     tiles = [place for name in gerod.STRATA for place in [p for p in places if p[2] == name][:PER_STRATUM]]
     scenes = [make_scene(grid, CHOSEN_ON, name, options) for _, grid, name, options in tiles]
     print(f"\nmean |TIN of the ground - truth| (m) of {len(scenes)} made tiles, seed {CHOSEN_ON}")
-    print(f"{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}")
+    print(f"{'filter':8}{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}  decks accepted")
     for slope, confidence in ((0.2, 1.65), (0.3, 1.65), (0.35, 1.65), (0.4, 1.65), (0.5, 1.65), (0.35, 3.0)):
-        options = Options(slope=slope, confidence=confidence)
-        error = np.mean([terrain_error(scene, options) for scene in scenes], axis=0)
-        print(f"{slope:6} {confidence:10} {error[0]:7.3f} {error[1]:7.3f}", flush=True)
+        row(
+            f"{'slope':8}{slope:6} {confidence:10}", scenes, ours(Options(slope=slope, confidence=confidence))
+        )
+    for slope in (0.05, 0.1, 0.15, 0.2, 0.3):
+        row(f"{'opening':8}{slope:6} {'':10}", scenes, opening(morphological.Options(slope=slope)))
 
 
-def terrain_error(scene: Scene, options: Options) -> tuple[float, float]:
-    """Return the mean vertical distance to the truth over all cells and over roads, without bridges (m)."""
-    is_ground = ground_cells(scene.dsm, scene.grid.cell, options)
+def row(title: str, scenes: list[Scene], classify: Filter) -> None:
+    error = np.nanmean([terrain_error(scene, classify) for scene in scenes], axis=0)
+    print(f"{title} {error[0]:7.3f} {error[1]:7.3f} {error[2]:10.0%}", flush=True)
+
+
+def terrain_error(scene: Scene, classify: Filter) -> tuple[float, float, float]:
+    """Return the mean vertical distance to the truth over all cells and over roads, without bridges (m).
+
+    And the share of the cells of bridge decks that are ground by the filter, NaN without decks.
+    """
+    is_ground = classify(cells(scene)).reshape(scene.dsm.shape)
     tin = LinearNDInterpolator(np.argwhere(is_ground), scene.dsm[is_ground])
     error = np.abs(tin(*np.indices(is_ground.shape)) - scene.reference)
-    valid = np.isfinite(error) & (scene.kind != Kind.DECK)
-    return float(error[valid].mean()), float(error[valid & scene.reference_road].mean())
+    deck = scene.kind == Kind.DECK
+    valid = np.isfinite(error) & ~deck
+    taken = is_ground[deck].mean() if deck.any() else np.nan
+    return float(error[valid].mean()), float(error[valid & scene.reference_road].mean()), float(taken)
+
+
+def cells(scene: Scene) -> Floats:
+    """Return the points of a surface model, one in the middle of each cell, ``(n, 3)``."""
+    easting, northing = np.meshgrid(scene.grid.eastings, scene.grid.northings)
+    return np.column_stack([easting.ravel(), northing.ravel(), scene.dsm.ravel()])
 
 
 def noise() -> None:
@@ -139,6 +160,10 @@ def noise() -> None:
 
 def ours(options: Options) -> Filter:
     return lambda points: ground(*np.ascontiguousarray(points.T), options)
+
+
+def opening(options: morphological.Options) -> Filter:
+    return lambda points: morphological.ground(*np.ascontiguousarray(points.T), options)
 
 
 def csf() -> dict[str, Filter]:
@@ -229,8 +254,7 @@ def made() -> Iterator[Case]:
         grid, options = next((grid, options) for _, grid, name, options in places if name == stratum)
         grid = replace(grid, width=SIDE_M, height=SIDE_M)
         scene = make_scene(grid, SEED, stratum, options)
-        easting, northing = np.meshgrid(grid.eastings, grid.northings)
-        points = np.column_stack([easting.ravel(), northing.ravel(), scene.dsm.ravel()])
+        points = cells(scene)
         truth = np.isin(scene.kind, BARE) & (scene.kind != Kind.DECK)
         vague = np.isin(scene.kind, (Kind.PLANTS, Kind.MIXED)) & (abs(scene.dsm - scene.reference) < VAGUE_M)
         yield Case(f"made, {stratum}", points, truth.ravel(), ~vague.ravel())

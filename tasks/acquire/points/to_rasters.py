@@ -15,6 +15,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks import options as base
 from flexroad.tasks.acquire.points import dtm, fill_voids
 from flexroad.tasks.acquire.points import ground_filter as slope_filter
+from flexroad.tasks.acquire.points import morphological as morphological_filter
 from flexroad.tasks.acquire.points.binning import Cells, bins, means
 from flexroad.tasks.acquire.points.max_height import highest, spikes
 from flexroad.tasks.acquire.points.orthophoto import photo
@@ -42,9 +43,10 @@ class Options(base.Options):
         le=10,
         description="points up to this much below a cell's highest one make the height of roads (m)",
     )
-    ground: Literal["classes", "filter"] = Field(
+    ground: Literal["classes", "filter", "morphological"] = Field(
         "classes",
-        description="classes: ground points have a ground class; filter: the slope filter identifies them",
+        description="classes: ground points have a ground class; filter: the slope filter identifies them; "
+        "morphological: the morphological filter does",
     )
     ground_classes: tuple[int, ...] = Field((2,), description="classes of ground points")
     bridge_classes: tuple[int, ...] = Field(
@@ -60,6 +62,10 @@ class Options(base.Options):
     )
     filter: slope_filter.Options = Field(
         slope_filter.Options(), description="the slope filter, used with ground: filter"
+    )
+    morphological: morphological_filter.Options = Field(
+        morphological_filter.Options(),
+        description="the morphological filter, used with ground: morphological",
     )
 
 
@@ -112,9 +118,9 @@ def reach_m(options: Options, cell: float) -> float:
     else:
         ground = fill_voids.reach_m(options.void_m, cell)
     if options.ground == "filter":
-        ground += options.filter.radius_m
-        if options.filter.low_m is not None:
-            ground += options.filter.low_radius_m
+        ground += options.filter.reach_m
+    if options.ground == "morphological":
+        ground += options.morphological.reach_m
     farthest = max(ground, fill_voids.reach_m(options.fill_m, cell), options.dop_fill_m)
     # Whether a point is a spike depends on its own and the neighbouring cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
@@ -129,6 +135,12 @@ def tags(options: Options) -> dict[str, str]:
     )
     if options.ground == "classes":
         ground = f"points of {_classes(options.ground_classes)}"
+    elif options.ground == "morphological":
+        of = options.morphological
+        ground = (
+            f"morphologically filtered points (Zhang et al. 2003: radius {of.radius_m:g} m, "
+            f"slope {of.slope:g}, tolerance {of.tolerance_m:.2f} m)"
+        )
     else:
         ground = (
             f"slope-filtered points (Vosselman 2000: radius {options.filter.radius_m:g} m, "
@@ -159,6 +171,9 @@ def _without_spikes(points: Points, grid: Grid, despike_m: float) -> Points:
 def _is_ground(points: Points, options: Options) -> Bools:
     if options.ground == "classes":
         return np.isin(points.kind, options.ground_classes)
+    if options.ground == "morphological":
+        of = options.morphological
+        return morphological_filter.ground(points.easting, points.northing, points.height, of)
     return slope_filter.ground(points.easting, points.northing, points.height, options.filter)
 
 

@@ -216,7 +216,7 @@ def test_prepare_points_with_workers_gives_the_same_rasters(plain, tmp_path, mon
     assert names == {*rasters, "catalog.parquet"}
 
 
-def test_prepare_points_ground_auto_uses_classes_only_if_present(tmp_path):
+def test_prepare_points_ground_is_identified_as_asked_and_auto_by_classes_if_present(tmp_path):
     xyz, kind, _ = world()
     crs = "EPSG:25832"
     flat = {name: write_cloud(tmp_path / f"{name}.laz", xyz, k, crs) for name, k in
@@ -231,6 +231,7 @@ def test_prepare_points_ground_auto_uses_classes_only_if_present(tmp_path):
     by_class, by_slope = " of points of class 2;", " of slope-filtered points "
     assert by_class in method("good")[0]
     assert by_slope in method("good", ground="filter")[0]
+    assert " of morphologically filtered points " in method("good", ground="morphological")[0]
     processing, notes = method("good", "alike")
     assert by_slope in processing
     assert "all points of alike.laz have the same class: ground is identified by the slope filter" in notes

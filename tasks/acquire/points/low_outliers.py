@@ -1,0 +1,197 @@
+"""Low outliers of a point cloud: points far below all around, as multipath echoes cause them.
+
+Ground filters leave them out first, because all points around one would be rejected. Sorting points into
+square buckets and by height avoids most of the comparisons.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flexroad.tasks import options as base
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.types import Bools, Floats
+
+Indices = NDArray[np.int64]
+
+POINTS_PER_BUCKET = 16
+BUCKETS_PER_RADIUS = 16
+"""Buckets have about `POINTS_PER_BUCKET` points, more in dense clouds: their side is at least radius / 16."""
+SLACK_M = 1e-6
+"""Margin of distances to buckets (m), for points that rounding moved across the edge of a bucket."""
+OUTNUMBERED = 20
+"""Low outliers have this many times more points above them; with fewer they may be ground."""
+
+
+class Options(base.Options):
+    """Detection of low outliers."""
+
+    low_m: float | None = Field(
+        0.5,
+        gt=0,
+        description="points lower than all around by this much are left out (m); null keeps all",
+    )
+    low_radius_m: float = Field(
+        10.0, gt=0, le=100, description="radius in plan of the search for low outliers (m)"
+    )
+    low_companions: int = Field(
+        5, ge=0, description="number of other points near a low outlier that may be as low"
+    )
+
+    @property
+    def low_reach_m(self) -> float:
+        """Distance up to which points decide whether one is a low outlier (m)."""
+        return 0.0 if self.low_m is None else self.low_radius_m
+
+
+def without_low_outliers(
+    easting: Floats, northing: Floats, height: Floats, radius_m: float, options: Options
+) -> Buckets:
+    """Return the points that are finite and no low outliers, sorted into buckets.
+
+    A point is a low outlier if within ``low_radius_m`` at most ``low_companions`` others are lower or at most
+    ``low_m`` higher, and 20 times as many points (counting itself) are above that.
+
+    Parameters
+    ----------
+    easting, northing, height : ndarray, (n,)
+        In metres.
+    radius_m : float
+        Radius of searches in the buckets (m), for their size.
+    options : Options
+
+    Raises
+    ------
+    TaskError
+        If the arrays differ in length.
+    """
+    if not (easting.shape == northing.shape == height.shape == (height.size,)):
+        shapes = f"{easting.shape}, {northing.shape} and {height.shape}"
+        raise TaskError(f"easting, northing and height of points must have the same length, not {shapes}")
+    valid = np.flatnonzero(np.isfinite(easting) & np.isfinite(northing) & np.isfinite(height))
+    if valid.size == 0:
+        nothing = np.zeros(0)
+        return Buckets(nothing, nothing, nothing, valid, np.zeros(2, np.int64), (1, 1), radius_m)
+    points = Buckets.of(easting[valid], northing[valid], height[valid], radius_m)
+    if options.low_m is not None:
+        low = _low_outliers(*points.arrays, options.low_radius_m, options.low_m, options.low_companions)
+        points = points.without(low)
+    return replace(points, order=valid[points.order])
+
+
+@dataclass(frozen=True, eq=False)
+class Buckets:
+    """Points sorted by square bucket and, within a bucket, by height."""
+
+    x: Floats
+    y: Floats
+    z: Floats
+    order: Indices
+    """Index of each sorted point in the input."""
+    start: Indices
+    """Points of bucket b are ``start[b]`` to ``start[b + 1] - 1``; buckets are numbered along x first."""
+    shape: tuple[int, int]
+    """Number of buckets along y and x."""
+    side: float
+    """Side of a bucket (m)."""
+
+    @classmethod
+    def of(cls, easting: Floats, northing: Floats, height: Floats, radius: float) -> Buckets:
+        """Sort points into buckets, whose number is at most a small multiple of that of the points."""
+        # Subtracting a whole-metre origin from large coordinates is exact.
+        x, y = easting - math.floor(easting.min()), northing - math.floor(northing.min())
+        width, depth = float(x.max()), float(y.max())
+        mean_side = math.sqrt(POINTS_PER_BUCKET * width * depth / x.size)
+        side = max(radius / BUCKETS_PER_RADIUS, mean_side, max(width, depth) / x.size)
+        shape = int(depth / side) + 1, int(width / side) + 1
+        bucket = (y / side).astype(np.int64) * shape[1] + (x / side).astype(np.int64)
+        order = np.argsort(height, kind="stable")
+        order = order[np.argsort(bucket[order], kind="stable")]
+        start = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=shape[0] * shape[1]))])
+        return cls(x[order], y[order], height[order], order, start, shape, side)
+
+    def without(self, excluded: Bools) -> Buckets:
+        """Return a copy without the excluded points, given in sorted order."""
+        if not excluded.any():
+            return self
+        keep = ~excluded
+        start = np.concatenate([[0], np.cumsum(keep)])[self.start]
+        return replace(
+            self, x=self.x[keep], y=self.y[keep], z=self.z[keep], order=self.order[keep], start=start
+        )
+
+    @property
+    def arrays(self) -> tuple[Floats, Floats, Floats, Indices, tuple[int, int], float]:
+        """Arguments of the compiled functions below."""
+        return self.x, self.y, self.z, self.start, self.shape, self.side
+
+
+@compiled()
+def span(position: float, reach: float, side: float, count: int) -> tuple[int, int]:
+    """Return the first bucket within reach of a coordinate, and the last one plus 1."""
+    first = math.floor((position - reach - SLACK_M) / side)
+    last = math.floor((position + reach + SLACK_M) / side)
+    return max(first, 0), min(last, count - 1) + 1
+
+
+@compiled()
+def _low_outliers(
+    x: Floats,
+    y: Floats,
+    z: Floats,
+    start: Indices,
+    shape: tuple[int, int],
+    side: float,
+    radius: float,
+    step: float,
+    companions: int,
+) -> Bools:
+    out = np.zeros(z.size, np.bool_)
+    bucket_is_near = math.sqrt(2) * side + SLACK_M <= radius
+    for b in range(start.size - 1):
+        end = start[b + 1]
+        # Points are sorted by height, so only the first ones of a bucket can have too few companions.
+        if bucket_is_near:
+            end = min(end, start[b] + companions + 1)
+        for p in range(start[b], end):
+            # The count includes the point itself.
+            as_low = _count(x, y, z, start, shape, side, radius, p, step, companions + 2)
+            if as_low <= companions + 1:
+                enough = (OUTNUMBERED + 1) * as_low
+                out[p] = _count(x, y, z, start, shape, side, radius, p, np.inf, enough) == enough
+    return out
+
+
+@compiled()
+def _count(
+    x: Floats,
+    y: Floats,
+    z: Floats,
+    start: Indices,
+    shape: tuple[int, int],
+    side: float,
+    radius: float,
+    p: int,
+    step: float,
+    enough: int,
+) -> int:
+    """Count the points near p, itself included, at most ``step`` above it; stop at ``enough``."""
+    count = 0
+    first_col, end_col = span(x[p], radius, side, shape[1])
+    first_row, end_row = span(y[p], radius, side, shape[0])
+    for row in range(first_row, end_row):
+        for b in range(row * shape[1] + first_col, row * shape[1] + end_col):
+            for q in range(start[b], start[b + 1]):
+                if z[q] - z[p] > step:
+                    break
+                if math.sqrt((x[q] - x[p]) ** 2 + (y[q] - y[p]) ** 2) <= radius:
+                    count += 1
+                    if count == enough:
+                        return count
+    return count
