@@ -65,7 +65,8 @@ class Objective:
         by_a, by_w = np.zeros_like(z), np.zeros_like(z)
         loss = _data_terms(
             w * z, w, self.target, self.factor,
-            self.start_u, self.along_u, self.start_v, self.along_v, by_a, by_w,
+            self.start_u, self.along_u, self.start_v, self.along_v,
+            tuple(range(self.along_v.shape[1])), by_a, by_w,
         )  # fmt: skip
         return loss, by_a, by_w
 
@@ -110,13 +111,13 @@ def objective(
 @compiled(error_model="numpy")
 def _data_terms(
     a: Floats, w: Floats, target: Floats, factor: Floats, start_u: Starts, along_u: Floats,
-    start_v: Starts, along_v: Floats, by_a: Floats, by_w: Floats,
+    start_v: Starts, along_v: Floats, taps: tuple[int, ...], by_a: Floats, by_w: Floats,
 ) -> float:  # fmt: skip
     """Return the road and terrain terms and add their gradient by A and W to ``by_a`` and ``by_w``.
 
     The sums are separable: along u once per control row, then along v once per cell; the gradient is computed
-    in the reverse order. Inner loops run along a raster row, so that the compiler can use vector
-    instructions.
+    in the reverse order. Inner loops run over consecutive numbers, so that the compiler can use vector
+    instructions; ``taps`` are the indices of the functions along v, whose number it then knows.
     """
     rows, cols = target.shape
     a_u, w_u = _along_u(a, start_u, along_u), _along_u(w, start_u, along_u)
@@ -124,19 +125,19 @@ def _data_terms(
     losses, num, den = np.zeros(cols), np.empty(cols), np.empty(cols)
     for r in range(rows):
         first = start_v[r]
-        num[:] = 0.0
-        den[:] = 0.0
-        for i in range(along_v.shape[1]):
-            b = along_v[r, i]
-            for c in range(cols):
-                num[c] += b * a_u[first + i, c]
-                den[c] += b * w_u[first + i, c]
+        for c in range(cols):
+            numerator = denominator = 0.0
+            for i in taps:
+                numerator += along_v[r, i] * a_u[first + i, c]
+                denominator += along_v[r, i] * w_u[first + i, c]
+            num[c], den[c] = numerator, denominator
         for c in range(cols):
             height = num[c] / den[c]
             difference = height - target[r, c]
             losses[c] += factor[r, c] * abs(difference)
             # d|x|/dx is the sign of x, 0 at 0; then dS/dA = N / W and dS/dW = -S N / W.
-            pull = factor[r, c] * np.sign(difference) / den[c]
+            sign = 1.0 if difference > 0 else (-1.0 if difference < 0 else 0.0)
+            pull = factor[r, c] * sign / den[c]
             num[c] = pull
             den[c] = -pull * height
         for i in range(along_v.shape[1]):
@@ -144,27 +145,35 @@ def _data_terms(
             for c in range(cols):
                 by_a_u[first + i, c] += b * num[c]
                 by_w_u[first + i, c] += b * den[c]
-    _back_along_u(by_a_u, start_u, along_u, by_a)
-    _back_along_u(by_w_u, start_u, along_u, by_w)
+    by_a += _back_along_u(by_a_u, start_u, along_u, by_a.shape[1])
+    by_w += _back_along_u(by_w_u, start_u, along_u, by_w.shape[1])
     return float(losses.sum())
 
 
 @compiled()
 def _along_u(coefficients: Floats, start_u: Starts, along_u: Floats) -> Floats:
-    out = np.zeros((coefficients.shape[0], start_u.size))
-    for i in range(coefficients.shape[0]):
+    """Return the sums along u in each column, for all control rows, ``(m, W)``."""
+    columns = np.ascontiguousarray(coefficients.T)
+    out = np.zeros((start_u.size, columns.shape[1]))
+    for c in range(start_u.size):
         for j in range(along_u.shape[0]):
-            for c in range(start_u.size):
-                out[i, c] += along_u[j, c] * coefficients[i, start_u[c] + j]
-    return out
+            k, b = start_u[c] + j, along_u[j, c]
+            for i in range(columns.shape[1]):
+                out[c, i] += b * columns[k, i]
+    return np.ascontiguousarray(out.T)
 
 
 @compiled()
-def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, out: Floats) -> None:
-    for i in range(out.shape[0]):
-        for c in range(start_u.size):
-            for j in range(along_u.shape[0]):
-                out[i, start_u[c] + j] += along_u[j, c] * gradient[i, c]
+def _back_along_u(gradient: Floats, start_u: Starts, along_u: Floats, points: int) -> Floats:
+    """Return the gradient by the coefficients of `_along_u`, ``(m, points)``, from that by its result."""
+    columns = np.ascontiguousarray(gradient.T)
+    out = np.zeros((points, columns.shape[1]))
+    for c in range(start_u.size):
+        for j in range(along_u.shape[0]):
+            k, b = start_u[c] + j, along_u[j, c]
+            for i in range(columns.shape[1]):
+                out[k, i] += b * columns[c, i]
+    return np.ascontiguousarray(out.T)
 
 
 @compiled()
