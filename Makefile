@@ -39,6 +39,8 @@ LITERAL := $(REPRODUCED)/literal
 # The column of the paper read literally has fewer tiles: tiles of a smaller number are the first of a larger one.
 LITERAL_TILES ?= $(shell [ $(TILES) -lt 6 ] && echo $(TILES) || echo 6)
 SURVEY := $(REPRODUCED)/survey/catalog.parquet
+# The same tiles with the true heights and roads as reference, in place of the paper's extended DTM.
+TRUE_SURVEY := $(REPRODUCED)/survey/catalog_true.parquet
 LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$(SEED)/survey/catalog.parquet)
 RESULTS ?= $(REPRODUCED)/results
 # The published dataset lies elsewhere than its catalog.
@@ -50,7 +52,7 @@ STAND_IN = $(BIN)/flexroad run --config dsc3d --store $(STANDIN)/store
 
 reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figures beside ours, on made tiles (TILES=24 SEED=1) or GEROD_ROOT=...
 	$(ABLATE) --catalog $(SURVEY) --config ablation --out $(REPRODUCED)/segmented
-	$(if $(TRUE),$(ABLATE) --catalog $(SURVEY) --config ablation_true --out $(TRUE))
+	$(if $(TRUE),$(ABLATE) --catalog $(TRUE_SURVEY) --config ablation_true --out $(TRUE))
 	$(ABLATE) --catalog $(LITERAL_SURVEY) --config literal --out $(LITERAL)
 	$(STAND_IN) --catalog $(SCENES) --out $(STANDIN)/circular
 	$(STAND_IN) --catalog $(STANDIN)/scenes/catalog_true.parquet --out $(STANDIN)/true

@@ -27,6 +27,7 @@ from scipy.ndimage import label
 from flexroad.catalog import Catalog
 from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.benchmark.truth import CATALOG
 from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import nurbs, smoothing_spline
@@ -86,7 +87,7 @@ def case(place: str, data: TileData) -> Case:
 
 
 def benchmark_cases(scratch: Path) -> Iterator[Case]:
-    catalog = Catalog.read(write_scenes(scratch, TILES, SEED, preset="gerod"))
+    catalog = Catalog.read(write_scenes(scratch, TILES, SEED, preset="gerod").with_name(CATALOG))
     for number, tile in enumerate(catalog.tiles):
         yield case(("chosen on", "reported on")[number % 2], load.load(tile, load.Options()))
 

@@ -35,6 +35,8 @@ def test_reproduce_synthetic_tiles_run_with_both_masks(tmp_path):
     stores = [line[line.index("--store") + 1] for line in (first, second, literal)]
     assert stores[0] == stores[1] == stores[2]
     assert ("ablation" in first, "ablation_true" in second, "literal" in literal) == (True, True, True)
+    catalogs = [Path(line[line.index("--catalog") + 1]) for line in (first, second)]
+    assert catalogs[1] == catalogs[0].with_name("catalog_true.parquet")
     outs = [line[line.index("--out") + 1] for line in (first, second, literal)]
     assert tables[:6] == ["tables", outs[0], "--true", outs[1], "--literal", outs[2]]
     assert figures[:2] == ["figures", outs[0]]

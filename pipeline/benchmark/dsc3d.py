@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexroad.catalog import Catalog, Layer, Tile
+from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.paths import write
+from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor
 from flexroad.tasks.synthetic import dsc3d, glb
@@ -24,8 +25,6 @@ MADE = datetime(2025, 1, 1, tzinfo=UTC)
 """Date of the data; fixed, so that the same command writes the same files."""
 NAME = "synthetic photogrammetry, stand-in for DSC3D, seed {}"
 TRUE = "true reference"
-KNOWN = "known"
-"""Folder of a scene's true layers and of its road mask with the errors of a segmentation."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
             if error:
                 raise ConfigError(error)
         tiles = [_tile(folder, place) for place in places]
-        Catalog(tuple(_with_truth(tile, seed) for tile in tiles)).write(folder / "catalog_true.parquet")
+        true = f"{NAME.format(seed)}; {TRUE}"
+        Catalog(tuple(with_truth(tile, f"{tile.id}/{KNOWN}", true) for tile in tiles)).write(folder / CATALOG)
         Catalog(tuple(tiles)).write(folder / "catalog.parquet")
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
@@ -109,14 +109,3 @@ def _tile(folder: Path, place: Place) -> Tile:
     (tile,) = Catalog.read(folder / name / "catalog.parquet").tiles
     tile = tile.renamed(lambda file: f"{name}/{Path(file).name}")
     return replace(tile, id=name, root=str(folder.resolve()), stratum=place.site.stratum)
-
-
-def _with_truth(tile: Tile, seed: int) -> Tile:
-    """Return the tile with the true heights and roads as reference."""
-    layers = tuple(
-        Layer(layer.name, (f"{tile.id}/{KNOWN}/{layer.name}/{tile.id}.tif",))
-        if layer.name in ("reference", "reference_road")
-        else layer
-        for layer in tile.layers
-    )
-    return replace(tile, layers=layers, dataset=f"{NAME.format(seed)}; {TRUE}")

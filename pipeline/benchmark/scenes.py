@@ -13,6 +13,7 @@ from flexroad.catalog.headers.vectors import opened, with_roads
 from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
+from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs
 from flexroad.tasks.io.vector_date import vector_date
@@ -42,6 +43,8 @@ class SceneJob:
     """Name of the dataset."""
     dop: bool
     """Whether to write an orthophoto."""
+    extended_dtm: bool
+    """Whether the reference is the DTM with bridges; the truth is then written to a folder of its own."""
 
 
 def write_scenes(
@@ -53,6 +56,9 @@ def write_scenes(
     preset: str | None = None,
 ) -> Path:
     """Write a block of neighbouring tiles, or the tiles of a preset; return the path of their catalog.
+
+    The reference of a preset's tiles is the one that the paper describes. Beside their catalog,
+    ``catalog_true.parquet`` lists them with the truth as reference.
 
     Parameters
     ----------
@@ -86,7 +92,11 @@ def write_scenes(
         path = folder / "catalog.parquet"
         # The folder may also contain tiles of an earlier call.
         tiles_written = prepared.index(folder, only={job.tile_id for job in jobs})
-        Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written)).write(path)
+        catalog = Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written))
+        if preset:
+            true = tuple(with_truth(tile, KNOWN, tile.dataset) for tile in catalog.tiles)
+            Catalog(true).write(folder / CATALOG)
+        catalog.write(path)
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
     return path
@@ -98,7 +108,7 @@ def _jobs(
     if preset is None:
         name, options = f"synthetic, seed {seed}", SceneOptions()
         return [
-            SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop)
+            SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop, extended_dtm=False)
             for tile_id, grid in block(tiles or TILES, size_m or SIZE_M)
         ]
     if preset not in PRESETS:
@@ -108,7 +118,7 @@ def _jobs(
         raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave --tile-size out")
     name = f"synthetic benchmark {preset}, seed {seed}"
     return [
-        SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop)
+        SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop, extended_dtm=True)
         for tile_id, grid, stratum, options in gerod.survey(tiles or gerod.TILES, seed)
     ]
 
@@ -117,7 +127,12 @@ def _write_scene(job: SceneJob) -> str:
     arguments = (job.grid, job.seed, job.stratum, job.options)
     scene = make_scene(*arguments)
     layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
-    prepared.write_tile(Path(job.folder), job.tile_id, job.grid, layers, scene.stratum, MADE, job.name)
+    folder, about = Path(job.folder), (scene.stratum, MADE, job.name)
+    if job.extended_dtm:
+        truth = {"reference": scene.reference, "reference_road": scene.reference_road}
+        prepared.write_tile(folder / KNOWN, job.tile_id, job.grid, truth, *about)
+        layers |= {"reference": scene.extended_dtm}
+    prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Paved and bare areas off the road: car parks and fields, which a segmentation mistakes for road."""
+"""Paved and bare areas off the road, which a segmentation mistakes for road: car parks, fields, yards."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BAY_M, AISLE_M = 2.6, 16.0
 OCCUPIED = 0.55
 """Fraction of the bays with a car."""
 MISTAKEN = 0.6
-"""Fraction of the car parks and fields that the segmentation mistakes for road."""
+"""Fraction of these areas that the segmentation mistakes for road."""
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (0, 0)])
 
 
@@ -48,6 +48,11 @@ def car_parks(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: f
 def fields(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
     """Return bare fields, ``mean`` per street on average."""
     return _beside(streets, seed, "fields", ground_at, mean, ((10, 20), (5, 14), (1.5, 4)))
+
+
+def yards(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[Area, ...]:
+    """Return paved yards next to the pavement, ``mean`` per street on average; houses may stand on them."""
+    return _beside(streets, seed, "paved yards", ground_at, mean, ((3, 10), (3, 9), (1.2, 2.5)))
 
 
 def _beside(

@@ -75,5 +75,33 @@ class SceneOptions(Options):
     )
     scars_m: float = Field(0.0, ge=0, le=2, description="depth of the DTM's errors under houses (m)")
 
+    patch_m: float = Field(
+        0.0, ge=0, le=5, description="side of the image patches that the mask consists of (m); 0: the cells"
+    )
+    verge_m: float = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="width of the strip beside streets that the mask shows as road, roofs excepted (m)",
+    )
+    verge_share: float = Field(
+        0.5, ge=0, le=1, description="fraction of the streets' length with such a strip"
+    )
+    yards: float = Field(
+        0.0, ge=0, le=10, description="paved yards per street that the mask may show as road"
+    )
+    lean: float = Field(
+        0.0, ge=0, le=0.6, description="greatest displacement of roofs in the photograph, per height"
+    )
+    facades: float = Field(
+        0.0, ge=0, le=1, description="fraction of the facades in the photograph that the mask shows as road"
+    )
+    works: float = Field(
+        0.0, ge=0, le=5, description="places per street that changed from the DTM's survey to the DSM's"
+    )
+    flight_offset_m: float = Field(
+        0.0, ge=0, le=1, description="root mean square offset of the DTM from the DSM's survey (m)"
+    )
+
 
 DEFAULTS = SceneOptions()

@@ -14,6 +14,7 @@ from flexroad.tasks.synthetic.network import Street
 from flexroad.tasks.synthetic.noise import generator
 from flexroad.tasks.synthetic.objects import Car, Crown, GroundAt, House, Spot, cars, crowns, houses, spots
 from flexroad.tasks.synthetic.options import SceneOptions
+from flexroad.tasks.synthetic.roofs import Roof, roofs_seen
 from flexroad.tasks.synthetic.towers import towers
 
 KERB_REACH_M = 2.5
@@ -34,6 +35,9 @@ class Objects:
     """Roofs, or parts of them, that the segmentation mistakes for road."""
     rails: Trace
     wires: Trace
+    yards: tuple[Area, ...] = ()
+    roofs: tuple[Roof, ...] = ()
+    """Roofs as the photograph shows them; empty if no error of the mask depends on them."""
 
 
 def populate(
@@ -64,6 +68,7 @@ def populate(
     built = houses(streets, seed, ground_at, density * options.built, options.storeys)
     built += towers(streets, seed, ground_at, options.towers * density)
     built = areas.houses_off(built, (*car_parks, *bare))
+    roofs = roofs_seen(built, seed, ground_at, options.lean * errors, options.facades)
     trees = crowns(streets, seed, ground_at, built, density, options.trees)
     vehicles = [car for street in streets for car in cars(street, seed, density)]
     if options.roundabouts:
@@ -76,9 +81,11 @@ def populate(
         tuple(spot for street in streets for spot in spots(street, seed, errors)),
         car_parks,
         bare,
-        _false_roofs(built, seed, options.false_roofs * errors),
+        _false_roofs(roofs, seed, options.false_roofs * errors),
         linework.rails(streets, seed, ground_at, options.rails * density),
         linework.wires(streets, seed, ground_at, options.wires * density),
+        areas.yards(farther, seed, ground_at, options.yards * errors),
+        roofs if options.lean or options.verge_m or options.yards else (),
     )
 
 
@@ -94,11 +101,13 @@ def _off_roundabouts(vehicles: Sequence[Car], ground_at: GroundAt) -> list[Car]:
     return [car for car, fit in zip(vehicles, fits, strict=True) if fit]
 
 
-def _false_roofs(built: Sequence[House], seed: int, share: float) -> tuple[Area, ...]:
-    roofs = []
-    for house in built if share > 0 else ():
+def _false_roofs(roofs: Sequence[Roof], seed: int, share: float) -> tuple[Area, ...]:
+    false = []
+    for roof in roofs if share > 0 else ():
+        house = roof.house
         rng = generator(seed, "roof", int(house.x // 1), int(house.y // 1))
         if rng.random() < share:
             length = house.half_length * rng.uniform(0.4, 1)
-            roofs.append(Area(house.x, house.y, house.heading, length, house.half_depth, as_road=True))
-    return tuple(roofs)
+            x, y = house.x + roof.shift[0], house.y + roof.shift[1]
+            false.append(Area(x, y, house.heading, length, house.half_depth, as_road=True))
+    return tuple(false)

@@ -14,15 +14,17 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.synthetic.mixing import mixed
 from flexroad.tasks.synthetic.network import Box, Plan
-from flexroad.tasks.synthetic.noise import Waves, generator, waves
+from flexroad.tasks.synthetic.noise import generator, waves
 from flexroad.tasks.synthetic.objects import GroundAt
 from flexroad.tasks.synthetic.options import DEFAULTS, SceneOptions
 from flexroad.tasks.synthetic.plants import growth
 from flexroad.tasks.synthetic.population import Objects, populate
 from flexroad.tasks.synthetic.scars import scars
-from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, segmentation, surface_model
+from flexroad.tasks.synthetic.segmentation import segmentation
+from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, surface_model
 from flexroad.tasks.synthetic.strata import find_stratum
 from flexroad.tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
+from flexroad.tasks.synthetic.works import changes, rise
 from flexroad.tasks.types import Bools, Floats
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
@@ -33,6 +35,8 @@ DTM_BLUR_M = 1.0
 """Standard deviation of the Gaussian that models the DTM's smoothing by interpolation (m)."""
 DTM_GRAIN_M = 3.0
 """Correlation length of the DTM's noise (m)."""
+FLIGHT_WAVES_M = (300.0, 1500.0)
+"""Shortest and longest wave of the offset between two surveys (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,9 @@ class Scene:
     road_mask: Bools
     """Road with the errors of a segmentation, ``(H, W)``."""
     reference: Floats
-    """True height of road and terrain with bridges, ``(H, W)``, m."""
+    """True height of road and terrain with bridges at the time of the DSM, ``(H, W)``, m."""
+    extended_dtm: Floats
+    """The DTM with the bridges' decks: the paper's reference, ``(H, W)``, m."""
     reference_road: Bools
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
@@ -98,20 +104,23 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     canvas, inner = Canvas.of(wide, plan), wide.window(grid)
     ground_at = _ground_near(canvas, options)
     here = ground_at(canvas.x, canvas.y)
+    truth = _truth(canvas, here, options)
     streets = plan.streets(_box(canvas, OBJECT_REACH_M))
     farther = plan.streets(_box(canvas, 2 * OBJECT_REACH_M))
     objects = populate(streets, farther, seed, ground_at, options)
     rng = generator(seed, "survey", *map(int, grid.origin))
-    dsm, kind = _survey(canvas, here, objects, options, rng)
-    wobble = _wobble(seed, options.wobble_m)
-    bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m)
+    dsm, kind = _survey(canvas, here, truth, objects, options, rng)
+    offset = _flight_offset(canvas, options.flight_offset_m)
+    bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m) + offset
+    dtm = _terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
     return Scene(
         grid=grid,
         stratum=plan.stratum_at(*_centre(canvas)).name,
         dsm=dsm[inner],
-        dtm=_terrain_model(bare, wide.cell, options.dtm_noise_m, rng)[inner],
-        road_mask=segmentation(canvas, here.edge, objects, wobble, options.mask_errors)[inner],
-        reference=here.height[inner],
+        dtm=dtm[inner],
+        road_mask=segmentation(canvas, here.edge, objects, ground_at, options)[inner],
+        reference=truth[inner],
+        extended_dtm=np.where(here.deck, here.graded + offset, dtm)[inner],
         reference_road=here.road[inner],
         kind=kind[inner],
     )
@@ -121,8 +130,8 @@ def true_height(grid: Grid, seed: int, stratum: str | None, options: SceneOption
     """Return ``reference`` of the scene that `make_scene` gives for these arguments, ``(H, W)``, m."""
     wide = grid.buffered(4 * DTM_BLUR_M)
     canvas = Canvas.of(wide, plan_of(seed, stratum, options))
-    height: Floats = _ground_near(canvas, options)(canvas.x, canvas.y).height
-    return height[wide.window(grid)]
+    here = _ground_near(canvas, options)(canvas.x, canvas.y)
+    return _truth(canvas, here, options)[wide.window(grid)]
 
 
 def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
@@ -140,11 +149,24 @@ def plan_of(seed: int, stratum: str | None, options: SceneOptions) -> Plan:
     )
 
 
+def _truth(canvas: Canvas, here: Ground, options: SceneOptions) -> Floats:
+    """Return the true height at the time of the DSM, ``(H, W)``, m; the DTM is of the time before."""
+    found = changes(canvas.plan.streets(_box(canvas, OBJECT_REACH_M)), canvas.plan.seed, options.works)
+    if not found:
+        return here.height
+    return np.where(here.deck, here.height, here.height + rise(found, canvas.x, canvas.y))
+
+
 def _survey(
-    canvas: Canvas, here: Ground, objects: Objects, options: SceneOptions, rng: np.random.Generator
+    canvas: Canvas,
+    here: Ground,
+    truth: Floats,
+    objects: Objects,
+    options: SceneOptions,
+    rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the surface model with noise (m) and the `Kind` of each cell."""
-    dsm, kind = surface_model(canvas, here.height, here.deck, objects, options.overhang_m, rng)
+    dsm, kind = surface_model(canvas, truth, here.deck, objects, options.overhang_m, rng)
     dsm += rng.uniform(*options.dsm_noise_m) * rng.standard_normal(dsm.shape)
     if options.growth_m > 0:
         seed = canvas.plan.seed
@@ -153,8 +175,8 @@ def _survey(
         dsm[overgrown] += height[overgrown]
         kind[overgrown] = Kind.PLANTS
     if options.mixed > 0:
-        dsm, chosen = mixed(dsm, here.height, options.mixed, rng)
-        kind[chosen & np.isin(kind, BARE) & (dsm > here.height)] = Kind.MIXED
+        dsm, chosen = mixed(dsm, truth, options.mixed, rng)
+        kind[chosen & np.isin(kind, BARE) & (dsm > truth)] = Kind.MIXED
     return dsm, kind
 
 
@@ -185,10 +207,11 @@ def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Gen
     return smooth
 
 
-def _wobble(seed: int, rms_m: float) -> Waves:
-    """Return the offset of the mask's edges; its waves are 5 to 40 m long, like errors of image patches."""
-    lengths = np.geomspace(5, 40, 12)
-    return waves(generator(seed, "wobble"), lengths, rms_m * np.sqrt(2 / lengths.size))
+def _flight_offset(canvas: Canvas, rms_m: float) -> Floats:
+    """Return the slowly varying offset of the DTM's survey from the DSM's (m), ``(H, W)``."""
+    lengths = np.geomspace(*FLIGHT_WAVES_M, 5)
+    field = waves(generator(canvas.plan.seed, "flights"), lengths, rms_m * np.sqrt(2 / lengths.size))
+    return field(canvas.x, canvas.y)
 
 
 def _box(canvas: Canvas, margin_m: float) -> Box:

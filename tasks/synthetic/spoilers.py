@@ -1,4 +1,4 @@
-"""Survey rasters with objects and errors ("spoilers"): the surface model and the road mask."""
+"""The surface model of a survey with the objects that spoil it ("spoilers")."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.synthetic.areas import Area
 from flexroad.tasks.synthetic.linework import Trace
 from flexroad.tasks.synthetic.network import Plan
-from flexroad.tasks.synthetic.noise import Waves
 from flexroad.tasks.synthetic.objects import Car, Crown, House
 from flexroad.tasks.synthetic.population import Objects
 from flexroad.tasks.types import Bools, Floats
@@ -33,7 +32,7 @@ class Kind(IntEnum):
     MIXED = 9
     """Cell at a wall, with a height between ground and top."""
     PAVED = 10
-    """Ground of a car park."""
+    """Ground of a car park or a yard."""
     FIELD = 11
     """Bare ground that looks like road from above."""
 
@@ -90,11 +89,13 @@ def surface_model(
     Low vegetation and mixed cells are added later. Roofs reach ``overhang_m`` beyond the walls.
     """
     dsm, kind = truth.copy(), np.where(deck, Kind.DECK, Kind.GROUND).astype(np.uint8)
-    for area, area_kind in [(a, Kind.PAVED) for a in objects.car_parks] + [
-        (a, Kind.FIELD) for a in objects.fields
-    ]:
-        window, inside = _covered(canvas, area, np.zeros(truth.shape))
-        kind[window][inside] = area_kind
+    for areas, area_kind in (
+        ((*objects.car_parks, *objects.yards), Kind.PAVED),
+        (objects.fields, Kind.FIELD),
+    ):
+        for area in areas:
+            window, inside = covered(canvas, area, np.zeros(truth.shape))
+            kind[window][inside] = area_kind
     for house in objects.houses:
         window, z = _roof(canvas, house, overhang_m)
         _raise(dsm[window], kind[window], z, Kind.BUILDING)
@@ -169,38 +170,7 @@ def _foliage(canvas: Canvas, crown: Crown) -> tuple[tuple[slice, slice], Floats]
     return window, np.where(out <= 1, crown.top - fall, -np.inf)
 
 
-def segmentation(canvas: Canvas, edge: Floats, objects: Objects, wobble: Waves, scale: float) -> Bools:
-    """Return the road mask with the errors of a segmentation, ``(H, W)``.
-
-    Parameters
-    ----------
-    canvas : Canvas
-        The tile's cells.
-    edge : (H, W) array
-        Distance to the nearest carriageway's edge, negative on the road (m).
-    objects : Objects
-        Objects: crowns hide the road; spots, and some areas and roofs, are classified wrongly.
-    wobble : Waves
-        Offset of the mask's edges (m).
-    scale : float
-        Factor on the size of the errors: 0 for a perfect mask, 1 for the usual size.
-    """
-    error = scale * wobble(canvas.x, canvas.y)
-    mask: Bools = edge + error <= 0
-    discs = [(c.x, c.y, 0.8 * c.radius * scale, False) for c in objects.crowns if c.hides]
-    discs += [(s.x, s.y, s.radius * scale, s.road) for s in objects.spots]
-    for x, y, radius, road in discs:
-        window = canvas.around(x, y, radius + 2)
-        away = np.hypot(canvas.x[window] - x, canvas.y[window] - y)
-        mask[window][away + error[window] < radius] = road
-    mistaken = [a for a in (*objects.car_parks, *objects.fields, *objects.false_roofs) if a.as_road]
-    for area in mistaken if scale > 0 else ():
-        window, inside = _covered(canvas, area, error)
-        mask[window][inside] = True
-    return mask
-
-
-def _covered(canvas: Canvas, area: Area, error: Floats) -> tuple[tuple[slice, slice], Bools]:
+def covered(canvas: Canvas, area: Area, error: Floats) -> tuple[tuple[slice, slice], Bools]:
     """Return the window and the cells of an area whose edge is shifted by ``error`` (m)."""
     window = canvas.around(area.x, area.y, float(np.hypot(area.half_length, area.half_width)) + 2)
     u, v = canvas.local(window, area.x, area.y, area.heading)

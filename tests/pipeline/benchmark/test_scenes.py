@@ -34,9 +34,25 @@ def test_write_scenes_preset_catalog_lists_its_tiles(benchmark):
 def test_write_scenes_preset_files_contain_its_scenes(benchmark):
     tile_id, grid, stratum, options = survey(5, 2)[-1]
     scene = make_scene(grid, 2, stratum, options)
-    for name, layer in scene.layers.items():
+    for name, layer in {**scene.layers, "reference": scene.extended_dtm}.items():
         with rasterio.open(benchmark.parent / name / f"{tile_id}.tif") as file:
             assert np.array_equal(file.read(1), layer.astype(file.dtypes[0]))
+
+
+def test_write_scenes_preset_second_catalog_has_truth(benchmark):
+    paper, true = (
+        {tile.id: tile for tile in Catalog.read(path).tiles}
+        for path in (benchmark, benchmark.with_name("catalog_true.parquet"))
+    )
+    tile_id, grid, stratum, options = survey(5, 2)[0]
+    scene = make_scene(grid, 2, stratum, options)
+    extended, truth = (load(tiles[tile_id], Options()) for tiles in (paper, true))
+    assert np.array_equal(truth.reference, scene.reference.astype(np.float32))
+    assert np.array_equal(truth.reference_road, scene.reference_road)
+    assert np.array_equal(extended.dsm, truth.dsm)
+    # The extended DTM is the DTM but for the decks of bridges.
+    assert np.mean(extended.reference == extended.dtm) > 0.9
+    assert {tile.dataset for tile in true.values()} == {tile.dataset for tile in paper.values()}
 
 
 def test_write_scenes_roads_are_true_and_repeatable(benchmark, tmp_path):

@@ -15,7 +15,7 @@ from flexroad.tasks.synthetic.spoilers import BARE
 from flexroad.tasks.synthetic.surfaces import CIRCLE_M, ISLAND_M
 
 GRID = block(1)[0][1]
-QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0}
+QUIET = {"dsm_noise_m": (0, 0), "dtm_noise_m": 0, "flight_offset_m": 0}
 INNER = np.s_[25:-25, 25:-25]
 """Cells whose neighbourhood lies on the tile."""
 EMPTY = {**QUIET, "density": 0, "mask_errors": 0, "stream_share": 0}
