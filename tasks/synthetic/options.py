@@ -81,11 +81,17 @@ class SceneOptions(Options):
     verge_m: float = Field(
         0.0,
         ge=0,
-        le=60,
+        le=10,
         description="width of the strip beside streets that the mask shows as road, roofs excepted (m)",
     )
     verge_share: float = Field(
         0.5, ge=0, le=1, description="fraction of the streets' length with such a strip"
+    )
+    open_ground: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="fraction of all ground that the mask shows as road, roofs and crowns excepted",
     )
     yards: float = Field(
         0.0, ge=0, le=10, description="paved yards per street that the mask may show as road"

@@ -85,7 +85,7 @@ def populate(
         linework.rails(streets, seed, ground_at, options.rails * density),
         linework.wires(streets, seed, ground_at, options.wires * density),
         areas.yards(farther, seed, ground_at, options.yards * errors),
-        roofs if options.lean or options.verge_m or options.yards else (),
+        roofs if options.lean or options.verge_m or options.yards or options.open_ground else (),
     )
 
 

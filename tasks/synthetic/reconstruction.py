@@ -43,7 +43,7 @@ class Faults(base.Options):
         0.04, ge=0, lt=1, description="fraction of the surfaces without texture that have no matches"
     )
     hidden: float = Field(
-        0.3, ge=0, lt=1, description="fraction of the ground at walls that no photograph shows"
+        0.1, ge=0, lt=1, description="fraction of the ground at walls that no photograph shows"
     )
     bridged_m2: float = Field(8.0, ge=0, description="area up to which holes are always bridged (m2)")
     open: float = Field(0.3, ge=0, le=1, description="fraction of the larger holes that stay open")

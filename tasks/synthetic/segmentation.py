@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.synthetic.areas import Area
@@ -19,8 +20,8 @@ from flexroad.tasks.types import Bools, Floats
 
 WOBBLE_M = (5.0, 40.0)
 """Shortest and longest wave of the offset of the mask's edges (m)."""
-VERGE_WAVES_M = (20.0, 120.0)
-"""Shortest and longest wave of the field that says where the mask reaches beyond the carriageway (m)."""
+STRETCH_M = (20.0, 120.0)
+"""Shortest and longest wave of the fields that say where the mask reaches beyond the carriageway (m)."""
 SOLID = 0.8
 """Radius of the part of a crown that hides what is below, as a fraction of the crown's radius."""
 FACADE_REACH_M = 8.0
@@ -67,6 +68,7 @@ def _classified(canvas: Canvas, edge: Floats, objects: Objects, options: SceneOp
     error = scale * _wobble(canvas, options.wobble_m)
     mask: Bools = edge + error <= scale * _verge(canvas, options)
     if scale > 0:
+        mask |= _stretches(canvas, "open ground", options.open_ground)
         _add(mask, canvas, objects.yards, error)
     for crown in objects.crowns:
         if crown.hides:
@@ -103,15 +105,19 @@ def _wobble(canvas: Canvas, rms_m: float) -> Floats:
     return field(canvas.x, canvas.y)
 
 
-def _verge(canvas: Canvas, options: SceneOptions) -> Floats | float:
+def _verge(canvas: Canvas, options: SceneOptions) -> Floats:
     """Return how far the mask reaches beyond the carriageway (m), ``(H, W)``."""
-    if not options.verge_m:
-        return 0.0
-    from scipy.special import ndtri
+    return np.where(_stretches(canvas, "verge", options.verge_share), options.verge_m, 0.0)
 
-    lengths = np.geomspace(*VERGE_WAVES_M, 15)
-    field = waves(generator(canvas.plan.seed, "verge"), lengths, np.sqrt(2 / lengths.size))
-    return np.where(field(canvas.x, canvas.y) < ndtri(options.verge_share), options.verge_m, 0.0)
+
+def _stretches(canvas: Canvas, purpose: str, share: float) -> Bools:
+    """Return coherent areas that cover a fraction of the plane, ``(H, W)``."""
+    if share <= 0:
+        return np.zeros(canvas.x.shape, np.bool_)
+    lengths = np.geomspace(*STRETCH_M, 15)
+    field = waves(generator(canvas.plan.seed, purpose), lengths, np.sqrt(2 / lengths.size))
+    inside: Bools = field(canvas.x, canvas.y) < ndtri(share)
+    return inside
 
 
 def _add(mask: Bools, canvas: Canvas, areas: Iterable[Area], error: Floats) -> None:

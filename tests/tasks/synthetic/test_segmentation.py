@@ -93,6 +93,14 @@ def test_verge_share_is_that_of_the_length():
     assert (half - none) / (whole - none) == pytest.approx(0.5, abs=0.2)
 
 
+def test_open_ground_is_all_but_roofs_and_crowns():
+    half, whole = made(open_ground=0.5), made(open_ground=1)
+    covered = np.isin(whole.kind, (Kind.BUILDING, Kind.CROWN)) & ~whole.reference_road
+    assert whole.road_mask[~covered].mean() > 0.97
+    assert whole.road_mask[covered].mean() < 0.15
+    assert 0.3 < false_road(half).sum() / false_road(whole).sum() < 0.7
+
+
 def test_yards_are_paved_and_partly_in_mask():
     yards = made(yards=3)
     paved = yards.kind == Kind.PAVED
