@@ -23,6 +23,7 @@ MAX_SHOWN = 5
 TITLES = {
     "dsm": "surface models (DSM)",
     "dtm": "terrain models (DTM)",
+    "road_height": "heights for roads",
     "dop": "orthophotos",
     "road_mask": "road masks or land cover",
     "cloud": "point clouds",

@@ -32,6 +32,7 @@ SUFFIXES = {
 """Kind -> endings of its files; a raster's layer is then told by its name."""
 NAMES = (
     ("above_ground", r"n(dom|dsm)|cdsm|chm|dhm|mnh|ndhm"),
+    ("road_height", r"road.?heights?"),
     ("dsm", r"dsm|dom|mns|mds|surface"),
     ("dtm", r"dtm|dgm|dem|mnt|mdt|terrain|ground|bare"),
     ("dop", r"dop|ortho|orthophoto|rgbi?|cir"),

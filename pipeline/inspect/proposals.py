@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flexroad.pipeline.inspect.downloads import Download
 
-LAYERS = ("dsm", "dtm", "dop", "road_mask")
+LAYERS = ("dsm", "dtm", "road_height", "dop", "road_mask")
 """Layers that rasters are given for."""
 LAYER = "--roads-layer with the layer of the roads"
 """What to add for a vector file of several layers."""

@@ -7,6 +7,7 @@ import pytest
 from rasterio.warp import transform
 from shapely import LineString, box
 
+from flexroad.catalog import Catalog
 from tests.make_rasters import write
 from tests.make_roads import write as write_roads
 
@@ -38,6 +39,18 @@ def test_init_commands_run_as_printed(downloads, flexroad, tmp_path):
     flexroad(*check).expected(0)
     assert "--config own.yaml" in " ".join(run)
     flexroad(*run, "--allow", downloads, "--dry-run").expected(0)
+
+
+def test_init_heights_for_roads_become_a_layer(downloads, flexroad):
+    for tile in ("1", "2"):
+        ground = np.full((60, 60), 99.98, np.float32)
+        write(downloads / f"road_height/a_{tile}.tif", ground, WEST + 60 * (tile == "2"), NORTH)
+    said = flexroad("init", downloads).expected(0).out
+    assert "heights for roads: 2" in said
+    (catalog,) = (line for line in said.splitlines() if line.startswith("flexroad catalog rasters"))
+    flexroad(*shlex.split(catalog)[1:], "--tile-size", 60).expected(0)
+    tiles = Catalog.read(shlex.split(catalog)[-1])
+    assert {layer.name for tile in tiles.tiles for layer in tile.layers} >= {"dsm", "dtm", "road_height"}
 
 
 def test_init_never_overwrites_configuration(downloads, flexroad, tmp_path):
