@@ -15,6 +15,7 @@ import startinpy
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.parts import middles
 from flexroad.tasks.meshing.triangulate import SNAP_TOLERANCE_M, Edges, Faces, with_edges
 from flexroad.tasks.types import Bools, Floats
@@ -78,6 +79,11 @@ def refined(
     points : ndarray, (N, 3)
         First the fixed points.
     faces : ndarray of int32, (F, 3)
+
+    Raises
+    ------
+    TaskError
+        If the mesh would have 2 million vertices or more.
     """
     triangulation = startinpy.DT()
     triangulation.snap_tolerance = SNAP_TOLERANCE_M
@@ -114,6 +120,8 @@ class _Errors:
 
     def worst(self, points: Floats, faces: Faces) -> NDArray[np.intp]:
         """Return the worst probes of faces that exceed the tolerance, ascending; each is returned once."""
+        if len(points) >= 1 << BITS:
+            raise TaskError(f"the mesh would have {1 << BITS:,} vertices or more; raise sample.tolerance_m")
         first, second, third = np.sort(faces, axis=1).T.astype(np.int64)
         keys = (first << 2 * BITS) | (second << BITS) | third
         at = np.minimum(np.searchsorted(self.keys, keys), max(len(self.keys) - 1, 0))
