@@ -49,6 +49,16 @@ def test_survey_scenes_have_rise_of_site(seed):
     assert survey(2, seed) == places[:2]
 
 
+def test_survey_masks_are_all_ground_between_roofs_and_crowns():
+    """T = 40K of 45K needs a mask of 89%; RGT's 15.4 m on terrain needs high objects on the rest."""
+    from flexroad.tasks.synthetic import make_scene
+
+    scenes = [make_scene(p.grid, SEED, p.site.stratum, p.options) for p in survey(seed=SEED)]
+    assert np.mean([scene.road_mask.mean() for scene in scenes]) == pytest.approx(0.89, abs=0.03)
+    heights = [(scene.dsm - scene.reference)[~scene.road_mask].mean() for scene in scenes]
+    assert np.mean(heights) == pytest.approx(15.4, rel=0.25)
+
+
 @pytest.mark.slow
 def test_mesh_fills_square_with_requested_triangles(scene, place):
     assert scene.mesh.bounds == pytest.approx(place.grid.bounds, abs=1e-6)
