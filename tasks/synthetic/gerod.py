@@ -100,7 +100,10 @@ _WORLDS: Mapping[str, SceneOptions] = {
         scars_m=0.25,
     ),
 }
-"""Mean contents of the tiles of each stratum."""
+"""Mean contents of the tiles of each stratum.
+
+``built`` was fixed by RGT on terrain, 1.773 m; the rest by the rounds of 2026-11-21 (``docs/decisions.md``).
+"""
 
 ERRORS: Mapping[str, float] = {
     # 14 pixels, DINOv2's patch, of 0.1 m, the pixel of the orthophotos of Geobasis NRW.

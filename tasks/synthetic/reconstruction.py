@@ -42,6 +42,7 @@ class Faults(base.Options):
     blank: float = Field(
         0.04, ge=0, lt=1, description="fraction of the surfaces without texture that have no matches"
     )
+    # RGT on roads, 0.195 m: ground bridged at walls is too high, and the mask covers it.
     hidden: float = Field(
         0.1, ge=0, lt=1, description="fraction of the ground at walls that no photograph shows"
     )
