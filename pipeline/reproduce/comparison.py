@@ -178,7 +178,7 @@ def _other_masks(rows: tuple[Row, ...], means: dict[str, Means]) -> Iterator[Sec
         for classes, class_means in means.items():
             values = [format_figure(class_means.mean[row.variant, figure], figure) for row in rows]
             table[f"{FIGURES[figure]}, {MASKS[classes]}"] = values
-    yield Section("Our figures by the segmented and by the true mask", table)
+    yield Section("Our figures by the segmented mask, and by the true mask and true heights", table)
 
 
 def _per_stratum(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
