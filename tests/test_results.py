@@ -174,6 +174,21 @@ def test_causes_has_the_table_of_the_stored_weights_of_the_loss():
     assert lambdas.table(pd.read_csv(lambdas.RESULTS)) in (ROOT / "docs" / "causes.md").read_text()
 
 
+def test_causes_has_the_table_of_the_stored_fits():
+    import pandas as pd
+
+    causes = experiment("causes")
+    means = pd.read_csv(causes.RESULTS)
+    text = (ROOT / "docs" / "causes.md").read_text()
+    assert causes.table(means) in text
+    ours, squared = (
+        means[means.fit == fit].set_index("roads") for fit in ("L1, from the DTM", "squared loss")
+    )
+    for part, figure in ((ours, "l2_road_m"), (squared, "l2_road_m"), (squared, "mad_road_deg")):
+        rise = part[figure]["all segmented cells"] / part[figure]["ECSRC, theta_z = 0.5 m"] - 1
+        assert f" by {rise:.0%}" in text
+
+
 def test_causes_bound_follows_from_the_published_tables():
     """Target of the fit without ECSRC: RGT on roads, the DTM elsewhere; see section 1 of the page."""
     from flexroad.pipeline.reproduce.published import published
