@@ -59,7 +59,8 @@ class Cluster(Options):
     batch_memory: ByteSize | None = Field(
         None,
         ge=1024**2,
-        description="memory of a batch of fits, 2 GiB by default; more tiles are solved in parts",
+        description="memory of a batch of fits; by default 2 GiB, on the CPU at most half of its worker's; "
+        "more tiles are solved in parts",
     )
     flush: bool = Field(
         True,

@@ -68,15 +68,27 @@ def fit_together(cluster: Cluster, jobs: tuple[TileJob, ...]) -> list[TileJob]:
     ConfigError
         If this worker does not have the device.
     """
-    engine = Engine(cluster.device, memory_bytes=int(cluster.batch_memory or Engine.memory_bytes))
     try:
-        engine.chosen_device()
+        device = Engine(cluster.device).chosen_device()
     except TaskError as error:
         raise ConfigError(f"cluster.device: {error}") from error
+    engine = Engine(device, memory_bytes=memory_of_batch(cluster, device))
     done = list(jobs)
     for number in range(len(jobs[0].start.fits)):
         done = _fit(done, number, engine)
     return done
+
+
+def memory_of_batch(cluster: Cluster, device: str) -> int:
+    """Return what a batch may use (bytes): on the CPU at most half of its worker's memory by default."""
+    if cluster.batch_memory or device != "cpu":
+        return int(cluster.batch_memory or Engine.memory_bytes)
+    from dask.system import CPU_COUNT
+
+    from flexroad.pipeline.execute.memory import available_bytes
+
+    worker = cluster.memory or available_bytes() // (cluster.workers or CPU_COUNT)
+    return min(Engine.memory_bytes, int(worker) // 2)
 
 
 def _fit(jobs: Sequence[TileJob], number: int, engine: Engine) -> list[TileJob]:

@@ -8,13 +8,14 @@ import pytest
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import BatchExecutor, DaskExecutor, SerialExecutor
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.worker import batch
-from flexroad.pipeline.worker.batch import fit_together, prepare
+from flexroad.pipeline.worker.batch import fit_together, memory_of_batch, prepare
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
 from tests.dask_processes import wait_for
@@ -94,6 +95,13 @@ def test_resumed_run_takes_surfaces_of_batches_and_not_those_of_another_engine(r
     # The products again, without a batch: the surfaces are those of the store.
     run_tiles(run, SerialExecutor(), force=frozenset({"export"}), watch=seen.append)
     assert all("fit" not in result.computed for result in seen)
+
+
+def test_batch_on_the_cpu_takes_at_most_half_of_its_worker():
+    worker = Cluster(memory="600 MiB")
+    assert memory_of_batch(worker, "cpu") == 300 * 1024**2
+    assert memory_of_batch(worker, "cuda") == 2 * 1024**3
+    assert memory_of_batch(Cluster(memory="600 MiB", batch_memory="1 GiB"), "cpu") == 1024**3
 
 
 def test_batch_without_memory_is_halved(run, single, monkeypatch):
