@@ -110,19 +110,17 @@ def local(cluster: Cluster, scratch: str, dashboard: bool, gpu: bool = False) ->
     ConfigError
         If the processes cannot be started.
     """
-    from dask.system import CPU_COUNT
     from distributed import LocalCluster
 
-    from flexroad.pipeline.execute.memory import available_bytes
+    from flexroad.pipeline.execute.memory import bytes_of_worker, workers_here
 
-    # Dask's count respects the limits of a container.
-    workers = cluster.workers or CPU_COUNT
+    workers = workers_here(cluster)
     try:
         opened = LocalCluster(
             n_workers=1 if gpu else workers,
             threads_per_worker=1,
             processes=True,
-            memory_limit=cluster.memory or available_bytes() // workers,
+            memory_limit=bytes_of_worker(cluster),
             dashboard_address="127.0.0.1:8787" if dashboard else None,
             worker_dashboard_address=None,
             local_directory=scratch,

@@ -83,12 +83,9 @@ def memory_of_batch(cluster: Cluster, device: str) -> int:
     """Return what a batch may use (bytes): on the CPU at most half of its worker's memory by default."""
     if cluster.batch_memory or device != "cpu":
         return int(cluster.batch_memory or Engine.memory_bytes)
-    from dask.system import CPU_COUNT
+    from flexroad.pipeline.execute.memory import bytes_of_worker
 
-    from flexroad.pipeline.execute.memory import available_bytes
-
-    worker = cluster.memory or available_bytes() // (cluster.workers or CPU_COUNT)
-    return min(Engine.memory_bytes, int(worker) // 2)
+    return min(Engine.memory_bytes, bytes_of_worker(cluster) // 2)
 
 
 def _fit(jobs: Sequence[TileJob], number: int, engine: Engine) -> list[TileJob]:
