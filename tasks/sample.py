@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks import options as base
@@ -55,8 +55,11 @@ from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Su
 if TYPE_CHECKING:
     import shapely
 
-VERSION = 4
+VERSION = 5
 
+SMOOTH_M = 1.5
+"""Distance from the road up to which a mesh without breaklines has no steps (m): faces between road and
+terrain would be steep, and those on the road's edge count as road."""
 PROBES = 2
 """Probes of an adaptive mesh per ``road_m``: places where it is compared with the surface."""
 FEW = 0.1
@@ -83,6 +86,16 @@ class Options(base.Options):
     terrain_tolerance_m: float = Field(
         0.2, ge=0.0005, description="adaptive: largest distance of the mesh from the surface elsewhere (m)"
     )
+    breaklines: bool = Field(
+        False,
+        description="dynamic: edges along the kerbs and walls of fit.steps; else the mesh is smooth there",
+    )
+
+    @model_validator(mode="after")
+    def _only_dynamic_has_breaklines(self) -> Options:
+        if self.breaklines and self.method != "dynamic":
+            raise ValueError(f"method {self.method} has no breaklines; choose method dynamic")
+        return self
 
 
 def sample(
@@ -126,13 +139,13 @@ def sample(
         # Subtraction leaves rounding errors if the size of the tile is no whole number of metres.
         west, south, east, north = (round(edge, DECIMALS) for edge in local)
         local = west, south, east, north
+    if isinstance(surface, SteppedSurface) and not options.breaklines:
+        surface = surface.without_steps_near(road.mask[road.grid.window(road.core)], SMOOTH_M)
     if options.method == "dynamic":
         return _dynamic(surface, road, mask, local, options, frame)
     if options.method == "adaptive":
         if isinstance(surface, MovingNurbs):
             raise TaskError("sample.method adaptive needs a surface over plan; use dynamic with plan: moving")
-        if isinstance(surface, SteppedSurface):
-            raise TaskError("sample.method adaptive has no edges at steps; use dynamic with fit.steps")
         return _adaptive(surface, road, mask, local, options, frame)
     step = options.road_m if options.method == "uniform" else np.inf
     points, faces = _regular(surface, origin, local, step, frame)
@@ -187,7 +200,7 @@ def _dynamic(
     limit, outline = _limit(road, local, frame), None
     lines = [] if limit is None else [_divided(limit.lines, road, mask, options)]
     breaks = None
-    if isinstance(surface, SteppedSurface):
+    if isinstance(surface, SteppedSurface) and options.breaklines:
         breaks = breaklines(surface, local)
         lines.append(_divided(breaks.lines, road, mask, options))
     if road.areas is not None and options.mask == "raw":

@@ -105,6 +105,9 @@ class RoadClusters:
     dtm_invalid: Bools | None = None
     """Dropped cells whose DTM is invalid, ``(H, W)``, or None if the DTM was not checked. Under objects that
     hide a road the DTM may be that of other ground; beside a road it is smoothed."""
+    beside: Bools | None = None
+    """Cells beside the streets whose ground has its own height (`tasks.spline.stepped`), ``(H, W)``: the
+    verge, whose DTM is left out of the fit, and cells near it. None if there is no verge."""
 
     @property
     def mask(self) -> Bools:

@@ -10,21 +10,48 @@ from PIL import Image
 from pyproj import Transformer
 
 from flexroad.pipeline.export.source import select
+from flexroad.tasks.spline.stepped import without_steps
 
 OFFSET_M = 47.5
 """Height of the vertical datum above the ellipsoid in the exports of the tests (m)."""
+SAME_M = 0.003
+"""Distance in plan by which formats move a vertex at most (m)."""
 NAMESPACE = "{http://www.landxml.org/schema/LandXML-1.2}"
 
 
 def true_heights(city, places):
     """The heights of the fitted surfaces at places, ``(n, 2)``."""
+    return _heights(city, places, lambda surface: surface)
+
+
+def spline_heights(city, places):
+    """The same without the steps beside roads."""
+    return _heights(city, places, without_steps)
+
+
+def _heights(city, places, part):
     heights = np.full(len(places), np.nan)
     for tile in select(city).finished():
         west, south, east, north = tile.tile.grid.bounds
         x, y = places.T
         inside = (west <= x) & (x <= east) & (south <= y) & (y <= north)
-        heights[inside] = tile.surface.height(x[inside], y[inside])
+        heights[inside] = part(tile.surface).height(x[inside], y[inside])
     return heights
+
+
+def off_surface(city, points):
+    """How far points, ``(n, 3)``, are above or below the surface, with or without steps beside roads."""
+    # A vertex at the corner of cells has the step of one of them, and rounding may move it to another.
+    corners = [(0.0, 0.0), *((x, y) for x in (-SAME_M, SAME_M) for y in (-SAME_M, SAME_M))]
+    here = spline_heights(city, points[:, :2])
+    heights = [here]
+    for corner in corners:
+        moved = points[:, :2] + corner
+        spline = spline_heights(city, moved)
+        # Just outside the run, the height is that of the border.
+        heights.append(np.where(np.isnan(here), spline, here))
+        heights.append(heights[-1] + true_heights(city, moved) - spline)
+    return np.nanmin(np.abs(points[:, 2] - np.array(heights)), axis=0)
 
 
 def landxml(path):

@@ -72,7 +72,7 @@ def fit(
     >>> scene = flexroad.example(size_m=60)
     >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
     >>> surface
-    <flexroad.Surface: nurbs of 20 x 20 control points, config production>
+    <flexroad.Surface: stepped of 20 x 20 control points, config production>
     EPSG:25832, 60 x 60 m, bounds 500200 5600000 500260 5600060
     road: 1576 cells given, 1445 kept by the filter
     """

@@ -253,8 +253,9 @@ class RunView:
         Returns
         -------
         Surface
-            Equal to the surfaces of its tiles except for rounding (below 1e-9 m), see docs/mosaic.md. NaN in
-            tiles that are not finished, and on their edges. It has no road mask, and so no mesh.
+            Equal to the surfaces of its tiles except for rounding (below 1e-9 m), see docs/mosaic.md, and
+            for the steps beside roads, which it does not have. NaN in tiles that are not finished, and on
+            their edges. It has no road mask, and so no mesh.
 
         Raises
         ------

@@ -9,15 +9,19 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.archive import npz
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 1
+VERSION = 2
 NAME = "_surface.npz"
 MEDIA_TYPE = "application/zip"
 
@@ -28,10 +32,17 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, z
 def encode(surface: NurbsSurface) -> bytes:
     """Return a surface as ``.npz``: one array per field of `NurbsSurface`, and ``version``.
 
+    A `SteppedSurface` has two more: ``steps`` (float32), and ``cells``, their grid (west, north and cell size
+    in m, columns, rows).
+
     ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
     m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
     with row 0 in the south. No pickled objects; float64.
     """
+    stepped: dict[str, NDArray[np.generic]] = {}
+    if isinstance(surface, SteppedSurface):
+        _, *numbers = astuple(surface.cells)
+        stepped = {"steps": surface.steps, "cells": np.asarray(numbers, np.float64)}
     return npz(
         {
             "version": np.int64(VERSION),
@@ -44,6 +55,7 @@ def encode(surface: NurbsSurface) -> bytes:
             "W": surface.W,
             "datum": np.float64(surface.datum),
             "origin": np.asarray(surface.origin, np.float64),
+            **stepped,
         }
     )
 
@@ -81,7 +93,7 @@ def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
     expected = len(knots_v) - q - 1, len(knots_u) - p - 1
     if not a.shape == w.shape == expected:
         raise ValueError(f"coefficients {a.shape} and weights {w.shape} do not fit knots for {expected}")
-    return NurbsSurface(
+    spline = NurbsSurface(
         crs=str(arrays["crs"]),
         bounds=(west, south, east, north),
         degree=(p, q),
@@ -92,3 +104,10 @@ def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
         datum=float(arrays["datum"]),
         origin=(easting, northing),
     )
+    if "steps" not in arrays:
+        return spline
+    west, north, cell, width, height = map(float, arrays["cells"])
+    cells = Grid(spline.crs, west, north, cell, int(width), int(height))
+    if arrays["steps"].shape != cells.shape:
+        raise ValueError(f"steps {arrays['steps'].shape} do not fit cells {cells.shape}")
+    return SteppedSurface(**vars(spline), steps=arrays["steps"], cells=cells)

@@ -35,12 +35,14 @@ from flexroad.tasks.roads.distances import columns_aside
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
-VERSION = 2
+VERSION = 3
 
 REACH_M = 4.0
 """Distance up to which a cell is compared with ground cells around it (m)."""
 GROUND_SHARE = 0.2
 """A cluster is on the ground if this share of its cells is: a deck is one cluster with its approaches."""
+BEYOND_M = 3.0
+"""Distance beyond the verge up to which a smooth surface may not follow the ground yet (m)."""
 UNKNOWN_M = 2.0
 """Assumed height of a cluster above the DTM where the DTM is unknown (m)."""
 
@@ -108,7 +110,8 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     RoadClusters
         Labels L, ``(H, W)``. Road cells without a DSM height have label 0, and so have all cells if
         no cluster is large enough. ``dtm_invalid`` marks the dropped cells where the DTM is not the road's
-        height either (under a car on a bridge it is the valley's), and the verge.
+        height either (under a car on a bridge it is the valley's), and the verge. ``beside`` are the cells
+        of the verge and those up to `BEYOND_M` from it.
     """
     cell, theta = data.grid.cell, options.theta_z_m
     points = road.mask & np.isfinite(data.dsm)
@@ -120,8 +123,12 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     level = np.abs(data.dsm - data.dtm) <= theta
     kept = ground | (consistency == CONSISTENT) | (points & ~ground & (consistency == NO_NEIGHBOURS) & level)
     labels = _labels(data.dsm, kept, patches, cell, options)
-    dtm_invalid = invalid_dtm(data, road, labels > 0) | _verge(road.mask, labels > 0, options.verge_m / cell)
-    return RoadClusters(data.grid, labels, dtm_invalid)
+    dtm_invalid = invalid_dtm(data, road, labels > 0)
+    if options.verge_m == 0:
+        return RoadClusters(data.grid, labels, dtm_invalid)
+    verge = _verge(road.mask, labels > 0, options.verge_m / cell)
+    beside = ~road.mask & _within(verge, BEYOND_M / cell)
+    return RoadClusters(data.grid, labels, dtm_invalid | verge, beside)
 
 
 def _verge(mask: Bools, kept: Bools, width: float) -> Bools:

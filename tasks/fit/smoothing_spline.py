@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from flexroad.tasks.spline.lattice import Lattice, Range
     from flexroad.tasks.spline.problem import Problem, TileProblem
     from flexroad.tasks.spline.space import Space
+    from flexroad.tasks.spline.stepped import Beside
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 6
+VERSION = 7
 
 REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
@@ -42,7 +43,6 @@ BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 BORDER_TOLERANCE = 1e-6
 """Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
-
 BATCH_DEGREE = 3
 """Largest degree of `fit_batch`: above it, its conjugate gradients converge too slowly."""
 
@@ -64,7 +64,7 @@ class Options(BaseOptions):
         0.02, gt=0, le=1000, description="weight of the terrain's squared curvature, as a share of the road's"
     )
     steps: bool = Field(
-        False, description="give the cells beside roads a step above the spline: kerbs, walls and banks"
+        True, description="give the cells beside roads a step above the spline: kerbs, walls and banks"
     )
     iterations: int = Field(200, ge=1, description="largest number of steps of reweighted least squares")
     stop_tolerance: float = Field(
@@ -77,12 +77,10 @@ class Options(BaseOptions):
     )
 
     @model_validator(mode="after")
-    def _torch_has_what_it_needs(self) -> Options:
+    def _torch_has_its_degree(self) -> Options:
         if self.engine == "torch" and self.degree > BATCH_DEGREE:
             limit = f"degree {BATCH_DEGREE} or less, not {self.degree}"
             raise ValueError(f"engine torch needs {limit}; choose engine numba")
-        if self.engine == "torch" and self.steps:
-            raise ValueError("engine torch has no steps; choose engine numba")
         return self
 
 
@@ -107,12 +105,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         return surface
     problem, held = _tile_problem(data, clusters, options, frame)
     heights = _with_held(held, _minimum_of(problem, options) + problem.datum)
-    surface = _surface(data.core, problem.space, heights)
-    if options.steps:
-        from flexroad.tasks.spline.stepped import with_steps
-
-        return with_steps(data, clusters, surface)
-    return surface
+    return _surface(data.core, problem.space, heights, _beside(data, clusters, options))
 
 
 def fit_batch(
@@ -161,7 +154,7 @@ def tile_problem(
     problem, held = _tile_problem(data, clusters, options, frame)
     return TileProblem(
         data.core, problem.heights, problem.weight, problem.stiffness, problem.first, held, problem.datum
-    )
+    ).with_ground(_beside(data, clusters, options))
 
 
 def solve(tiles: Sequence[TileProblem], options: Options, engine: Engine) -> list[NurbsSurface]:
@@ -180,7 +173,7 @@ def solve(tiles: Sequence[TileProblem], options: Options, engine: Engine) -> lis
     problems = [tile.on(_space(tile.grid, options)) for tile in tiles]
     heights = minimise(problems, options.huber_m, options.iterations, options.stop_tolerance, engine)
     return [
-        _surface(tile.grid, problem.space, _with_held(tile.held, z + tile.datum))
+        _surface(tile.grid, problem.space, _with_held(tile.held, z + tile.datum), tile.ground)
         for tile, problem, z in zip(tiles, problems, heights, strict=True)
     ]
 
@@ -209,11 +202,19 @@ def _tile_problem(
     return _problem(data, clusters, lattice, start, (0, n), (0, m), held, options), held
 
 
-def _surface(core: Grid, space: Space, A: Floats) -> NurbsSurface:
+def _beside(data: TileData, clusters: RoadClusters, options: Options) -> Beside | None:
+    from flexroad.tasks.spline.stepped import ground_beside
+
+    return ground_beside(data, clusters) if options.steps else None
+
+
+def _surface(core: Grid, space: Space, A: Floats, beside: Beside | None) -> NurbsSurface:
     from flexroad.tasks.spline.space import surface_on
+    from flexroad.tasks.spline.stepped import with_steps
 
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    return surface_on(space, core, core.exact_bounds, A, np.ones_like(A), datum=0.0)
+    surface = surface_on(space, core, core.exact_bounds, A, np.ones_like(A), datum=0.0)
+    return with_steps(beside, surface, core) if beside else surface
 
 
 def _with_held(held: Floats, z: Floats) -> Floats:

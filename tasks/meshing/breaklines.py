@@ -55,7 +55,11 @@ def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
     import shapely
 
     cells = surface.cells
-    high = _large(np.abs(surface.steps) >= LEAST_M)
+    # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.
+    large = np.abs(scipy.ndimage.median_filter(surface.steps, 3)) >= LEAST_M
+    # On the border of the tile there are no steps: neighbours meet in the spline.
+    large[[0, -1]], large[:, [0, -1]] = False, False
+    high = _large(large)
     corner = cells.west - cells.origin[0], cells.north - cells.origin[1]
     level = survey_limit(high, corner, cells.cell, local)
     parts = shapely.get_parts(level.lines)

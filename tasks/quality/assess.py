@@ -23,7 +23,7 @@ from flexroad.tasks.roads.dtm_validity import AGREE_M
 from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, Quality, RoadClusters, RoadMask, Surface, TileData
 
-VERSION = 4
+VERSION = 5
 
 FLAGS = {
     "error-estimate": "error_estimate_m",
@@ -125,7 +125,7 @@ def assess(
         "residual_nmad_m": nmad(residuals),
         "residual_p95_m": _quantile(np.abs(residuals), 95),
         "curvature_per_m": _largest(_second_differences(height, on_road) / cell**2),
-        "edge_step_m": _quantile(_edge_steps(height, on_road), 95),
+        "edge_step_m": _quantile(_edge_steps(cells.smooth, on_road), 95),
         "measured_road": mean(classes[on_road] == Support.MEASURED),
         "dtm_road": mean(classes[on_road] == Support.DTM),
         "inferred_road": mean(classes[on_road] == Support.INFERRED),

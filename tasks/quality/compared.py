@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from flexroad.tasks.quality.estimate import deviation, error_estimate, scatter
 from flexroad.tasks.quality.support import Support, support
 from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
 
 
@@ -26,6 +27,8 @@ class Compared:
     """The cells' `Support`."""
     height: Floats
     """Height of the surface (m)."""
+    smooth: Floats
+    """The same without the steps of the ground beside roads (m)."""
     off_dsm: Floats
     """Surface minus the heights that it was fitted to on the road, elsewhere minus DSM (m)."""
     excess: Floats
@@ -60,10 +63,11 @@ def compare(
     """
     window = data.grid.window(data.core)
     fitted = with_road_heights(data, clusters)
-    classes = support(data, road, clusters, agree_m)[window]
+    classes = support(data, road, _with_ground(clusters, surface, data), agree_m)[window]
     on_road = road.mask[window] & (classes != Support.NONE)
     kept = on_road & clusters.mask[window] & np.isfinite(data.dsm[window])
     height = surface.lattice(data.core.eastings, data.core.northings)
+    smooth = height - surface.steps if isinstance(surface, SteppedSurface) else height
     off_dsm, off_dtm = height - fitted.dsm[window], height - data.dtm[window]
     spread = scatter((fitted.dsm - data.dtm)[window], kept, data.core.cell)
     residual = height - _heights(fitted, clusters)[window]
@@ -72,7 +76,16 @@ def compare(
     inferred = classes == Support.INFERRED
     distance = np.where(inferred, estimate, deviation(off_dsm, off_dtm, spread, kept, inferred))
     excess = (data.dsm - fitted.dsm)[window]
-    return Compared(on_road, kept, classes, height, off_dsm, excess, off_dtm, distance, estimate)
+    return Compared(on_road, kept, classes, height, smooth, off_dsm, excess, off_dtm, distance, estimate)
+
+
+def _with_ground(clusters: RoadClusters, surface: Surface, data: TileData) -> RoadClusters:
+    """Return the clusters with the DTM valid where the surface has a step up to it."""
+    if not isinstance(surface, SteppedSurface) or clusters.beside is None or clusters.dtm_invalid is None:
+        return clusters
+    stepped = np.zeros(data.grid.shape, np.bool_)
+    stepped[data.grid.window(data.core)] = clusters.beside[data.grid.window(data.core)]
+    return replace(clusters, dtm_invalid=clusters.dtm_invalid & ~stepped)
 
 
 def heights_fitted(data: TileData, clusters: RoadClusters) -> Floats:

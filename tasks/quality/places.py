@@ -41,7 +41,7 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
         "error-estimate": _around(np.where(road, cells.estimate, 0.0), grid.cell),
         "patch": _depth(_largest_patch(road & (cells.deviation > agree_m))),
         "spike": _bend(cells.height, road),
-        "edge-step": _edge_step(cells.height, road),
+        "edge-step": _edge_step(cells.smooth, road),
         "loose": np.where(cells.kept, np.abs(cells.off_dsm), 0.0),
         "off-dtm": _around(np.where(road & (np.abs(cells.off_dtm) > agree_m), 1.0, 0.0), grid.cell),
         "inferred": _depth(_largest_patch(road & (cells.classes == Support.INFERRED))),

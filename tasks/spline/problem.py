@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.spline.space import Space
+from flexroad.tasks.spline.stepped import Beside
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -50,6 +51,23 @@ class TileProblem:
     held: Floats
     """Heights above sea level that control points keep, ``(m, n)``, m; NaN where they are fitted."""
     datum: float
+    beside: Bools | None = None
+    """This and the next two are the arrays of `ground`; None for a surface without steps."""
+    beside_dsm: Floats | None = None
+    beside_dtm: Floats | None = None
+
+    @property
+    def ground(self) -> Beside | None:
+        """The heights beside the streets."""
+        if self.beside is None or self.beside_dsm is None or self.beside_dtm is None:
+            return None
+        return Beside(self.beside, self.beside_dsm, self.beside_dtm)
+
+    def with_ground(self, ground: Beside | None) -> TileProblem:
+        """Return the problem with heights beside the streets."""
+        if ground is None:
+            return self
+        return replace(self, beside=ground.cells, beside_dsm=ground.dsm, beside_dtm=ground.dtm)
 
     def on(self, space: Space) -> Problem:
         """Return the loss over the splines of the tile."""

@@ -1,20 +1,22 @@
 """A spline with steps beside roads: kerbs, walls and banks, which a smooth surface cannot follow.
 
 The spline is the road's surface, continued beside it. A cell beside the road has a step: the height of the
-ground there above the spline. So both sides of a kerb have their own height, and the road stays smooth.
+ground there above the spline, by DSM or DTM. So both sides of a kerb have their own height, and the road
+stays smooth.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.spline.between import between
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
+from flexroad.tasks.types import Bools, Floats, RoadClusters, Surface, TileData
 
 SAME_M = 0.25
 """A DSM within this of the spline (m) shows the ground: it is the road, or as low as a kerb."""
@@ -25,102 +27,148 @@ ROUNDED = 0.1
 ALIKE_M = 0.1
 """Standard deviation of the weights of neighbouring cells by the difference of their steps (m)."""
 WALL_M = 0.5
-"""Where objects hide the ground, smaller steps are left out (m): they are not known there."""
-BEYOND_M = 3.0
-"""Distance from the cells whose DTM is left out up to which the spline may still be off (m). Nearer to the
-road than this, cells with a DTM were dropped by the filter, and are no ground beside it."""
+"""Where the DTM rises by this from cell to cell (m), the DSM is preferred to it, too. Where objects hide the
+ground, the DTM is preferred to smaller steps."""
+KERB_M = 2.0
+"""Distance from the road up to which the DSM is preferred (m): a DTM is smoothed there, across a kerb or a
+wall. Farther away the DTM is nearer to the ground than a DSM with grass and shrubs."""
+ROUNDING_M = 1e-6
+"""Points this near to the border of a tile are on it (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SteppedSurface(NurbsSurface):
-    """A spline, and the steps of cells above it; the slope and the normal are the spline's."""
+    """A spline, and the steps of cells above it; the slope and the normal are the spline's.
+
+    On the border of the tile, where neighbours meet, the height is the spline's.
+    """
 
     steps: NDArray[np.float32]
-    """Height of the ground above the spline, ``(H, W)``, m; 0 on the road, and along the tile's border."""
+    """Height of the ground above the spline, ``(H, W)``, m; 0 on the road."""
     cells: Grid
     """The cells of the steps."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
-        return np.asarray(self.smooth(easting, northing) + self.steps[self.cells.cells(easting, northing)])
+        west, south, east, north = self.cells.exact_bounds
+        inside = _between(easting, west, east) & _between(northing, south, north)
+        steps = self.steps[self.cells.cells(easting, northing)]
+        return np.asarray(self.smooth(easting, northing) + np.where(inside, steps, 0.0))
 
     def smooth(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights of the spline (m) at scattered points, in their broadcast shape."""
         return super().height(easting, northing)
 
+    def without_steps_near(self, cells: Bools, distance_m: float) -> SteppedSurface:
+        """Return the surface without the steps within a distance of the given cells, ``(H, W)``."""
+        if not cells.any():
+            return self
+        near = scipy.ndimage.distance_transform_edt(~cells) * self.cells.cell <= distance_m
+        return replace(self, steps=np.where(near, np.float32(0), self.steps))
+
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
         row, col = self.cells.cells(eastings, northings)
-        return np.asarray(super().lattice(eastings, northings) + self.steps[np.ix_(row, col)])
+        west, south, east, north = self.cells.exact_bounds
+        inside = _between(northings, south, north)[:, None] & _between(eastings, west, east)
+        steps = np.where(inside, self.steps[np.ix_(row, col)], 0.0)
+        return np.asarray(super().lattice(eastings, northings) + steps)
 
 
-def with_steps(data: TileData, clusters: RoadClusters, surface: NurbsSurface) -> SteppedSurface:
-    """Return a tile's surface with the steps of the cells beside its road."""
+def without_steps(surface: Surface) -> Surface:
+    """Return the spline of a surface with steps; others are returned as they are."""
+    if not isinstance(surface, SteppedSurface):
+        return surface
+    return NurbsSurface(**{field.name: getattr(surface, field.name) for field in fields(NurbsSurface)})
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Heights of the ground beside a tile's streets; arrays are ``(H, W)``, on the tile's core."""
+
+    cells: Bools
+    """The cells that may have a step."""
+    dsm: Floats
+    """DSM of those near the road or a wall (m), by the heights that roads are fitted to; else NaN."""
+    dtm: Floats
+    """DTM of the cells (m); else NaN."""
+
+
+def ground_beside(data: TileData, clusters: RoadClusters) -> Beside | None:
+    """Return the heights beside the streets of a tile, None if the filter gives no such cells."""
     from flexroad.tasks.roads.road_height import ground_heights
 
-    steps = steps_beside(ground_heights(data, clusters), clusters, surface)
-    return SteppedSurface(**vars(surface), steps=steps, cells=data.core)
+    if clusters.beside is None:
+        return None
+    window = data.grid.window(data.core)
+    cells = clusters.beside[window]
+    away = scipy.ndimage.distance_transform_edt(~clusters.mask[window]) * data.core.cell
+    dsm = ground_heights(data, clusters).dsm[window]
+    low, high = _around_dtm(data.dtm[window])
+    preferred = (away <= KERB_M) | (high - low >= WALL_M) | (np.abs(dsm - data.dtm[window]) >= WALL_M)
+    dtm = np.where(cells, data.dtm[window], np.nan)
+    return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm)
 
 
-def steps_beside(data: TileData, clusters: RoadClusters, surface: NurbsSurface) -> NDArray[np.float32]:
-    """Return the steps of the cells beside the road, ``(H, W)``, m, on the tile's core; else 0.
+def _between(values: Floats, low: float, high: float) -> Bools:
+    """Return which values are between two others and not equal to one of them, but for rounding."""
+    return np.asarray((values > low + ROUNDING_M) & (values < high - ROUNDING_M))
 
-    These are the cells whose DTM the fit leaves out, and those near them. Their height is the DSM's where it
-    shows the ground. It is averaged with the neighbours' whose steps are alike, so that edges remain.
+
+def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurface:
+    """Return a tile's surface with the steps of the cells beside its streets.
+
+    A cell has the height of its DSM if that shows the ground, averaged with the neighbours whose steps are
+    alike, so that edges remain. Behind an object it has the height of the wall around, if there is one; else
+    that of its DTM, or, without DTM, a step between those around.
+    """
+    spline = surface.lattice(core.eastings, core.northings)
+    rise, smoothed = beside.dsm - spline, beside.dtm - spline
+    shown = beside.cells & ((np.abs(rise) <= SAME_M) | _is_open(beside.dsm, beside.dtm))
+    steps = np.where(beside.cells, smoothed, 0.0)
+    near = np.isfinite(beside.dsm)
+    around = _around(np.where(shown, rise, np.nan), near)
+    walls = _walls(around, smoothed[near])
+    steps[near] = np.where(np.abs(walls) >= WALL_M, walls, smoothed[near])
+    steps[shown] = _alike(around[shown[near]], rise[shown])
+    filled = between(steps, beside.cells)
+    return SteppedSurface(**vars(surface), steps=filled.astype(np.float32), cells=core)
+
+
+def _alike(around: Floats, own: Floats) -> Floats:
+    """Return the means of steps and of the steps around that are alike, ``(n,)``, m.
 
     Parameters
     ----------
-    data, clusters : TileData, RoadClusters
-        The heights, and the cells whose DTM is left out.
-    surface : NurbsSurface
-        The spline fitted to them.
+    around : ndarray, (n, 9)
+        Steps of the cell and its neighbours; NaN where the DSM does not show them.
+    own : ndarray, (n,)
+        Those of the cell.
     """
-    core, window = data.core, data.grid.window(data.core)
-    steps = np.zeros(core.shape, np.float32)
-    if clusters.dtm_invalid is None:
-        return steps
-    unknown = clusters.dtm_invalid[window] & ~clusters.mask[window]
-    beside = unknown | (_within(unknown, core) & ~_within(clusters.mask[window], core))
-    dsm, dtm = data.dsm[window], data.dtm[window]
-    spline = surface.lattice(core.eastings, core.northings)
-    rise = dsm - spline
-    seen = beside & ((np.abs(rise) <= SAME_M) | _is_open(dsm, dtm))
-    # Neighbours meet in the spline.
-    beside[[0, -1]], beside[:, [0, -1]] = False, False
-    around = _around(np.where(seen, rise, np.nan), beside)
-    smoothed = (dtm - spline)[beside]
-    walls = np.where(unknown[beside], _walls(around, smoothed), smoothed)
-    walls = np.where(np.abs(walls) >= WALL_M, walls, 0.0)
-    own = np.where(seen[beside], rise[beside], walls)
     weights = np.where(np.isfinite(around), np.exp(-0.5 * ((around - own[:, None]) / ALIKE_M) ** 2), 0.0)
-    total = weights.sum(axis=1)
-    means = (weights * np.nan_to_num(around)).sum(axis=1) / np.maximum(total, 1e-300)
-    steps[beside] = np.where(seen[beside], means, own)
-    return steps
-
-
-def _within(cells: Bools, grid: Grid) -> Bools:
-    """Return the cells at most `BEYOND_M` away from the given ones, ``(H, W)``."""
-    if not cells.any():
-        return cells
-    away: Floats = scipy.ndimage.distance_transform_edt(~cells)
-    return np.asarray(away * grid.cell <= BEYOND_M)
+    return np.asarray((weights * np.nan_to_num(around)).sum(axis=1) / weights.sum(axis=1))
 
 
 def _is_open(dsm: Floats, dtm: Floats) -> Bools:
     """Return the cells whose DSM is the DTM's height, or at a wall that of the ground above or below it."""
-    low = scipy.ndimage.minimum_filter(np.nan_to_num(dtm, nan=np.inf), 3)
-    high = scipy.ndimage.maximum_filter(np.nan_to_num(dtm, nan=-np.inf), 3)
+    low, high = _around_dtm(dtm)
     # The DTM is smoothed: beside the wall it has not reached the full height.
     reach = OPEN_M + ROUNDED * np.maximum(high - low, 0.0)
     away = np.minimum(np.abs(dsm - low), np.abs(dsm - high))
     return np.asarray((np.abs(dsm - dtm) <= OPEN_M) | (away <= reach))
 
 
+def _around_dtm(dtm: Floats) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest DTM of each cell and its eight neighbours, ``(H, W)``, m."""
+    low = scipy.ndimage.minimum_filter(np.nan_to_num(dtm, nan=np.inf), 3)
+    return low, scipy.ndimage.maximum_filter(np.nan_to_num(dtm, nan=-np.inf), 3)
+
+
 def _around(values: Floats, cells: Bools) -> Floats:
-    """Return the values of each cell and its eight neighbours, ``(n, 9)``; no cell is at the border."""
+    """Return the values of each cell and its eight neighbours, ``(n, 9)``; NaN beyond the tile."""
     row, col = np.nonzero(cells)
-    return np.stack([values[row + i, col + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=1)
+    wide = np.pad(values, 1, constant_values=np.nan)
+    return np.stack([wide[row + i, col + j] for i in (0, 1, 2) for j in (0, 1, 2)], axis=1)
 
 
 def _walls(around: Floats, smoothed: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Errors at kerbs, walls and hump bridges on made tiles, without and with steps beside roads (`fit.steps`).
+"""Errors at kerbs, walls and hump bridges on made tiles: no steps, `fit.steps`, and `sample.breaklines`.
 
 ``PYTHONPATH=. python tests/bench/bench_steps.py`` prints the table of docs/fit.md.
 """
@@ -57,14 +57,14 @@ def errors(heights: Floats, truth: Floats, road: Bools) -> dict[str, float]:
     }
 
 
-def figures(data: TileData, steps: bool) -> dict[str, float]:
+def figures(data: TileData, steps: bool, lines: bool) -> dict[str, float]:
     """Return the errors of the surface and of its mesh on one tile."""
     if data.reference is None or data.reference_road is None:
         raise ValueError("the tile has no truth")
     road = mask.segment(data, mask.Options())
     clusters = planar.ecsrc(data, road, FILTER)
     surface = smoothing_spline.fit(data, clusters, smoothing_spline.Options(steps=steps))
-    mesh = sample.sample(surface, road, clusters, sample.Options())
+    mesh = sample.sample(surface, road, clusters, sample.Options(breaklines=lines))
     heights = surface.lattice(GRID.eastings, GRID.northings), drape(mesh, GRID) + mesh.origin[2]
     of_surface, of_mesh = (errors(z, data.reference, data.reference_road) for z in heights)
     return of_surface | {f"{key}, mesh": value for key, value in of_mesh.items()} | {"T": len(mesh.faces)}
@@ -73,11 +73,12 @@ def figures(data: TileData, steps: bool) -> dict[str, float]:
 def main() -> None:
     for name in SCENES:
         for mask_errors in (0.0, 1.0):
-            for steps in (False, True):
-                found = [figures(data, steps) for data in tiles(name, mask_errors)]
+            for steps, lines in ((False, False), (True, False), (True, True)):
+                found = [figures(data, steps, lines) for data in tiles(name, mask_errors)]
                 means = {key: np.mean([part[key] for part in found]) for key in found[0]}
                 text = "  ".join(f"{key} {value:.4g}" for key, value in means.items())
-                print(f"{name:12}  mask errors {mask_errors:.0f}  steps {steps!s:5}  {text}", flush=True)
+                kind = "breaklines" if lines else "steps" if steps else "smooth"
+                print(f"{name:12}  mask errors {mask_errors:.0f}  {kind:10}  {text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -316,7 +316,9 @@ def test_fit_plane_and_raster_have_heights_but_no_file(scene, tmp_path):
 def test_surface_to_mesh_has_surface_heights(surface):
     mesh = surface.to_mesh()
     east, north, up = (mesh.vertices + mesh.metadata["origin"]).T
-    np.testing.assert_allclose(up, surface.height(east, north), atol=1e-6)
+    # Near the road the mesh leaves out the steps of the ground beside it.
+    off = np.minimum(*(np.abs(up - z(east, north)) for z in (surface.height, surface.fitted.smooth)))
+    assert off.max() < 1e-6
     assert mesh.face_attributes["road"].any()
     upright = surface.to_mesh(up="y")
     np.testing.assert_array_equal(upright.vertices[:, 1], mesh.vertices[:, 2])

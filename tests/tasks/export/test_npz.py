@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import bisplev
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots
 
 WEST, SOUTH = 295500.5, 5629250.5
@@ -27,6 +29,21 @@ def surface(unit_weights: bool = False) -> NurbsSurface:
         datum=150.25,
         origin=(295500.0, 5629250.0),
     )
+
+
+def stepped() -> SteppedSurface:
+    cells = Grid("EPSG:25832", WEST, SOUTH + 249.0, 1.0, 249, 249)
+    steps = np.random.default_rng(4).normal(size=cells.shape).astype(np.float32)
+    return SteppedSurface(**vars(surface()), steps=steps, cells=cells)
+
+
+def test_decode_returns_steps():
+    original = stepped()
+    restored = npz.decode(npz.encode(original))
+    assert isinstance(restored, SteppedSurface)
+    assert restored.cells == original.cells
+    x, y = WEST + np.linspace(0, 249, 300), SOUTH + np.linspace(0, 249, 300)
+    np.testing.assert_array_equal(restored.height(x, y), original.height(x, y))
 
 
 @pytest.mark.parametrize("from_file", [False, True])
@@ -70,8 +87,8 @@ def test_encode_equal_surfaces_give_equal_bytes():
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
-def encoded_with(**fields) -> bytes:
-    with np.load(io.BytesIO(npz.encode(surface()))) as arrays:
+def encoded_with(of=None, **fields) -> bytes:
+    with np.load(io.BytesIO(npz.encode(of or surface()))) as arrays:
         arrays_and_changes = {**arrays, **fields}
     buffer = io.BytesIO()
     np.savez(buffer, **{name: value for name, value in arrays_and_changes.items() if value is not None})
@@ -85,8 +102,10 @@ def encoded_with(**fields) -> bytes:
         (b"no zip at all", "not a FlexRoad surface"),
         (npz.encode(surface())[:-200], "not a FlexRoad surface"),
         (encoded_with(W=None), "not a FlexRoad surface.*W"),
+        (encoded_with(stepped(), steps=np.zeros((3, 3))), r"steps \(3, 3\) do not fit cells \(249, 249\)"),
+        (encoded_with(stepped(), cells=None), "not a FlexRoad surface.*cells"),
         (encoded_with(A=np.zeros((9, 11))), r"\(9, 11\).*\(9, 12\)"),
-        (encoded_with(version=np.int64(npz.VERSION + 1)), "version 2, this program reads up to 1"),
+        (encoded_with(version=np.int64(npz.VERSION + 1)), "version 3, this program reads up to 2"),
     ],
 )
 def test_decode_invalid_data_raises_one_line(data, message):

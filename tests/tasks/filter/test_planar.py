@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, INCONSISTENT, ground_consistency
 from flexroad.tasks.filter.kit.planar_patches import flat_patches
-from flexroad.tasks.filter.planar import VERSION, Options, ecsrc
+from flexroad.tasks.filter.planar import BEYOND_M, VERSION, Options, ecsrc
 from flexroad.tasks.synthetic import gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import RoadMask, TileData
@@ -202,6 +202,8 @@ def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
     away = scipy.ndimage.distance_transform_edt(~result.mask) * cell
     near = (away <= verge) & result.mask.any()
     np.testing.assert_array_equal(result.dtm_invalid, ~mask & near)
+    beyond = scipy.ndimage.distance_transform_edt(~result.dtm_invalid) * cell if near.any() else np.inf
+    np.testing.assert_array_equal(result.beside, ~mask & (beyond <= BEYOND_M))
 
 
 def scattered_blocks(seed, shape=(30, 44)):
@@ -302,7 +304,7 @@ def test_planar_benchmark_tile_reaches_precision_and_recall(under):
 def test_planar_output_is_pinned_to_version():
     labels = clusters(*random_crossing(7)).labels
     digest = hashlib.sha256(labels.tobytes()).hexdigest()[:16]
-    assert (VERSION, np.bincount(labels.ravel()).tolist(), digest) == (2, [7164, 936], "bb5fe3cd9d3c165b")
+    assert (VERSION, np.bincount(labels.ravel()).tolist(), digest) == (3, [7164, 936], "bb5fe3cd9d3c165b")
 
 
 def test_options_out_of_bounds_are_refused():

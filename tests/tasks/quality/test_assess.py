@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.fit import nurbs, plane
+from flexroad.tasks.fit import nurbs, plane, smoothing_spline
 from flexroad.tasks.quality.assess import NO_ROAD, Options, assess
 from flexroad.tasks.quality.estimate import FACTOR, LEAST_M
 from flexroad.tasks.quality.support import Support
@@ -167,6 +167,24 @@ def test_assess_road_dropped_by_filter_has_figures_and_both_flags():
     dropped = assessed(tile(), None, kept=NOWHERE)
     assert dropped.flags == (NO_ROAD, "dropped")
     assert (dropped.dropped_road, dropped.suspect_m2) == (1, 0)
+
+
+def test_assess_steps_beside_road_are_supported_and_no_steps_of_surface():
+    verge = distance_transform_edt(~STREET) <= 4
+    wall = np.where(STREET, 0, 2.0)
+    labels = STREET.astype(np.int32)
+    data = tile(dsm=TRUTH + wall + NOISE, dtm=TRUTH + wall)
+    clusters = RoadClusters(GRID, labels, verge & ~STREET, verge & ~STREET)
+    surfaces = [
+        smoothing_spline.fit(data, clusters, smoothing_spline.Options(steps=steps)) for steps in (False, True)
+    ]
+    road = RoadMask(GRID, GRID, STREET, NOWHERE)
+    smooth, stepped = (assess(data, road, clusters, surface, Options()) for surface in surfaces)
+    beside = verge & ~STREET
+    assert (smooth.support[beside] == Support.INFERRED).all()
+    assert (stepped.support[beside] != Support.INFERRED).all()
+    assert stepped.edge_step_m == smooth.edge_step_m
+    np.testing.assert_array_equal(stepped.support[STREET], smooth.support[STREET])
 
 
 def test_assess_ignores_reference():

@@ -8,10 +8,11 @@ import pytest
 from flexroad.catalog.grid import Grid
 from flexroad.pipeline.store import codec
 from flexroad.tasks import sample
-from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
 from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.spline.batch import Engine
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -21,6 +22,7 @@ ROAD = np.abs(ROWS - 29.5) < 5
 EDGE = np.abs(np.abs(ROWS - 29.5) - 5) < 1
 """The cells within 1 m of the edges of the road."""
 VERGE = (np.abs(ROWS - 29.5) < 10) & ~ROAD
+BESIDE = (np.abs(ROWS - 29.5) < 13) & ~ROAD
 
 
 def tile(height, noise_m=0.02):
@@ -29,7 +31,7 @@ def tile(height, noise_m=0.02):
     truth = 100 + np.where(ROAD, 0.0, height)
     smoothed = 100 + height * np.clip(beyond / 2, 0, 1)
     dsm = truth + noise_m * np.random.default_rng(0).standard_normal(GRID.shape)
-    clusters = RoadClusters(GRID, ROAD.astype(np.int32), VERGE)
+    clusters = RoadClusters(GRID, ROAD.astype(np.int32), VERGE, BESIDE)
     return TileData("t", GRID, GRID, dsm, smoothed), clusters, truth
 
 
@@ -76,7 +78,7 @@ def test_steps_hidden_cells_are_on_their_side_of_wall():
     assert np.abs(found - truth)[rim].max() < 0.5
 
 
-def test_steps_along_border_are_zero():
+def test_height_on_the_border_is_that_of_the_spline():
     """Neighbours meet there: the heights are those of the common spline."""
     data, clusters, _ = tile(4.0)
     surface = fitted(data, clusters)
@@ -85,6 +87,10 @@ def test_steps_along_border_are_zero():
     for x, y in ((west, south + along), (east, south + along), (west + along, south), (west + along, north)):
         x, y = np.broadcast_arrays(x, y)
         assert surface.height(x, y).tobytes() == surface.smooth(x, y).tobytes()
+    nodes = surface.lattice(np.linspace(west, east, 5), np.linspace(south, north, 5))
+    expected = surface.smooth(np.linspace(west, east, 5), np.full(5, south))
+    np.testing.assert_allclose(nodes[0], expected, rtol=0, atol=1e-9)
+    assert np.abs(surface.steps[:, [0, -1]]).max() > 1
 
 
 def test_steps_height_equals_lattice():
@@ -94,10 +100,42 @@ def test_steps_height_equals_lattice():
     np.testing.assert_allclose(surface.height(x, y), heights(surface), rtol=0, atol=1e-9)
 
 
-def test_steps_without_verge_are_zero():
+def test_surface_without_verge_has_no_steps():
     data, clusters, _ = tile(4.0)
-    surface = fitted(data, RoadClusters(GRID, clusters.labels))
-    assert not surface.steps.any()
+    assert type(fitted(data, RoadClusters(GRID, clusters.labels))) is NurbsSurface
+
+
+def test_ground_beside_the_road_is_the_dtm():
+    """Grass is in the DSM; where neither has a height, the ground is between that of the cells around."""
+    data, clusters, _ = tile(1.0, noise_m=0.0)
+    bank = 100 + 0.1 * np.clip(np.abs(ROWS - 29.5) - 4.5, 0, None)
+    void = (slice(20, 22), slice(30, 33))
+    data = replace(data, dsm=bank + 0.15 * VERGE, dtm=bank.copy())
+    data.dsm[void], data.dtm[void] = np.nan, np.nan
+    found, far = heights(fitted(data, clusters)), inner(BESIDE & (np.abs(ROWS - 29.5) > 8))
+    far[void] = False
+    assert np.abs(found - bank)[far].max() < 1e-6
+    assert np.abs(found - bank)[void].max() < 0.05
+
+
+def test_hidden_road_has_no_steps():
+    """The filter dropped it, and its DTM is not the road's: the spline continues the road."""
+    data, clusters, _ = tile(1.0)
+    crown = (slice(26, 33), slice(20, 40))
+    data.dsm[crown], data.dtm[crown], clusters.labels[crown] = 108.0, 101.0, 0
+    clusters.dtm_invalid[crown] = True
+    plain, stepped = (heights(fitted(data, clusters, steps)) for steps in (False, True))
+    assert np.array_equal(stepped[crown], plain[crown])
+    assert not np.array_equal(stepped, plain)
+
+
+def test_batch_has_the_steps_of_single_fits():
+    data, clusters, _ = tile(0.12)
+    options = smoothing_spline.Options()
+    (batched,) = smoothing_spline.fit_batch([(data, clusters, None)], options, Engine())
+    assert isinstance(batched, SteppedSurface)
+    assert batched.steps.any()
+    np.testing.assert_allclose(heights(batched), heights(fitted(data, clusters)), rtol=0, atol=1e-3)
 
 
 def test_stepped_surface_is_stored_without_loss():
@@ -116,7 +154,8 @@ def test_mesh_has_edges_of_steps(height):
     road = RoadMask(GRID, GRID, ROAD, nothing)
     errors = []
     for steps in (False, True):
-        mesh = sample.sample(fitted(data, clusters, steps), road, clusters, sample.Options())
+        options = sample.Options(breaklines=steps)
+        mesh = sample.sample(fitted(data, clusters, steps), road, clusters, options)
         check(mesh)
         errors.append(np.abs(drape(mesh, GRID) + mesh.origin[2] - truth)[EDGE & (np.abs(ROWS.T - 29.5) < 27)])
     assert errors[1].mean() < errors[0].mean() / 2
@@ -129,8 +168,22 @@ def test_steps_are_measured_from_the_heights_that_the_road_is_fitted_to():
     assert np.abs(heights(fitted(lifted, clusters)) - truth)[inner(ROAD | VERGE)].max() < 1e-3
 
 
-def test_steps_are_refused_by_adaptive_sampling():
-    data, clusters, _ = tile(0.12)
+@pytest.mark.parametrize("method", ["dynamic", "adaptive", "uniform"])
+def test_mesh_without_breaklines_has_a_smooth_road_and_the_ground_beside(method):
+    data, clusters, truth = tile(0.5)
     road = RoadMask(GRID, GRID, ROAD, np.zeros(GRID.shape, bool))
-    with pytest.raises(TaskError, match="adaptive has no edges at steps; use dynamic"):
-        sample.sample(fitted(data, clusters), road, clusters, sample.Options(method="adaptive"))
+    plain, stepped = (
+        sample.sample(fitted(data, clusters, steps), road, clusters, sample.Options(method=method))
+        for steps in (False, True)
+    )
+    check(stepped)
+    of_plain, of_stepped = (drape(mesh, GRID) + mesh.origin[2] for mesh in (plain, stepped))
+    inside = inner(ROAD & (np.abs(ROWS - 29.5) < 4))
+    np.testing.assert_allclose(of_stepped[inside], of_plain[inside], rtol=0, atol=0.006)
+    far = inner(BESIDE & (np.abs(ROWS - 29.5) > 8) & (np.abs(ROWS.T - 29.5) < 27))
+    assert np.abs(of_stepped - truth)[far].mean() < np.abs(of_plain - truth)[far].mean()
+
+
+def test_breaklines_without_dynamic_sampling_are_refused():
+    with pytest.raises(ValueError, match="method adaptive has no breaklines; choose method dynamic"):
+        sample.Options(method="adaptive", breaklines=True)
