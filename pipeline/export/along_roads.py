@@ -38,7 +38,7 @@ from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Floats
 
-VERSION = 1
+VERSION = 2
 """Of the roads themselves: their division, lines and grids."""
 
 

@@ -1,4 +1,4 @@
-"""Heights of a run at any place, from the surfaces of its tiles, of which a process keeps a few in memory."""
+"""Heights of a run's roads, from the surfaces of its tiles, of which a process keeps a few in memory."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.source import FinishedTile
+from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tasks.types import Bools, Floats, Surface
 
 SURFACES, ESTIMATES = 128, 32
@@ -43,7 +44,10 @@ class GroundTile:
 
 @dataclass(frozen=True)
 class Ground:
-    """The common ground of some finished tiles."""
+    """The common ground of some finished tiles, without the steps beside their roads.
+
+    A road along a centre line may be wider than that of the mask. It goes on beside it without a kerb.
+    """
 
     tiles: tuple[GroundTile, ...]
 
@@ -102,7 +106,7 @@ def _within(bounds: Bounds, easting: Floats, northing: Floats) -> Bools:
 def _patch(tile: GroundTile) -> _Patch:
     finished = tile.unread
     road = finished.road
-    return _Patch(tile.grid, finished.surface, road.outside[road.grid.window(road.core)])
+    return _Patch(tile.grid, without_steps(finished.surface), road.outside[road.grid.window(road.core)])
 
 
 @lru_cache(maxsize=ESTIMATES)

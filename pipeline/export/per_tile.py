@@ -14,6 +14,7 @@ from flexroad.pipeline.export.photo import Photographed, texture_of
 from flexroad.pipeline.export.pieces import Piece
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
+from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
@@ -70,19 +71,25 @@ def _obj(tile: FinishedTile, vertical: str | None, materials: str, photo: Bounds
 
 
 def _error_m(tile: FinishedTile, unit_m: float) -> float:
-    """Return the largest vertical distance of a mesh's vertices from the surface (m).
+    """Return the largest vertical distance of a file's vertices from the surface through the mesh's (m).
+
+    A coordinate that is rounded in plan may be in another cell, with another step. Between the two places the
+    surface therefore counts without its steps.
 
     Parameters
     ----------
     unit_m : float
         Of this unit the coordinates of a file are multiples (m).
     """
-    mesh = tile.mesh
-    points = np.rint((mesh.vertices + mesh.origin) / unit_m) * unit_m
+    points = tile.mesh.vertices + tile.mesh.origin
+    written = np.rint(points / unit_m) * unit_m
     west, south, east, north = tile.tile.grid.bounds
-    x, y, z = points.T
-    heights = tile.surface.height(np.clip(x, west, east), np.clip(y, south, north))
-    return float(np.nanmax(np.abs(heights - z), initial=0.0))
+    heights = without_steps(tile.surface).height
+    here, there = (
+        heights(np.clip(x, west, east), np.clip(y, south, north)) for x, y, _ in (points.T, written.T)
+    )
+    errors = (written[:, 2] - points[:, 2]) - (there - here)
+    return float(np.nanmax(np.abs(errors), initial=0.0))
 
 
 def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:

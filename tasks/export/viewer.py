@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.routes import CentreLine
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats
 
-VERSION = 1
+VERSION = 2
 NAME_TILE, NAME_RUN, NAME_PICTURES = ".js", "run.js", "pictures.js"
 MOST_CELLS = 256
 """Largest width and height of the rasters (cells); finer ones are thinned."""
@@ -87,6 +88,7 @@ def encode_tile(scene: TileScene) -> bytes:
         "dtm": _heights(scene.dtm, thinned),
         "estimate": _estimate(scene.estimate, thinned),
         "surface": _surface(scene.surface),
+        "steps": _steps(scene.surface),
         "lines": [_line(line, scene.grid) for line in scene.lines],
     }
     return _call("tile", scene.id, content)
@@ -181,6 +183,19 @@ def _surface(surface: NurbsSurface | None) -> dict[str, Any] | None:
         "A": _doubles(surface.A),
         "W": _doubles(surface.W) if weighted else None,
     }
+
+
+def _steps(surface: NurbsSurface | None) -> dict[str, Any] | None:
+    """Return the steps of the cells that have one, with their cells, which are never thinned."""
+    if not isinstance(surface, SteppedSurface):
+        return None
+    steps = _heights(np.where(surface.steps == 0, np.nan, surface.steps), slice(None))
+    if steps is None:
+        return None
+    cells = surface.cells
+    west, _, _, north = cells.exact_bounds
+    grid = {"west": west, "north": north, "cell": cells.cell, "rows": cells.height, "cols": cells.width}
+    return {"grid": grid, **steps}
 
 
 def _doubles(values: Floats) -> str:

@@ -14,6 +14,14 @@ export function nearest(raster, easting, northing) {
   return raster.at(row * cols + col);
 }
 
+/** Returns the step of the cell under a place (m): 0 without one, and where tiles meet. */
+export function stepAt(steps, easting, northing) {
+  const { west, north, cell, rows, cols } = steps.grid;
+  const [x, y] = [(easting - west) / cell, (north - northing) / cell];
+  const inside = x > 0 && x < cols && y > 0 && y < rows;
+  return (inside && nearest(steps, easting, northing)) || 0;
+}
+
 /** Returns the height between cell centres; that of the nearest cell where one of four has none. */
 export function bilinear(raster, easting, northing) {
   const { west, north, cell, rows, cols } = raster.grid;

@@ -14,7 +14,7 @@ export const ESTIMATE_STEP = 0.002;
 export async function unpacked(tile, data) {
   const { parts, image, mime } = readGlb(await inflated(data.glb));
   const grid = data.grid;
-  const raster = async (packed) => packed && heights(grid, packed.low, packed.step, await inflated(packed.data));
+  const raster = async (packed, cells = grid) => packed && heights(cells, packed.low, packed.step, await inflated(packed.data));
   const cells = async (text) => text && (await inflated(text));
   const estimate = await cells(data.estimate);
   return {
@@ -31,6 +31,7 @@ export async function unpacked(tile, data) {
       at: (index) => (estimate[index] === NO_ESTIMATE ? NaN : (estimate[index] - 1) * ESTIMATE_STEP),
     },
     surface: data.surface && spline(numbers(data.surface)),
+    steps: await raster(data.steps, data.steps?.grid),
     corners: data.corners,
     lines: data.lines.map(({ name, points }) => line(tile, name, points)),
   };

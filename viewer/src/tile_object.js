@@ -20,7 +20,7 @@ import {
 } from "three";
 
 import { surfaceMaterial } from "./material.js";
-import { bilinear, centre, nearest } from "./raster.js";
+import { bilinear, centre, nearest, stepAt } from "./raster.js";
 import { contains } from "./run.js";
 
 export const OWN = { road: "#565b66", terrain: "#c6bea9" };
@@ -87,7 +87,10 @@ export class TileObject {
   /** Returns height (m) and slopes of the surface at a place; null beside the tile. */
   at(easting, northing) {
     if (!contains(this.tile, easting, northing)) return null;
-    return this.data.surface ? this.data.surface(easting, northing) : null;
+    const { surface, steps } = this.data;
+    if (!surface) return null;
+    const found = surface(easting, northing);
+    return steps ? { ...found, height: found.height + stepAt(steps, easting, northing) } : found;
   }
 
   /** Returns what the rasters have at a place: scan and terrain model (m), support class, error estimate (m). */

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { bilinear, centre, heights, nearest } from "../src/raster.js";
+import { bilinear, centre, heights, nearest, stepAt } from "../src/raster.js";
 
 const GRID = { west: 100, north: 50, cell: 2, rows: 2, cols: 3 };
 const bytes = (...codes) => new Uint8Array(new Uint16Array(codes).buffer);
@@ -26,4 +26,14 @@ test("a cell without height has none, and is not mixed into its neighbours", () 
   const holed = heights(GRID, 10, 0.5, bytes(0, 3, 5, 7, 9, 11));
   assert.ok(Number.isNaN(nearest(holed, 101, 49)));
   assert.equal(bilinear(holed, 102.2, 48.6), 11);
+});
+
+test("steps are those of the cell, and 0 without one and on the border of the tile", () => {
+  const steps = heights(GRID, -0.25, 0.125, bytes(0, 1, 5, 3, 4, 0));
+  assert.deepEqual(
+    [[101, 49], [103, 49], [105, 49], [101, 47]].map(([x, y]) => stepAt(steps, x, y)),
+    [0, -0.25, 0.25, 0],
+  );
+  assert.equal(stepAt(steps, 103, 50), 0);
+  assert.equal(stepAt(steps, 106, 47), 0);
 });

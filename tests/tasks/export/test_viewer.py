@@ -18,6 +18,7 @@ from flexroad.tasks.export.viewer import (
     encode_tile,
     picture,
 )
+from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 
 GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 40, 30)
 
@@ -104,3 +105,20 @@ def test_texts_of_the_index_stay_texts():
     assert script.isascii()
     (index,) = json.loads(f"[{script.decode()[len('FLEXROAD.run(') : -3]}]")
     assert index == {"name": '</script>"\u2028ä', "values": [None, 1.5]}
+
+
+def test_steps_beside_roads_are_of_every_cell_and_exactly_none_on_the_road():
+    cells = Grid("EPSG:25832", 500000.0, 5600000.0, 0.5, 2 * MOST_CELLS, 40)
+    steps = np.zeros(cells.shape, np.float32)
+    steps[10:20] = np.linspace(-4, 4, cells.width)
+    knots = np.array([0.0, 0, 1, 1])
+    spline = {"crs": cells.crs, "bounds": cells.exact_bounds, "degree": (1, 1), "datum": 0.0}
+    spline |= {"knots_u": knots, "knots_v": knots, "A": np.ones((2, 2)), "W": np.ones((2, 2))}
+    surface = SteppedSurface(**spline, origin=cells.origin, steps=steps, cells=cells)
+    packed = content(encode_tile(scene(cells, surface=surface)))["steps"]
+    assert (packed["grid"]["rows"], packed["grid"]["cols"]) == cells.shape
+    found = np.nan_to_num(heights(packed, packed["grid"]))
+    np.testing.assert_allclose(found, steps, rtol=0, atol=0.0006)
+    assert (found[steps == 0] == 0).all()
+    smooth = content(encode_tile(scene(cells, surface=without_steps(surface))))
+    assert smooth["steps"] is None
