@@ -91,7 +91,10 @@ def scatter(dsm_above_dtm: Floats, kept: Bools, cell: float) -> Floats:
 def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     """Return the estimate from the residuals of some cells around each cell, ``(H, W)``, m."""
     valid = cells & np.isfinite(residual)
-    misfit, share = _mean_around(residual, valid, _width(SQUARE_M, cell))
+    # A cell that is farther off than heights of the same ground is a car or a crown. Larger differences count
+    # little in the loss of the fit, too.
+    same_ground = np.clip(residual, -AGREE_M, AGREE_M)
+    misfit, share = _mean_around(same_ground, valid, _width(SQUARE_M, cell))
     misfit, share = _mean_around(np.abs(misfit), valid & (share >= MIN_SHARE), _width(AROUND_M, cell))
     if not (share > 0).any():
         return np.full(residual.shape, AGREE_M)

@@ -6,6 +6,9 @@ classes, within 0.3 m of the terrain model of all points. Of Autzen, the ground 
 classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,
 which is a second truth. Made scans have a scanner's noise, and are compared with the true surface.
 
+The error estimates of the road's squares are compared with their errors: how many squares have a mean error
+within the 90% interval, and how many of the worst tenth are among the tenth with the largest estimate.
+
 Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...]``; each NAME is a
 further configuration, production with options: ``--set soft=fit.bending_m3=20``. Real places need
 FLEXROAD_REAL_DATA.
@@ -32,7 +35,9 @@ import flexroad
 from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import prepared, rasters
 from flexroad.pipeline.cli.main import main as command
+from flexroad.pipeline.export.source import select
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
+from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 from flexroad.tasks.synthetic.points import DECK, GROUND, scan
 from flexroad.tasks.types import Bools, Floats
@@ -51,6 +56,8 @@ CONFIGS = {
 }
 """Configurations: the paper's, production fitted to the DSM, and production."""
 DRAWS = 2000
+FEWEST_IN_SQUARE = 5
+"""Smallest number of withheld points of a square whose mean error is compared with its estimate."""
 Figure = Callable[[Floats], Floats]
 Configs = dict[str, tuple[str, Sequence[str]]]
 """Name -> shipped configuration, and options that are set."""
@@ -311,6 +318,31 @@ def by_ground(held: str, truth: Truth, error: Floats) -> Iterator[tuple[str, Flo
             yield f"  {held}, {ground}:", error[there], truth.square[there]
 
 
+def estimates(folder: Path, place: Place, truth: Truth) -> Floats:
+    """Return the error estimate (m) of a run at what was withheld; NaN off the raw road mask."""
+    estimate = np.full(truth.x.shape, np.nan)
+    for tile in select(str(folder), allow=[str(place.catalog.anchor)]).finished():
+        west, south, east, north = tile.tile.grid.bounds
+        inside = (truth.x >= west) & (truth.x < east) & (truth.y > south) & (truth.y <= north)
+        error, _ = tile.cell_errors
+        road = tile.road.mask[tile.road.grid.window(tile.road.core)]
+        cells = tile.tile.grid.cells(truth.x[inside], truth.y[inside])
+        estimate[inside] = np.where(road, error, np.nan)[cells]
+    return estimate
+
+
+def doubt(truth: Truth, error: Floats, estimate: Floats) -> str:
+    """Return how well the error estimates of the road's squares agree with their errors, as text."""
+    there = truth.road & np.isfinite(error + estimate)
+    _, square, count = np.unique(truth.square[there], return_inverse=True, return_counts=True)
+    off, expected = (np.bincount(square, values[there]) / count for values in (error, estimate))
+    off, expected = np.abs(off[count >= FEWEST_IN_SQUARE]), expected[count >= FEWEST_IN_SQUARE]
+    covered, worst = (off <= INTERVAL * expected).sum(), max(1, round(len(off) / 10))
+    found = np.intersect1d(np.argsort(off)[-worst:], np.argsort(expected)[-worst:])
+    means = f"mean error {off.mean():.4f}, mean estimate {expected.mean():.4f}"
+    return f"{covered} of {len(off)} squares within the interval, {len(found)} of {worst} found, {means}"
+
+
 def compare(name: str, place: Place, folder: Path, configs: Configs) -> None:
     """Print the figures of each configuration, and what production changes."""
     errors: dict[tuple[str, str], Floats] = {}
@@ -326,6 +358,9 @@ def compare(name: str, place: Place, folder: Path, configs: Configs) -> None:
                 l2, bias = mean_of(np.abs(error), group), mean_of(error, group)
                 where = f"{error.size} in {np.unique(group).size} squares"
                 print(f"{title} {where}: L2 {l2} RMSE {rmse_of(error, group)} bias {bias}", flush=True)
+        held = place.truths["squares"]
+        text = doubt(held, errors[config, "squares"], estimates(folder / config, place, held))
+        print(f"  squares, road: {text}", flush=True)
     for held, truth in place.truths.items():
         for other in (config for config in configs if config != "production"):
             gain = np.abs(errors["production", held]) - np.abs(errors[other, held])
