@@ -13,6 +13,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.spline.stepped import without_steps
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,17 @@ class Town:
             heights[inside] = tile.surface.height(x[inside], y[inside])
             normals[inside] = tile.surface.normal(x[inside], y[inside])
         return heights, normals
+
+    def is_smooth(self, x, y, around_m):
+        """Whether the surfaces have no step at places, nor at the corners of a square around them."""
+        smooth = np.ones(np.shape(x), bool)
+        corners = [(0, 0), *((i, j) for i in (-around_m, around_m) for j in (-around_m, around_m))]
+        for tile in select(self.path).finished():
+            spline = without_steps(tile.surface)
+            for east, north in corners:
+                place = x + east, y + north
+                smooth &= tile.surface.height(*place) == spline.height(*place)
+        return smooth
 
 
 @pytest.fixture(scope="session")

@@ -214,11 +214,14 @@ def test_sumo_gives_the_nodes_of_a_network_the_heights_of_the_mosaic(town, tmp_p
     with rasterio.open(raster) as file:
         columns, rows = ~file.transform @ (x, y)
         between = map_coordinates(file.read(1).astype(float), [rows - 0.5, columns - 0.5], order=1)
+    # Between cells a step beside a road is a slope, on which SUMO's rounding of places is one of heights.
+    smooth = town.is_smooth(x, y, town.tiles[0].grid.cell)
+    assert smooth.mean() > 0.3
     # SUMO interpolates between the cell centres.
-    assert np.abs(heights - between).max() < 0.005
+    assert np.abs(heights - between)[smooth].max() < 0.005
     surface, _ = town.at(x, y)
-    assert np.median(np.abs(heights - surface)) < 0.002
-    assert np.abs(heights - surface).max() < 0.03
+    assert np.median(np.abs(heights - surface)[smooth]) < 0.002
+    assert np.abs(heights - surface)[smooth].max() < 0.03
     missing = town.tiles[3].grid.bounds
     heights, said = sumo_heights(
         tmp_path, raster, np.add(missing[::2], [5, -5]), np.add(missing[1::2], [5, -5])
