@@ -22,6 +22,9 @@ torch = pytest.importorskip("torch")
 TILE = Grid("EPSG:25832", 500000, 5600500, 1.0, 100, 130)
 OPTIONS = smoothing_spline.Options()
 MOST_MM = 1.0
+ROUNDING_MM = 0.01
+"""Some processors sum a matrix product in another order for another batch, or for another tile of the batch.
+Control points that few cells hold turn that into 0.04 mm, the heights of cells into less than 0.001 mm."""
 LOST = np.hypot(*(np.indices(TILE.shape) - np.array([60, 50])[:, None, None])) < 30
 
 
@@ -70,6 +73,12 @@ def off_mm(tiles, options=OPTIONS, engine=None):
         ).max()
         for surface, (data, clusters, frame) in zip(surfaces, tiles, strict=True)
     )
+
+
+def apart_mm(one, other):
+    """Return the largest difference of two surfaces at all cells (mm)."""
+    at = TILE.eastings, TILE.northings
+    return 1e3 * np.abs(one.lattice(*at) - other.lattice(*at)).max()
 
 
 def mixed():
@@ -163,7 +172,7 @@ def test_tile_does_not_depend_on_its_company():
     together = smoothing_spline.fit_batch(tiles, OPTIONS, Engine())
     for tile, surface in zip(tiles, together, strict=True):
         (alone,) = smoothing_spline.fit_batch([tile], OPTIONS, Engine())
-        assert np.abs(alone.A - surface.A).max() < 1e-6
+        assert apart_mm(alone, surface) < ROUNDING_MM
 
 
 def test_tile_without_heights_does_not_fail_the_others():
@@ -187,7 +196,7 @@ def test_tiles_of_two_shapes_are_fitted_in_two_batches():
     )
     surfaces = smoothing_spline.fit_batch([made(), other, made()], OPTIONS, Engine())
     assert [surface.A.shape for surface in surfaces] == [(40, 31), (20, 20), (40, 31)]
-    assert np.array_equal(surfaces[0].A, surfaces[2].A)
+    assert apart_mm(surfaces[0], surfaces[2]) < ROUNDING_MM
 
 
 def problem_of(tile=None):
