@@ -20,6 +20,7 @@ def vertical_crs(tile: Tile) -> str | None:
     TaskError
         If object storage does not answer.
     """
+    from flexroad.catalog.headers.kept_rasters import kept_raster
     from flexroad.catalog.headers.rasters import quiet
     from flexroad.tasks.io.raster import Unreadable, opened
 
@@ -29,7 +30,7 @@ def vertical_crs(tile: Tile) -> str | None:
         for layer in (layer for layer in tile.layers if layer.name in LAYERS):
             for path in tile.paths(layer):
                 try:
-                    with opened(path, layer.name, tile.allowed) as raster:
+                    with opened(path, layer.name, tile.allowed, kept_raster) as raster:
                         declared = raster.crs.to_wkt() if raster.crs else layer.crs
                 except Unreadable:
                     continue

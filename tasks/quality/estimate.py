@@ -83,8 +83,8 @@ def scatter(dsm_above_dtm: Floats, kept: Bools, cell: float) -> Floats:
     It is small on roads and bridge decks and large in tree crowns; 0 where no kept cell is near.
     """
     valid, size = kept & np.isfinite(dsm_above_dtm), _width(SCATTER_M, cell)
-    mean, _ = _mean_around(dsm_above_dtm, valid, size)
-    square, _ = _mean_around(dsm_above_dtm**2, valid, size)
+    share = _share_around(valid, size)
+    mean, square = (_mean_around(values, valid, share, size) for values in (dsm_above_dtm, dsm_above_dtm**2))
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)))
 
 
@@ -94,8 +94,12 @@ def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     # A cell that is farther off than heights of the same ground is a car or a crown. Larger differences count
     # little in the loss of the fit, too.
     same_ground = np.clip(residual, -AGREE_M, AGREE_M)
-    misfit, share = _mean_around(same_ground, valid, _width(SQUARE_M, cell))
-    misfit, share = _mean_around(np.abs(misfit), valid & (share >= MIN_SHARE), _width(AROUND_M, cell))
+    square, around = _width(SQUARE_M, cell), _width(AROUND_M, cell)
+    share = _share_around(valid, square)
+    misfit = np.abs(_mean_around(same_ground, valid, share, square))
+    counted = valid & (share >= MIN_SHARE)
+    share = _share_around(counted, around)
+    misfit = _mean_around(misfit, counted, share, around)
     if not (share > 0).any():
         return np.full(residual.shape, AGREE_M)
     estimate = filled(np.where(share > 0, LEAST_M + FACTOR * misfit, np.nan), cells)
@@ -104,13 +108,17 @@ def _unexplained(residual: Floats, cells: Bools, cell: float) -> Floats:
     return estimate
 
 
-def _mean_around(values: Floats, valid: Bools, size: int) -> tuple[Floats, Floats]:
-    """Return the mean of the valid values in a square around each cell, and their share of the square."""
+def _share_around(valid: Bools, size: int) -> Floats:
+    """Return the share of valid cells in a square around each cell, ``(H, W)``."""
     share = scipy.ndimage.uniform_filter(valid.astype(np.float64), size)
-    total = scipy.ndimage.uniform_filter(np.where(valid, values, 0.0), size)
     # Less than half a cell is a rounding error of the filter.
-    there = share * size**2 > 0.5
-    return total / np.where(there, share, 1.0), np.where(there, share, 0.0)
+    return np.where(share * size**2 > 0.5, share, 0.0)
+
+
+def _mean_around(values: Floats, valid: Bools, share: Floats, size: int) -> Floats:
+    """Return the mean of the valid values in a square around each cell, given their share of it."""
+    total = scipy.ndimage.uniform_filter(np.where(valid, values, 0.0), size)
+    return np.asarray(total / np.where(share > 0, share, 1.0))
 
 
 def _width(side_m: float, cell: float) -> int:

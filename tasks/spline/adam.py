@@ -6,11 +6,13 @@ bounds after each step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
@@ -67,7 +69,8 @@ def minimise(
         The loss at the start and after each step.
     """
     variables = best = start.copy()
-    mean, variance = np.zeros_like(start), np.zeros_like(start)
+    mean, variance = np.zeros(start.size), np.zeros(start.size)
+    limits = np.broadcast_to(limit, start.shape).ravel()
     losses: list[float] = []
     while True:
         loss, gradient = objective(variables)
@@ -77,8 +80,32 @@ def minimise(
         if schedule.has_finished(losses):
             return (variables if schedule.last else best), losses
         step = len(losses)
-        mean += (1 - BETA_1) * (gradient - mean)
-        variance += (1 - BETA_2) * (gradient**2 - variance)
-        spread = np.sqrt(variance / (1 - BETA_2**step)) + EPSILON
-        variables -= schedule.rate / (1 - BETA_1**step) * mean / spread
-        np.clip(variables, -limit, limit, out=variables)
+        _step(
+            variables.reshape(-1), gradient.ravel(), mean, variance, limits,
+            schedule.rate / (1 - BETA_1**step), 1 - BETA_2**step,
+        )  # fmt: skip
+
+
+@compiled(error_model="numpy")
+def _step(
+    variables: Floats, gradient: Floats, mean: Floats, variance: Floats, limit: Floats, rate: float,
+    known: float,
+) -> None:  # fmt: skip
+    """Take one step in place, all arrays ``(n,)``.
+
+    Parameters
+    ----------
+    rate : float
+        Learning rate over the share of the mean that is known after so many steps.
+    known : float
+        The same share of the variance.
+    """
+    for i in range(variables.size):
+        mean[i] += (1 - BETA_1) * (gradient[i] - mean[i])
+        variance[i] += (1 - BETA_2) * (gradient[i] ** 2 - variance[i])
+        spread = math.sqrt(variance[i] / known) + EPSILON
+        variables[i] -= rate * mean[i] / spread
+        if variables[i] > limit[i]:
+            variables[i] = limit[i]
+        elif variables[i] < -limit[i]:
+            variables[i] = -limit[i]
