@@ -9,6 +9,8 @@ which is a second truth. Made scans have a scanner's noise, and are compared wit
 The error estimates of the road's squares are compared with their errors: how many squares have a mean error
 within the 90% interval, and how many of the worst tenth are among the tenth with the largest estimate.
 
+Small places have few such squares, so they are run with several draws of them (`DRAWN`), pooled.
+
 Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...]``; each NAME is a
 further configuration, production with options: ``--set soft=fit.bending_m3=20``. Real places need
 FLEXROAD_REAL_DATA.
@@ -43,7 +45,9 @@ from flexroad.tasks.synthetic.points import DECK, GROUND, scan
 from flexroad.tasks.types import Bools, Floats
 
 SIDE_M, SHARE, SEED = 5.0, 0.06, 7
-"""Side of the squares, and the share of them that is withheld."""
+"""Side of the squares, the share of them that is withheld, and the number of the first draw."""
+DRAWN = {"IGN": 6, "Brighton Beach": 6}
+"""Number of draws of a place, else 1."""
 NEAR_M = 0.3
 """Points without classes are ground within this distance of the terrain model of all points."""
 FOOT_M, SAME_M = 0.3048, 0.02
@@ -83,13 +87,28 @@ class Place:
     truths: dict[str, Truth]
 
 
-def squares(x: Floats, y: Floats) -> tuple[Floats, Bools]:
+Maker = Callable[[Path, int], Place]
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A configuration's errors and error estimates at what was withheld, and the figures of its tiles."""
+
+    errors: dict[str, Floats]
+    """By the name of the truth."""
+    estimates: Floats
+    """Of the squares."""
+    mad: Floats
+    triangles: Floats
+
+
+def squares(x: Floats, y: Floats, draw: int) -> tuple[Floats, Bools]:
     """Return the number of the square of each point, and whether it is withheld."""
     column, row = (np.floor(np.asarray(axis) / SIDE_M).astype(np.int64) for axis in (x, y))
     number = column * 10**7 + row
     # A hash of the number: which squares are withheld does not depend on the others.
-    mixed = ((number * np.int64(2654435761) + SEED) ^ (number >> 7)) % 1_000_003
-    mixed = (mixed * 48271 + SEED) % 1_000_003
+    mixed = ((number * np.int64(2654435761) + draw) ^ (number >> 7)) % 1_000_003
+    mixed = (mixed * 48271 + draw) % 1_000_003
     return number, mixed < SHARE * 1_000_003
 
 
@@ -123,6 +142,7 @@ def scanned(
     roads: Sequence[object],
     options: Sequence[object],
     folder: Path,
+    draw: int,
     unit: float = 1.0,
     others: Path | None = None,
 ) -> Place:
@@ -131,7 +151,7 @@ def scanned(
     clouds = [laspy.read(file) for file in files]
     x, y, z = (np.concatenate([np.asarray(cloud[a]) for cloud in clouds]) * unit for a in "xyz")
     kind = np.concatenate([np.asarray(cloud.classification) for cloud in clouds])
-    number, out = squares(x, y)
+    number, out = squares(x, y, draw)
     extra = _other_ground(others, x, y, z) if others else None
     gone = out if extra is None else out | extra
     start = 0
@@ -182,7 +202,7 @@ def _other_ground(file: Path, x: Floats, y: Floats, z: Floats) -> Bools:
     return np.isfinite(distance)
 
 
-def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path) -> Place:
+def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path, draw: int) -> Place:
     """Withhold cells of a town's DSM, with canopies, and DTM; truth is its DTM, and road is paved ground."""
     zipfile.ZipFile(archive).extractall(folder)
     root = folder / archive.stem
@@ -199,7 +219,7 @@ def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path) -> Pla
             layers[name] = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
     dtm = layers["dtm"]
     dsm = np.fmax(layers["dsm"], dtm + np.nan_to_num(layers["canopy"]))
-    number, out = squares(x, y)
+    number, out = squares(x, y, draw)
     for name, heights in (("left_dsm.tif", dsm), ("left_dtm.tif", dtm)):
         with rasterio.open(root / name, "w", **profile) as raster:
             raster.write(np.where(out | np.isnan(heights), -9999.0, heights), 1)
@@ -210,13 +230,13 @@ def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path) -> Pla
     return Place(folder / "catalog.parquet", {"squares": truth})
 
 
-def made(stratum: str, folder: Path) -> Place:
+def made(stratum: str, folder: Path, draw: int) -> Place:
     """Withhold points of a made scan of two by two tiles; the true surface is the truth."""
     whole = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
     options = SceneOptions(dsm_noise_m=(0.0, 0.0))
     scene = make_scene(whole, SEED, stratum, options)
     points = scan(scene, per_m2=8, noise_m=0.03, seed=SEED)
-    left = rasterise(points[~squares(points.easting, points.northing)[1]], whole, Options(), None)
+    left = rasterise(points[~squares(points.easting, points.northing, draw)[1]], whole, Options(), None)
     layers = {
         "dsm": left.dsm, "dtm": left.dtm, "road_height": left.top.height, "road_mask": scene.road_mask,
         "reference": scene.reference, "reference_road": scene.reference_road,
@@ -226,35 +246,35 @@ def made(stratum: str, folder: Path) -> Place:
         prepared.write_tile(folder, name, tile, {layer: values[cut] for layer, values in layers.items()})
     Catalog(tuple(prepared.index(folder))).write(folder / "catalog.parquet")
     x, y = np.meshgrid(whole.eastings, whole.northings)
-    number, out = squares(x, y)
+    number, out = squares(x, y, draw)
     z, road = scene.reference, scene.reference_road
     return Place(
         folder / "catalog.parquet", {"squares": Truth(x[out], y[out], z[out], road[out], number[out])}
     )
 
 
-def places(data: Path | None, roads: Path) -> dict[str, Callable[[Path], Place]]:
-    """Return the places by name; each makes its data in a folder."""
-    found: dict[str, Callable[[Path], Place]] = {
-        f"made, {stratum}": lambda folder, stratum=stratum: made(stratum, folder)
+def places(data: Path | None, roads: Path) -> dict[str, Maker]:
+    """Return the places by name; each makes its data in a folder, for one draw of squares."""
+    found: dict[str, Maker] = {
+        f"made, {stratum}": lambda folder, draw, stratum=stratum: made(stratum, folder, draw)
         for stratum in ("urban", "suburban", "rural")
     }
     if data is None:
         return found
     where = "class = 'road' AND certainty <> 'low' AND visible_in IS NOT 'rgb'"
     drawn = data / "autzen" / "roads" / "autzen_north_roads.gpkg"
-    found["Autzen north"] = lambda folder: scanned(
+    found["Autzen north"] = lambda folder, draw: scanned(
         [data / "autzen" / "autzen_north.laz"],
         ["--roads", drawn, "--roads-layer", "road_polygons", "--roads-where", where],
-        ["--crs", "EPSG:2994"], folder, FOOT_M, data / "autzen" / "autzen-thin.las",
+        ["--crs", "EPSG:2994"], folder, draw, FOOT_M, data / "autzen" / "autzen-thin.las",
     )  # fmt: skip
-    found["IGN"] = lambda folder: scanned(
+    found["IGN"] = lambda folder, draw: scanned(
         sorted((data / "ign_crops" / "l93_770500_6277500").glob("*.la[sz]")),
-        ["--roads", roads / "ign_l93.geojson"], ["--cell", 0.5], folder,
+        ["--roads", roads / "ign_l93.geojson"], ["--cell", 0.5], folder, draw,
     )  # fmt: skip
-    found["Brighton Beach"] = lambda folder: scanned(
+    found["Brighton Beach"] = lambda folder, draw: scanned(
         [data / "brighton_beach" / "model.laz"],
-        ["--roads", roads / "brighton_beach.geojson"], ["--cell", 0.5, "--dop-cell", 0.25], folder,
+        ["--roads", roads / "brighton_beach.geojson"], ["--cell", 0.5, "--dop-cell", 0.25], folder, draw,
     )  # fmt: skip
     barbican = {
         "dsm": "dsm_barb*.tif",
@@ -262,15 +282,17 @@ def places(data: Path | None, roads: Path) -> dict[str, Callable[[Path], Place]]
         "canopy": "cdsm_barb*.tif",
         "cover": "landcover*.tif",
     }
-    found["Barbican"] = lambda folder: town(data / "umep" / "London_BNG.zip", "EPSG:27700", barbican, folder)
+    found["Barbican"] = lambda folder, draw: town(
+        data / "umep" / "London_BNG.zip", "EPSG:27700", barbican, folder, draw
+    )
     gothenburg = {
         "dsm": "DSM_KR*.tif",
         "dtm": "DEM_KR*.tif",
         "canopy": "CDSM_KR*.asc",
         "cover": "landcover.tif",
     }
-    found["Gothenburg"] = lambda folder: town(
-        data / "umep" / "Goteborg_SWEREF99_1200.zip", "EPSG:3007", gothenburg, folder
+    found["Gothenburg"] = lambda folder, draw: town(
+        data / "umep" / "Goteborg_SWEREF99_1200.zip", "EPSG:3007", gothenburg, folder, draw
     )
     return found
 
@@ -343,27 +365,51 @@ def doubt(truth: Truth, error: Floats, estimate: Floats) -> str:
     return f"{covered} of {len(off)} squares within the interval, {len(found)} of {worst} found, {means}"
 
 
-def compare(name: str, place: Place, folder: Path, configs: Configs) -> None:
+def pooled(truths: Sequence[Truth]) -> Truth:
+    """Return the truths of several draws as one; squares of different draws are different ones."""
+    joined = {
+        name: np.concatenate([getattr(truth, name) for truth in truths]) for name in ("x", "y", "z", "road")
+    }
+    numbers = [truth.square * len(truths) + k for k, truth in enumerate(truths)]
+    return Truth(**joined, square=np.concatenate(numbers))
+
+
+def compared(places: Sequence[Place], base: str, options: Sequence[str], folder: Path) -> Compared:
+    """Run a configuration over the draws of a place and compare it with what was withheld."""
+    errors: dict[str, list[Floats]] = {name: [] for name in places[0].truths}
+    expected, mad, triangles = [], [], []
+    for number, place in enumerate(places):
+        out = folder / f"{folder.name}_{number}"
+        view = run(place, base, options, out)
+        mad.append(view.metrics.mad_road_deg.to_numpy())
+        triangles.append(view.metrics.triangles.to_numpy(np.float64))
+        expected.append(estimates(out, place, place.truths["squares"]))
+        for name, truth in place.truths.items():
+            errors[name].append(view.height(truth.x, truth.y) - truth.z)
+    joined = {name: np.concatenate(parts) for name, parts in errors.items()}
+    return Compared(joined, *map(np.concatenate, (expected, mad, triangles)))
+
+
+def compare(name: str, places: Sequence[Place], folder: Path, configs: Configs) -> None:
     """Print the figures of each configuration, and what production changes."""
-    errors: dict[tuple[str, str], Floats] = {}
+    truths = {held: pooled([place.truths[held] for place in places]) for held in places[0].truths}
+    results: dict[str, Compared] = {}
     for config, (base, options) in configs.items():
-        view = run(place, base, options, folder / config)
-        number, faces = np.arange(len(view.metrics)), view.metrics.triangles.to_numpy(np.float64)
-        mad = view.metrics.mad_road_deg.to_numpy()
-        seen = np.isfinite(mad)
-        print(f"{name}, {config}: MAD {mean_of(mad[seen], number[seen])} deg, T {mean_of(faces, number)}")
-        for held, truth in place.truths.items():
-            errors[config, held] = view.height(truth.x, truth.y) - truth.z
-            for title, error, group in by_ground(held, truth, errors[config, held]):
+        (folder / config).mkdir()
+        result = results[config] = compared(places, base, options, folder / config)
+        number, seen = np.arange(len(result.mad)), np.isfinite(result.mad)
+        mad, faces = mean_of(result.mad[seen], number[seen]), mean_of(result.triangles, number)
+        print(f"{name}, {config}: MAD {mad} deg, T {faces}")
+        for held, truth in truths.items():
+            for title, error, group in by_ground(held, truth, result.errors[held]):
                 l2, bias = mean_of(np.abs(error), group), mean_of(error, group)
                 where = f"{error.size} in {np.unique(group).size} squares"
                 print(f"{title} {where}: L2 {l2} RMSE {rmse_of(error, group)} bias {bias}", flush=True)
-        held = place.truths["squares"]
-        text = doubt(held, errors[config, "squares"], estimates(folder / config, place, held))
+        text = doubt(truths["squares"], result.errors["squares"], result.estimates)
         print(f"  squares, road: {text}", flush=True)
-    for held, truth in place.truths.items():
+    for held, truth in truths.items():
         for other in (config for config in configs if config != "production"):
-            gain = np.abs(errors["production", held]) - np.abs(errors[other, held])
+            gain = np.abs(results["production"].errors[held]) - np.abs(results[other].errors[held])
             for title, change, group in by_ground(held, truth, gain):
                 print(f"{title} L2 of production minus {other} {mean_of(change, group)}", flush=True)
 
@@ -378,8 +424,13 @@ def main(words: list[str]) -> None:
     data = os.environ.get("FLEXROAD_REAL_DATA")
     there = places(Path(data) if data else None, Path(__file__).parents[1] / "real" / "roads")
     for name in names or there:
-        with tempfile.TemporaryDirectory() as folder:
-            compare(name, there[name](Path(folder)), Path(folder), configs)
+        with tempfile.TemporaryDirectory() as scratch:
+            folders = [Path(scratch) / f"draw {number}" for number in range(DRAWN.get(name, 1))]
+            made_places = []
+            for number, folder in enumerate(folders):
+                folder.mkdir()
+                made_places.append(there[name](folder, SEED + number))
+            compare(name, made_places, Path(scratch), configs)
 
 
 if __name__ == "__main__":
