@@ -122,18 +122,24 @@ def _add_extents(rows: list[Item], assets: Any) -> None:
                 asset["flexroad:extents"] = extents
 
 
-def table_bytes(items: list[Item], full: Item) -> bytes:
+def schema_of(full: Item) -> Any:
+    """Return the columns of a table of items, inferred from an item with all fields."""
+    from stac_geoparquet.arrow import parse_stac_items_to_arrow
+
+    return parse_stac_items_to_arrow([full]).read_all().schema
+
+
+def table_bytes(items: list[Item], schema: Any) -> bytes:
     """Return a table of items; stac-geoparquet's own conversion is many times slower.
 
     Parameters
     ----------
-    full : Item
-        An item with all fields: columns are inferred from it, so that every catalog has the same schema.
+    schema : pyarrow.Schema
+        Of `schema_of`.
     """
     import pyarrow as pa
-    from stac_geoparquet.arrow import parse_stac_items_to_arrow, to_parquet
+    from stac_geoparquet.arrow import to_parquet
 
-    schema = parse_stac_items_to_arrow([full]).read_all().schema
     with ScratchFolder() as folder:
         # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"

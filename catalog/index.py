@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -301,7 +301,13 @@ def _to_json(items: list[Item]) -> bytes:
 
 
 def _to_parquet(items: list[Item]) -> bytes:
-    return geoparquet.table_bytes(items, _full_item())
+    return geoparquet.table_bytes(items, _schema())
+
+
+@cache
+def _schema() -> Any:
+    """Return the columns of every catalog."""
+    return geoparquet.schema_of(_full_item())
 
 
 def _full_item() -> Item:
