@@ -1,6 +1,7 @@
 """The command line, run in this process or in a new one."""
 
 import contextlib
+import functools
 import io
 import os
 import signal
@@ -10,11 +11,14 @@ from typing import NamedTuple
 from unittest import mock
 
 import pytest
+import typer
 
 from flexroad.pipeline.cli.main import main
 
 PROCESS = (sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()")
 """Command of a new process; the words of a command line follow."""
+built = functools.cache(typer.main.get_command)
+"""The commands of an app, which each call of it would build anew: that takes longer than many a command."""
 
 
 class Said(NamedTuple):
@@ -54,6 +58,7 @@ def call(*words) -> Said:
     out, err = io.StringIO(), io.StringIO()
     with (
         same_signals(),
+        mock.patch("typer.main.get_command", built),
         mock.patch.object(sys, "argv", ["flexroad", *map(str, words)]),
         mock.patch.dict(os.environ, COLUMNS="200"),
         contextlib.redirect_stdout(out),
