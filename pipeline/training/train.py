@@ -29,8 +29,9 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.roads.mask_cleanup import NOTHING, within
+from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.training_types import Round, Sample, Trained
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData

@@ -31,7 +31,7 @@ from flexroad.tasks.filter.kit.union_find import (
     unite,
 )
 from flexroad.tasks.roads.columns import columns_of
-from flexroad.tasks.roads.distances import columns_aside
+from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.dtm_validity import invalid_dtm
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
@@ -126,35 +126,22 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
     dtm_invalid = invalid_dtm(data, road, labels > 0)
     if options.verge_m == 0:
         return RoadClusters(data.grid, labels, dtm_invalid)
-    verge = _verge(road.mask, labels > 0, options.verge_m / cell)
-    beside = ~road.mask & _within(verge, BEYOND_M / cell)
+    verge = _verge(road.mask, labels > 0, cell, options.verge_m)
+    beside = ~road.mask & within(verge, cell, BEYOND_M)
     return RoadClusters(data.grid, labels, dtm_invalid | verge, beside)
 
 
-def _verge(mask: Bools, kept: Bools, width: float) -> Bools:
-    """Return the cells beside the streets at most ``width`` cells away, ``(H, W)``.
+def _verge(mask: Bools, kept: Bools, cell: float, width_m: float) -> Bools:
+    """Return the cells beside the streets at most ``width_m`` away, ``(H, W)``.
 
     A street is a connected part of the mask with at least one kept cell, including its dropped cells.
     """
-    if not kept.any() or width <= 0:
+    if not kept.any():
         return np.zeros_like(mask)
     parts, count = scipy.ndimage.label(mask, np.ones((3, 3)))
     street = np.zeros(count + 1, np.bool_)
     street[parts[kept]] = True
-    return ~mask & _within(street[parts], width)
-
-
-@compiled()
-def _within(cells: Bools, width: float) -> Bools:
-    """Return the cells at most ``width`` cells away from one of the given cells, ``(H, W)``."""
-    rows, cols = cells.shape
-    aside, near, reach = columns_aside(cells), np.zeros((rows, cols), np.bool_), min(int(width), rows - 1)
-    for down in range(-reach, reach + 1):
-        wide = int(math.sqrt(width**2 - down**2))
-        for r in range(max(down, 0), min(rows + down, rows)):
-            for c in range(cols):
-                near[r, c] |= abs(aside[r - down, c]) <= wide
-    return near
+    return ~mask & within(street[parts], cell, width_m)
 
 
 def _clusters(dsm: Floats, patches: Patches, gap: float, theta: float) -> NDArray[np.int32]:

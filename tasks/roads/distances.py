@@ -6,6 +6,8 @@ mostly narrow, so it is much faster than a distance transform of the whole raste
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +39,24 @@ def filled(values: Floats, wanted: Bools | None = None) -> Floats:
     result = values.copy()
     result[holes] = values.ravel()[_nearest(np.flatnonzero(holes), columns_aside(~missing))[1]]
     return result
+
+
+def within(mask: Bools, cell: float, reach_m: float) -> Bools:
+    """Return the cells whose centre lies within ``reach_m`` of that of a cell of the mask, ``(H, W)``."""
+    # A quotient like 0.3 / 0.1 is a little below 3.
+    return _within(mask, reach_m / cell + 1e-9)
+
+
+@compiled()
+def _within(mask: Bools, reach: float) -> Bools:
+    rows, cols = mask.shape
+    aside, near, most = columns_aside(mask), np.zeros((rows, cols), np.bool_), min(int(reach), rows - 1)
+    for down in range(-most, most + 1):
+        wide = int(math.sqrt(reach**2 - down**2))
+        for r in range(max(down, 0), min(rows + down, rows)):
+            for c in range(cols):
+                near[r, c] |= abs(aside[r - down, c]) <= wide
+    return near
 
 
 @compiled()

@@ -16,6 +16,7 @@ from pydantic import Field
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import Bools, TileData
 
@@ -74,17 +75,6 @@ def fuse(mask: Bools, second: Bools, cell: float, options: Cleanup) -> Bools:
             return mask & within(second, cell, options.corridor_m)
         case _:
             return mask
-
-
-def within(mask: Bools, cell: float, reach_m: float) -> Bools:
-    """Return the cells whose centre lies within ``reach_m`` of that of a cell of the mask, ``(H, W)``."""
-    import cv2
-
-    if not mask.any():
-        return mask
-    distance = cv2.distanceTransform(_bytes(~mask), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near: Bools = distance <= reach_m / cell + 1e-4  # OpenCV's distances are float32
-    return near
 
 
 def close(mask: Bools, cell: float, width_m: float) -> Bools:

@@ -14,6 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.roads.distances import within
 from flexroad.tasks.spline.between import between
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, Surface, TileData
@@ -61,9 +62,7 @@ class SteppedSurface(NurbsSurface):
 
     def without_steps_near(self, cells: Bools, distance_m: float) -> SteppedSurface:
         """Return the surface without the steps within a distance of the given cells, ``(H, W)``."""
-        if not cells.any():
-            return self
-        near = scipy.ndimage.distance_transform_edt(~cells) * self.cells.cell <= distance_m
+        near = within(cells, self.cells.cell, distance_m)
         return replace(self, steps=np.where(near, np.float32(0), self.steps))
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
@@ -102,10 +101,10 @@ def ground_beside(data: TileData, clusters: RoadClusters) -> Beside | None:
         return None
     window = data.grid.window(data.core)
     cells = clusters.beside[window]
-    away = scipy.ndimage.distance_transform_edt(~clusters.mask[window]) * data.core.cell
+    near = within(clusters.mask[window], data.core.cell, KERB_M)
     dsm = ground_heights(data, clusters).dsm[window]
     low, high = _around_dtm(data.dtm[window])
-    preferred = (away <= KERB_M) | (high - low >= WALL_M) | (np.abs(dsm - data.dtm[window]) >= WALL_M)
+    preferred = near | (high - low >= WALL_M) | (np.abs(dsm - data.dtm[window]) >= WALL_M)
     dtm = np.where(cells, data.dtm[window], np.nan)
     return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm)
 

@@ -2,9 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 from scipy.ndimage import distance_transform_edt
 
-from flexroad.tasks.roads.distances import distances, filled
+from flexroad.tasks.roads.distances import distances, filled, within
+
+MASKS = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
 
 
 @pytest.mark.parametrize("shape", [(40, 37), (1, 30), (30, 1)])
@@ -33,3 +38,13 @@ def test_filled_gaps_equal_feature_transform(share):
 
 def test_filled_raster_without_any_value_stays_empty():
     assert np.isnan(filled(np.full((3, 4), np.nan))).all()
+
+
+@given(MASKS, st.sampled_from([1.0, 0.5, 0.2, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0, 2.5]))
+@settings(deadline=None)
+def test_within_measures_between_cell_centres(mask, cell, reach):
+    if mask.any():
+        distance = distance_transform_edt(~mask) * cell
+        np.testing.assert_array_equal(within(mask, cell, reach), distance <= reach + 1e-6)
+    else:
+        assert not within(mask, cell, reach).any()

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean, close, drop, fill, within
+from flexroad.tasks.roads.mask_cleanup import NOTHING, Cleanup, clean, close, drop, fill
 from flexroad.tasks.types import Source, TileData
 
 masks = arrays.arrays(bool, st.tuples(st.integers(1, 24), st.integers(1, 24)))
@@ -139,16 +139,6 @@ def test_clean_fuse_combines_with_second_source():
     corridor = mask.copy()
     corridor[:, :11] = corridor[:, 18:] = False
     np.testing.assert_array_equal(fused("corridor", corridor_m=1.5), corridor)
-
-
-@given(masks, cells, st.sampled_from([0.0, 0.7, 1.0, 2.5]))
-@settings(deadline=None)
-def test_within_measures_between_cell_centres(mask, cell, reach):
-    if mask.any():
-        distance = ndimage.distance_transform_edt(~mask) * cell
-        np.testing.assert_array_equal(within(mask, cell, reach), distance <= reach + 1e-6)
-    else:
-        assert not within(mask, cell, reach).any()
 
 
 def test_clean_missing_second_source_fails():
