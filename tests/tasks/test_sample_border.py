@@ -198,6 +198,7 @@ def test_mesh_of_covered_tile_is_the_same_beside_end_of_survey():
     np.testing.assert_array_equal(one.faces, other.faces)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.02, 0.98), cell=st.sampled_from([0.2, 0.5, 1.0]))
 def test_meshes_of_any_survey_meet(seed, share, cell):

@@ -22,6 +22,7 @@ def ground(north: float, west: float) -> np.ndarray:
     return (100 + (north - rows) % 97 * 0.02 + (west + columns) % 89 * 0.01).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_catalog_nrw_can_be_run(tmp_path, quick_config):
     root = tmp_path / "nrw"
     for product in ("dom1", "dgm1"):

@@ -54,6 +54,7 @@ def test_catalog_with_file_outside_needs_allow_for_all_commands(flexroad, tamper
     assert "missing" not in flexroad("catalog", "check", catalog, *option).out
 
 
+@pytest.mark.slow
 def test_run_from_another_user_needs_allow(flexroad, survey, quick_config, tmp_path, monkeypatch):
     run, points = tmp_path / "run", tmp_path / "points.csv"
     flexroad(

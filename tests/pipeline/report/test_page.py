@@ -216,6 +216,7 @@ def test_remedy_without_a_place_is_a_whole_sentence(flag):
     assert not re.search(r"\b(if|whether) is\b|  | :", reason.remedy)
 
 
+@pytest.mark.slow
 def test_report_before_the_end_of_the_first_run_has_the_tiles_so_far(made_survey, tmp_path):
     run = Run.create(
         tmp_path / "RUN", load_config("production"), Catalog.read(made_survey / "catalog.parquet")

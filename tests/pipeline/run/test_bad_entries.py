@@ -78,6 +78,7 @@ def test_bad_entry_fails_only_its_tile(kind, change, run, write, tmp_path):
     assert line == f"failed {row['tile_id']}: load: TaskError: {row['message']}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["json", "parquet"])
 def test_many_bad_entries_fail_only_their_tiles(kind, run, write, flexroad, tmp_path):
     """Every command that reads the catalog or the run works with them."""
@@ -169,6 +170,7 @@ def test_longest_id_runs_again(run, write):
     assert "1 done (1 cached)" in run(catalog).expected(0).out
 
 
+@pytest.mark.slow
 def test_control_characters_in_file_names_are_escaped(run, write, flexroad, tmp_path):
     name = "dsm/\x1b[2J\n*evil* <b>_x_</b>.tif"
 

@@ -74,6 +74,7 @@ def test_meshes_of_real_tiles_have_no_fault(real_data, tmp_path):
     assert set(table.result) == {"no fault"}
 
 
+@pytest.mark.slow
 def test_mesh_with_fault_fails_its_tile_with_one_line(survey, quick_config, tmp_path, monkeypatch):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
     first = run.catalog.tiles[0]
