@@ -140,7 +140,8 @@ def sample(
         west, south, east, north = (round(edge, DECIMALS) for edge in local)
         local = west, south, east, north
     if isinstance(surface, SteppedSurface) and not options.breaklines:
-        surface = surface.without_steps_near(road.mask[road.grid.window(road.core)], SMOOTH_M)
+        on_road = road.mask[road.grid.window(road.core)]
+        surface = surface.without_steps_near(on_road, SMOOTH_M, frame)
     if options.method == "dynamic":
         return _dynamic(surface, road, mask, local, options, frame)
     if options.method == "adaptive":

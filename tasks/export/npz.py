@@ -23,6 +23,7 @@ from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 2
 NAME = "_surface.npz"
+STEPS = ("steps", "south_north", "west_east")
 MEDIA_TYPE = "application/zip"
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -32,8 +33,8 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, z
 def encode(surface: NurbsSurface) -> bytes:
     """Return a surface as ``.npz``: one array per field of `NurbsSurface`, and ``version``.
 
-    A `SteppedSurface` has two more: ``steps`` (float32), and ``cells``, their grid (west, north and cell size
-    in m, columns, rows).
+    A `SteppedSurface` has four more: ``steps``, ``south_north`` and ``west_east`` (float32), and ``cells``,
+    their grid (west, north and cell size in m, columns, rows).
 
     ``z(u, v) = datum + A(u, v) / W(u, v)``, with u and v affine over ``bounds`` (west, south, east, north;
     m), from the knot with the number ``degree`` to the one as far from the end. Coefficients are (row, col)
@@ -42,7 +43,8 @@ def encode(surface: NurbsSurface) -> bytes:
     stepped: dict[str, NDArray[np.generic]] = {}
     if isinstance(surface, SteppedSurface):
         _, *numbers = astuple(surface.cells)
-        stepped = {"steps": surface.steps, "cells": np.asarray(numbers, np.float64)}
+        stepped = {name: getattr(surface, name) for name in STEPS}
+        stepped["cells"] = np.asarray(numbers, np.float64)
     return npz(
         {
             "version": np.int64(VERSION),
@@ -108,6 +110,10 @@ def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
         return spline
     west, north, cell, width, height = map(float, arrays["cells"])
     cells = Grid(spline.crs, west, north, cell, int(width), int(height))
-    if arrays["steps"].shape != cells.shape:
-        raise ValueError(f"steps {arrays['steps'].shape} do not fit cells {cells.shape}")
-    return SteppedSurface(**vars(spline), steps=arrays["steps"], cells=cells)
+    steps, south_north, west_east = (arrays[name] for name in STEPS)
+    shapes = steps.shape, south_north.shape, west_east.shape
+    if shapes != (cells.shape, (2, cells.width), (2, cells.height)):
+        raise ValueError(f"steps {shapes} do not fit cells {cells.shape}")
+    return SteppedSurface(
+        **vars(spline), steps=steps, cells=cells, south_north=south_north, west_east=west_east
+    )

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from flexroad.tasks.spline.stepped import Beside
     from flexroad.tasks.spline.surface import NurbsSurface
 
-VERSION = 7
+VERSION = 8
 
 REACHES_M = (25.0, 50.0, 100.0)
 """Distances from a corner or edge up to which its control points are fitted (m): the first that is enough,
@@ -105,7 +105,7 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         return surface
     problem, held = _tile_problem(data, clusters, options, frame)
     heights = _with_held(held, _minimum_of(problem, options) + problem.datum)
-    return _surface(data.core, problem.space, heights, _beside(data, clusters, options))
+    return _surface(data.core, problem.space, heights, _beside(data, clusters, options, frame))
 
 
 def fit_batch(
@@ -154,7 +154,7 @@ def tile_problem(
     problem, held = _tile_problem(data, clusters, options, frame)
     return TileProblem(
         data.core, problem.heights, problem.weight, problem.stiffness, problem.first, held, problem.datum
-    ).with_ground(_beside(data, clusters, options))
+    ).with_ground(_beside(data, clusters, options, frame))
 
 
 def solve(tiles: Sequence[TileProblem], options: Options, engine: Engine) -> list[NurbsSurface]:
@@ -202,10 +202,10 @@ def _tile_problem(
     return _problem(data, clusters, lattice, start, (0, n), (0, m), held, options), held
 
 
-def _beside(data: TileData, clusters: RoadClusters, options: Options) -> Beside | None:
+def _beside(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None) -> Beside | None:
     from flexroad.tasks.spline.stepped import ground_beside
 
-    return ground_beside(data, clusters) if options.steps else None
+    return ground_beside(data, clusters, frame) if options.steps else None
 
 
 def _surface(core: Grid, space: Space, A: Floats, beside: Beside | None) -> NurbsSurface:
@@ -257,7 +257,7 @@ def edge(
     ends: tuple[Corner, Corner],
     options: Options,
 ) -> Edge:
-    """Fit the control points that act on an edge, but on none of its corners, to the ground around it.
+    """Fit the control points that act on an edge, but on none of its corners, and find the steps on it.
 
     Parameters
     ----------
@@ -268,33 +268,33 @@ def edge(
     """
     from flexroad.tasks.meshing.road_outline import crossings
     from flexroad.tasks.roads.road_height import with_road_heights
+    from flexroad.tasks.spline.border_steps import border_steps, spline_around
     from flexroad.tasks.spline.frame import Edge, rounded
 
-    data = with_road_heights(data, clusters)
+    fitted = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     eastward = border.kind == "east"
     n, m = (lattice.intervals[0], 0) if eastward else (0, lattice.intervals[1])
-    k, j = _lines(data, clusters, border, lattice)
+    k, j = _lines(fitted, clusters, border, lattice)
     held = np.full((m + 2 * j + p, n + 2 * k + p), np.nan)
     acting = slice(j, j + m + p), slice(k, k + n + p)
     held[acting][:p, :p], held[acting][-p:, -p:] = (end.control for end in ends)
-    z = rounded(
-        _control_heights(
-            data, clusters, lattice, border.cell, (-k, n + k), (-j, m + j), held, _precise(options)
-        )[acting]
-    )
+    u, v = (-k, n + k), (-j, m + j)
+    around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, _precise(options))
+    z = rounded(around[acting])
     control = z[:, p:-p] if eastward else z[p:-p]
-    second = border.sides[1]
-    order = slice(None) if eastward else slice(None, None, -1)
+    second, order = border.sides[1], slice(None, None, 1 if eastward else -1)
     outside = np.stack([road.outside[side].ravel()[order] for side in border.sides])
     first, last = (end.outside for end in ends)
     outside[:, 0], outside[:, -1] = (first[:, 1], last[:, 0]) if eastward else (first[0], last[1])
+    spline = spline_around(lattice, border, u, v, around)
     return Edge(
         control,
         road=road.mask[second].ravel()[order],
         kept=clusters.mask[second].ravel()[order],
         outside=outside,
         crossings=crossings(road.areas, border),
+        **(border_steps(data, road, clusters, border, spline) if options.steps else {}),
     )
 
 

@@ -57,7 +57,7 @@ def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
     cells = surface.cells
     # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.
     large = np.abs(scipy.ndimage.median_filter(surface.steps, 3)) >= LEAST_M
-    # On the border of the tile there are no steps: neighbours meet in the spline.
+    # Lines end before the border of the tile: those of the neighbour need not meet them there.
     large[[0, -1]], large[:, [0, -1]] = False, False
     high = _large(large)
     corner = cells.west - cells.origin[0], cells.north - cells.origin[1]

@@ -46,6 +46,18 @@ class Edge:
     crossings: Floats
     """Where the outline of roads from vectors crosses the edge, ``(n,)``: ascending, m from the start. Empty
     if the roads are cells."""
+    steps: Floats | None = None
+    """Step of the surface on the edge at each pair of cells, ``(cells,)``, m, from west to east or south to
+    north; None if the surface has no steps (`tasks.spline.stepped`)."""
+    road_m: Floats | None = None
+    """Distance of the nearer of the two cells to the nearest road cell of the raw mask, ``(cells,)``, m; with
+    ``steps``."""
+
+    def steps_beyond(self, distance_m: float, cells: int) -> Floats:
+        """Return the steps, ``(cells,)``, m: 0 within a distance of road cells, and if there are none."""
+        if self.steps is None or self.road_m is None:
+            return np.zeros(cells)
+        return np.where(self.road_m <= distance_m, 0.0, self.steps)
 
     @property
     def inside(self) -> Bools:
@@ -81,6 +93,21 @@ class Frame:
         heights[:q, p:-p], heights[-q:, p:-p] = self.south.control, self.north.control
         heights[q:-q, :p], heights[q:-q, -p:] = self.west.control, self.east.control
         return heights
+
+    def steps(self, shape: tuple[int, int], beyond_m: float = 0.0) -> tuple[Floats, Floats]:
+        """Return the steps of a tile's surface on its border, 0 up to a distance from road cells, m.
+
+        Returns
+        -------
+        south_north : ndarray, (2, W)
+            On the southern and the northern edge, from west to east.
+        west_east : ndarray, (2, H)
+            On the western and the eastern edge, from north to south.
+        """
+        rows, cols = shape
+        south_north = [edge.steps_beyond(beyond_m, cols) for edge in (self.south, self.north)]
+        west_east = [edge.steps_beyond(beyond_m, rows)[::-1] for edge in (self.west, self.east)]
+        return np.stack(south_north), np.stack(west_east)
 
     def outside(self, cells: Bools) -> Bools:
         """Return the cells of the tile beyond the survey, ``(H, W)``; those along the edges are as these say.

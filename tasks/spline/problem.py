@@ -52,22 +52,30 @@ class TileProblem:
     """Heights above sea level that control points keep, ``(m, n)``, m; NaN where they are fitted."""
     datum: float
     beside: Bools | None = None
-    """This and the next two are the arrays of `ground`; None for a surface without steps."""
+    """This and the next four are the arrays of `ground`; None for a surface without steps."""
     beside_dsm: Floats | None = None
     beside_dtm: Floats | None = None
+    south_north: Floats | None = None
+    west_east: Floats | None = None
 
     @property
     def ground(self) -> Beside | None:
         """The heights beside the streets."""
-        if self.beside is None or self.beside_dsm is None or self.beside_dtm is None:
-            return None
-        return Beside(self.beside, self.beside_dsm, self.beside_dtm)
+        arrays = self.beside, self.beside_dsm, self.beside_dtm, self.south_north, self.west_east
+        return None if any(array is None for array in arrays) else Beside(*arrays)  # type: ignore[arg-type]
 
     def with_ground(self, ground: Beside | None) -> TileProblem:
         """Return the problem with heights beside the streets."""
         if ground is None:
             return self
-        return replace(self, beside=ground.cells, beside_dsm=ground.dsm, beside_dtm=ground.dtm)
+        return replace(
+            self,
+            beside=ground.cells,
+            beside_dsm=ground.dsm,
+            beside_dtm=ground.dtm,
+            south_north=ground.south_north,
+            west_east=ground.west_east,
+        )
 
     def on(self, space: Space) -> Problem:
         """Return the loss over the splines of the tile."""

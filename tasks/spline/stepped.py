@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.spline.between import between
+from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, Surface, TileData
 
@@ -41,37 +42,56 @@ ROUNDING_M = 1e-6
 class SteppedSurface(NurbsSurface):
     """A spline, and the steps of cells above it; the slope and the normal are the spline's.
 
-    On the border of the tile, where neighbours meet, the height is the spline's.
+    The border of the tile has steps of its own, which its neighbours have, too. In its corners the height is
+    the spline's.
     """
 
     steps: NDArray[np.float32]
     """Height of the ground above the spline, ``(H, W)``, m; 0 on the road."""
     cells: Grid
     """The cells of the steps."""
+    south_north: NDArray[np.float32]
+    """Steps on the southern and the northern border, ``(2, W)``, m, from west to east."""
+    west_east: NDArray[np.float32]
+    """Steps on the western and the eastern border, ``(2, H)``, m, from north to south."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
-        west, south, east, north = self.cells.exact_bounds
-        inside = _between(easting, west, east) & _between(northing, south, north)
-        steps = self.steps[self.cells.cells(easting, northing)]
-        return np.asarray(self.smooth(easting, northing) + np.where(inside, steps, 0.0))
+        return np.asarray(self.smooth(easting, northing) + self._steps_at(easting, northing))
 
     def smooth(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights of the spline (m) at scattered points, in their broadcast shape."""
         return super().height(easting, northing)
 
-    def without_steps_near(self, cells: Bools, distance_m: float) -> SteppedSurface:
-        """Return the surface without the steps within a distance of the given cells, ``(H, W)``."""
-        near = within(cells, self.cells.cell, distance_m)
-        return replace(self, steps=np.where(near, np.float32(0), self.steps))
+    def without_steps_near(
+        self, road: Bools, distance_m: float, frame: Frame | None = None
+    ) -> SteppedSurface:
+        """Return the surface without the steps within a distance of the given road cells, ``(H, W)``."""
+        near = within(road, self.cells.cell, distance_m)
+        rim = (
+            frame.steps(self.cells.shape, distance_m) if frame else (0 * self.south_north, 0 * self.west_east)
+        )
+        south_north, west_east = (steps.astype(np.float32) for steps in rim)
+        steps = np.where(near, np.float32(0), self.steps)
+        return replace(self, steps=steps, south_north=south_north, west_east=west_east)
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
-        row, col = self.cells.cells(eastings, northings)
-        west, south, east, north = self.cells.exact_bounds
-        inside = _between(northings, south, north)[:, None] & _between(eastings, west, east)
-        steps = np.where(inside, self.steps[np.ix_(row, col)], 0.0)
+        steps = self._steps_at(np.asarray(eastings), np.asarray(northings)[:, None])
         return np.asarray(super().lattice(eastings, northings) + steps)
+
+    def _steps_at(self, easting: Floats, northing: Floats) -> Floats:
+        """Return the steps (m) at points, in their broadcast shape; 0 in corners and beyond the tile."""
+        (west, south, east, north), cells = self.cells.exact_bounds, self.cells
+        # Two tiles count from edges that differ by rounding, and must find the same cell along their border.
+        nudge = ROUNDING_M
+        row, col = cells.cells(np.asarray(easting) + nudge, np.asarray(northing) - nudge)
+        across, along = _between(easting, west, east), _between(northing, south, north)
+        steps = np.where(across & along, self.steps[row, col], 0.0)
+        for k, (edge, side) in enumerate(((south, west), (north, east))):
+            steps = np.where(across & _equal(northing, edge), self.south_north[k][col], steps)
+            steps = np.where(along & _equal(easting, side), self.west_east[k][row], steps)
+        return steps
 
 
 def without_steps(surface: Surface) -> Surface:
@@ -91,10 +111,17 @@ class Beside:
     """DSM of those near the road or a wall (m), by the heights that roads are fitted to; else NaN."""
     dtm: Floats
     """DTM of the cells (m); else NaN."""
+    south_north: Floats
+    """Steps on the southern and the northern border, ``(2, W)``, m, from west to east."""
+    west_east: Floats
+    """Steps on the western and the eastern border, ``(2, H)``, m, from north to south."""
 
 
-def ground_beside(data: TileData, clusters: RoadClusters) -> Beside | None:
-    """Return the heights beside the streets of a tile, None if the filter gives no such cells."""
+def ground_beside(data: TileData, clusters: RoadClusters, frame: Frame | None = None) -> Beside | None:
+    """Return the heights beside the streets of a tile, None if the filter gives no such cells.
+
+    Without a frame there are no steps on the border.
+    """
     from flexroad.tasks.roads.road_height import ground_heights
 
     if clusters.beside is None:
@@ -106,12 +133,19 @@ def ground_beside(data: TileData, clusters: RoadClusters) -> Beside | None:
     low, high = _around_dtm(data.dtm[window])
     preferred = near | (high - low >= WALL_M) | (np.abs(dsm - data.dtm[window]) >= WALL_M)
     dtm = np.where(cells, data.dtm[window], np.nan)
-    return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm)
+    rows, cols = cells.shape
+    border = frame.steps(cells.shape) if frame else (np.zeros((2, cols)), np.zeros((2, rows)))
+    return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm, *border)
 
 
 def _between(values: Floats, low: float, high: float) -> Bools:
     """Return which values are between two others and not equal to one of them, but for rounding."""
     return np.asarray((values > low + ROUNDING_M) & (values < high - ROUNDING_M))
+
+
+def _equal(values: Floats, edge: float) -> Bools:
+    """Return which values are equal to another one, but for rounding."""
+    return np.asarray(np.abs(values - edge) <= ROUNDING_M)
 
 
 def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurface:
@@ -131,7 +165,14 @@ def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurf
     steps[near] = np.where(np.abs(walls) >= WALL_M, walls, smoothed[near])
     steps[shown] = _alike(around[shown[near]], rise[shown])
     filled = between(steps, beside.cells)
-    return SteppedSurface(**vars(surface), steps=filled.astype(np.float32), cells=core)
+    south_north, west_east = (border.astype(np.float32) for border in (beside.south_north, beside.west_east))
+    return SteppedSurface(
+        **vars(surface),
+        steps=filled.astype(np.float32),
+        cells=core,
+        south_north=south_north,
+        west_east=west_east,
+    )
 
 
 def _alike(around: Floats, own: Floats) -> Floats:

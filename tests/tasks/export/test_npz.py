@@ -33,8 +33,13 @@ def surface(unit_weights: bool = False) -> NurbsSurface:
 
 def stepped() -> SteppedSurface:
     cells = Grid("EPSG:25832", WEST, SOUTH + 249.0, 1.0, 249, 249)
-    steps = np.random.default_rng(4).normal(size=cells.shape).astype(np.float32)
-    return SteppedSurface(**vars(surface()), steps=steps, cells=cells)
+    rng = np.random.default_rng(4)
+    steps, south_north, west_east = (
+        rng.normal(size=shape).astype(np.float32) for shape in (cells.shape, (2, 249), (2, 249))
+    )
+    return SteppedSurface(
+        **vars(surface()), steps=steps, cells=cells, south_north=south_north, west_east=west_east
+    )
 
 
 def test_decode_returns_steps():
@@ -42,8 +47,11 @@ def test_decode_returns_steps():
     restored = npz.decode(npz.encode(original))
     assert isinstance(restored, SteppedSurface)
     assert restored.cells == original.cells
-    x, y = WEST + np.linspace(0, 249, 300), SOUTH + np.linspace(0, 249, 300)
-    np.testing.assert_array_equal(restored.height(x, y), original.height(x, y))
+    along = np.linspace(0, 249, 300)
+    for x, y in ((along, along), (along, 0), (along, 249), (0, along), (249, along)):
+        np.testing.assert_array_equal(
+            restored.height(WEST + x, SOUTH + y), original.height(WEST + x, SOUTH + y)
+        )
 
 
 @pytest.mark.parametrize("from_file", [False, True])
@@ -102,7 +110,11 @@ def encoded_with(of=None, **fields) -> bytes:
         (b"no zip at all", "not a FlexRoad surface"),
         (npz.encode(surface())[:-200], "not a FlexRoad surface"),
         (encoded_with(W=None), "not a FlexRoad surface.*W"),
-        (encoded_with(stepped(), steps=np.zeros((3, 3))), r"steps \(3, 3\) do not fit cells \(249, 249\)"),
+        (
+            encoded_with(stepped(), steps=np.zeros((3, 3))),
+            r"steps \(\(3, 3\), .* do not fit cells \(249, 249\)",
+        ),
+        (encoded_with(stepped(), west_east=np.zeros((2, 9))), r"steps .*\(2, 9\)\) do not fit cells"),
         (encoded_with(stepped(), cells=None), "not a FlexRoad surface.*cells"),
         (encoded_with(A=np.zeros((9, 11))), r"\(9, 11\).*\(9, 12\)"),
         (encoded_with(version=np.int64(npz.VERSION + 1)), "version 3, this program reads up to 2"),

@@ -114,6 +114,7 @@ def test_steps_beside_roads_are_of_every_cell_and_exactly_none_on_the_road():
     knots = np.array([0.0, 0, 1, 1])
     spline = {"crs": cells.crs, "bounds": cells.exact_bounds, "degree": (1, 1), "datum": 0.0}
     spline |= {"knots_u": knots, "knots_v": knots, "A": np.ones((2, 2)), "W": np.ones((2, 2))}
+    spline |= {"south_north": np.zeros((2, cells.width)), "west_east": np.zeros((2, cells.height))}
     surface = SteppedSurface(**spline, origin=cells.origin, steps=steps, cells=cells)
     packed = content(encode_tile(scene(cells, surface=surface)))["steps"]
     assert (packed["grid"]["rows"], packed["grid"]["cols"]) == cells.shape

@@ -20,6 +20,7 @@ def level(steps) -> SteppedSurface:
     spline = {"crs": CELLS.crs, "bounds": CELLS.exact_bounds, "degree": (1, 1), "datum": 0.0}
     spline |= {"knots_u": knots, "knots_v": knots, "A": np.full((2, 2), 100.0), "W": np.ones((2, 2))}
     steps = np.asarray(steps, np.float32)
+    spline |= {"south_north": np.zeros((2, CELLS.width)), "west_east": np.zeros((2, CELLS.height))}
     return SteppedSurface(**spline, origin=CELLS.origin, steps=steps, cells=CELLS)
 
 

@@ -1,0 +1,151 @@
+"""The ground beside a road goes on across the border of two tiles, at equal heights in both."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from flexroad.catalog.borders import border_of
+from flexroad.catalog.grid import Grid
+from flexroad.pipeline.graph.borders import ENDS
+from flexroad.pipeline.store import codec
+from flexroad.tasks import sample
+from flexroad.tasks.fit import smoothing_spline
+from flexroad.tasks.metrics.mesh_check import check
+from flexroad.tasks.spline.batch import Engine
+from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.types import RoadClusters, RoadMask, TileData
+
+SIZE, AROUND_M, STEP_M = 60, 40, 0.3
+TILES = [Grid("EPSG:25832", 500000.0 + SIZE * k, 5600060.0, 1.0, SIZE, SIZE) for k in (0, 1)]
+EDGE = TILES[1].west
+WORLD = Grid("EPSG:25832", 499950.0, 5600110.0, 1.0, 220, 160)
+OPTIONS = smoothing_spline.Options()
+ALONG = {
+    "across the edge": lambda x, y: np.abs(y - 5600030) < 5,
+    "beside the edge": lambda x, y: (x > EDGE) & (x < EDGE + 8),
+}
+"""Where the road is."""
+
+
+def ground(x, y, where):
+    """The true height: a level road, and ground above it beside."""
+    return 100 + np.where(ALONG[where](x, y), 0.0, STEP_M)
+
+
+@cache
+def world(where):
+    x, y = np.meshgrid(WORLD.eastings, WORLD.northings)
+    road = ALONG[where](x, y)
+    away = distance_transform_edt(~road)
+    dsm = ground(x, y, where) + 0.01 * np.random.default_rng(0).standard_normal(WORLD.shape)
+    beside = ~road & (away < 9)
+    return dsm, ground(x, y, where), road, ~road & (away < 6), beside
+
+
+def part(where, grid, core):
+    window = WORLD.window(grid)
+    dsm, dtm, road, verge, beside = (values[window] for values in world(where))
+    data = TileData("t", grid, core, dsm, dtm)
+    mask = RoadMask(grid, core, road, np.zeros_like(road))
+    return data, mask, RoadClusters(grid, road.astype(np.int32), verge, beside)
+
+
+@cache
+def frame_of(where, tile):
+    parts = []
+    for number, border in enumerate(border_of(tile, AROUND_M)):
+        data, mask, clusters = part(where, border.grid, border.grid)
+        if number < 4:
+            parts.append(smoothing_spline.corner(data, mask, clusters, border, OPTIONS))
+        else:
+            ends = [parts[end] for end in ENDS[number - 4]]
+            parts.append(smoothing_spline.edge(data, mask, clusters, border, ends, OPTIONS))
+    return Frame(*parts)
+
+
+@cache
+def fitted(where, number):
+    tile = TILES[number]
+    data, _, clusters = part(where, tile.buffered(20), tile)
+    return smoothing_spline.fit(data, clusters, OPTIONS, frame_of(where, tile))
+
+
+ON_EDGE = 5600000 + np.linspace(0, SIZE, 10 * SIZE + 1)
+
+
+@pytest.mark.parametrize("where", ALONG)
+def test_heights_of_neighbours_on_their_edge_have_the_same_bits(where):
+    west, east = (fitted(where, number).height(EDGE, ON_EDGE) for number in (0, 1))
+    assert west.tobytes() == east.tobytes()
+    lattices = [fitted(where, number).lattice(np.array([EDGE]), ON_EDGE)[:, 0] for number in (0, 1)]
+    np.testing.assert_allclose(lattices, [west, east], rtol=0, atol=1e-9)
+
+
+def test_ground_goes_on_across_the_edge():
+    surface, y = fitted("across the edge", 0), 5600000 + np.arange(1, SIZE - 1) + 0.5
+    true = ground(EDGE, y, "across the edge")
+    near = np.abs(y - 5600030) < 12
+    assert np.abs(surface.height(EDGE, y) - true)[near].max() < 0.05
+    assert np.abs(surface.smooth(EDGE, y) - true)[near].max() > 0.2
+    on_road = ALONG["across the edge"](EDGE, y)
+    assert np.array_equal(surface.height(EDGE, y)[on_road], surface.smooth(EDGE, y)[on_road])
+
+
+def test_edge_of_a_road_along_the_border_is_not_moved():
+    surface = fitted("beside the edge", 0)
+    assert surface.steps[:, -1].mean() == pytest.approx(STEP_M, abs=0.05)
+    assert np.array_equal(surface.height(EDGE, ON_EDGE), surface.smooth(EDGE, ON_EDGE))
+
+
+def test_corners_have_the_height_of_the_spline():
+    surface = fitted("across the edge", 0)
+    west, south, east, north = TILES[0].bounds
+    x, y = np.array([west, east, west, east]), np.array([south, south, north, north])
+    assert np.array_equal(surface.height(x, y), surface.smooth(x, y))
+
+
+@pytest.mark.parametrize("method", ["dynamic", "adaptive", "uniform"])
+def test_meshes_meet_with_steps_away_from_the_road(method):
+    found = []
+    for number, tile in enumerate(TILES):
+        _, mask, clusters = part("across the edge", tile.buffered(20), tile)
+        options = sample.Options(method=method)
+        surface = fitted("across the edge", number)
+        mesh = sample.sample(surface, mask, clusters, options, frame_of("across the edge", tile))
+        check(mesh)
+        points = mesh.vertices + mesh.origin
+        found.append(points[points[:, 0] == EDGE][:, 1:])
+    west, east = (points[np.argsort(points[:, 0])] for points in found)
+    assert np.array_equal(west, east)
+    y, z = west.T
+    np.testing.assert_allclose(np.interp([5600020, 5600040], y, z), 100 + STEP_M, rtol=0, atol=0.05)
+    near = np.abs(y - 5600030) < 6
+    np.testing.assert_allclose(z[near], fitted("across the edge", 0).smooth(EDGE, y[near]), rtol=0, atol=2e-4)
+
+
+def test_batch_has_the_same_steps_on_the_border():
+    tile = TILES[0]
+    data, _, clusters = part("across the edge", tile.buffered(20), tile)
+    frame = frame_of("across the edge", tile)
+    problem, _ = codec.decode(codec.encode(smoothing_spline.tile_problem(data, clusters, OPTIONS, frame), {}))
+    (batched,) = smoothing_spline.solve([problem], OPTIONS, Engine())
+    assert batched.west_east.any()
+    assert np.array_equal(batched.west_east, fitted("across the edge", 0).west_east)
+
+
+def test_edge_is_stored_without_loss():
+    edge = frame_of("across the edge", TILES[0]).east
+    restored, _ = codec.decode(codec.encode(edge, {}))
+    assert np.array_equal(restored.steps, edge.steps)
+    assert np.array_equal(restored.road_m, edge.road_m)
+
+
+def test_edge_without_steps_has_none():
+    tile = TILES[0]
+    border = border_of(tile, AROUND_M)[7]
+    data, mask, clusters = part("across the edge", border.grid, border.grid)
+    ends = frame_of("across the edge", tile).south_east, frame_of("across the edge", tile).north_east
+    options = OPTIONS.model_copy(update={"steps": False})
+    assert smoothing_spline.edge(data, mask, clusters, border, ends, options).steps is None
