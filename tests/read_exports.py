@@ -41,17 +41,30 @@ def _heights(city, places, part):
 
 def off_surface(city, points):
     """How far points, ``(n, 3)``, are above or below the surface, with or without steps beside roads."""
-    # A vertex at the corner of cells has the step of one of them, and rounding may move it to another.
+    # A vertex at the corner of cells or on a border of tiles has the step of one of them, and rounding may
+    # move it to another.
     corners = [(0.0, 0.0), *((x, y) for x in (-SAME_M, SAME_M) for y in (-SAME_M, SAME_M))]
     here = spline_heights(city, points[:, :2])
     heights = [here]
     for corner in corners:
         moved = points[:, :2] + corner
-        spline = spline_heights(city, moved)
-        # Just outside the run, the height is that of the border.
-        heights.append(np.where(np.isnan(here), spline, here))
-        heights.append(heights[-1] + true_heights(city, moved) - spline)
+        for place in (moved, on_borders(city, moved)):
+            spline = spline_heights(city, place)
+            # Just outside the run, the height is that of the border.
+            heights.append(np.where(np.isnan(here), spline, here))
+            heights.append(heights[-1] + true_heights(city, place) - spline)
     return np.nanmin(np.abs(points[:, 2] - np.array(heights)), axis=0)
+
+
+def on_borders(city, places):
+    """The places, ``(n, 2)``, with those near a border of tiles moved onto it."""
+    bounds = np.array([tile.tile.grid.exact_bounds for tile in select(city).finished()])
+    moved = places.copy()
+    for axis in (0, 1):
+        for border in np.unique(bounds[:, [axis, axis + 2]]):
+            near = np.abs(moved[:, axis] - border) <= 2 * SAME_M
+            moved[near, axis] = border
+    return moved
 
 
 def landxml(path):
