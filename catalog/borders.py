@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
 
@@ -58,6 +61,17 @@ class Border:
             return (rows, slice(col - 1, col)), (rows, slice(col, col + 1))
         cols = slice(col, col + width) if self.kind == "east" else slice(col - 1, col + 1)
         return (slice(row - 1, row), cols), (slice(row, row + 1), cols)
+
+    def along(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of the cells on both sides of an edge, ``(2, n)``, ordered from its start.
+
+        Parameters
+        ----------
+        values : ndarray, (H, W)
+            The values of all cells of `grid`.
+        """
+        order = slice(None, None, 1 if self.kind == "east" else -1)
+        return np.stack([values[side].ravel()[order] for side in self.sides])
 
 
 def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:

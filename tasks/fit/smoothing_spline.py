@@ -283,15 +283,14 @@ def edge(
     around = _control_heights(fitted, clusters, lattice, border.cell, u, v, held, _precise(options))
     z = rounded(around[acting])
     control = z[:, p:-p] if eastward else z[p:-p]
-    second, order = border.sides[1], slice(None, None, 1 if eastward else -1)
-    outside = np.stack([road.outside[side].ravel()[order] for side in border.sides])
+    outside = border.along(road.outside)
     first, last = (end.outside for end in ends)
     outside[:, 0], outside[:, -1] = (first[:, 1], last[:, 0]) if eastward else (first[0], last[1])
     spline = spline_around(lattice, border, u, v, around)
     return Edge(
         control,
-        road=road.mask[second].ravel()[order],
-        kept=clusters.mask[second].ravel()[order],
+        road=border.along(road.mask)[1],
+        kept=border.along(clusters.mask)[1],
         outside=outside,
         crossings=crossings(road.areas, border),
         **(border_steps(data, road, clusters, border, spline) if options.steps else {}),

@@ -58,22 +58,22 @@ def border_steps(
     beside = ground_beside(part, RoadClusters(grid, clusters.labels[strip], None, clusters.beside[strip]))
     if beside is None:
         return {}
-    found, has_step = np.zeros((2, *data.grid.shape))
-    found[strip], has_step[strip] = with_steps(beside, spline, grid).steps, beside.cells
-    first, second = (found[side].ravel() for side in border.sides)
-    both = np.logical_and(*(has_step[side].ravel() for side in border.sides))
-    away = [_to_road(road, side) for side in border.sides]
-    order = slice(None) if border.kind == "east" else slice(None, None, -1)
-    steps = np.where(both, (first + second) / 2, 0.0)
-    return {"steps": rounded(steps)[order], "road_m": np.minimum(*away)[order]}
+    steps, has_step = np.zeros((2, *data.grid.shape))
+    steps[strip], has_step[strip] = with_steps(beside, spline, grid).steps, beside.cells
+    both = border.along(has_step).all(axis=0)
+    mean = np.where(both, border.along(steps).sum(axis=0) / 2, 0.0)
+    return {"steps": rounded(mean), "road_m": border.along(_to_road(road, border)).min(axis=0)}
 
 
 def _widened(first: slice, last: slice, reach: int, count: int) -> slice:
     return slice(max(first.start - reach, 0), min(last.stop + reach, count))
 
 
-def _to_road(road: RoadMask, side: tuple[slice, slice]) -> Floats:
-    """Return the distance of cells to the nearest road cell, ``(n,)``, m."""
-    along = np.zeros_like(road.mask)
-    along[side] = True
-    return distances(along, road.mask) * road.grid.cell
+def _to_road(road: RoadMask, border: Border) -> Floats:
+    """Return the distance of the cells beside an edge to the nearest road cell, ``(H, W)``, m; else inf."""
+    beside = np.zeros_like(road.mask)
+    for side in border.sides:
+        beside[side] = True
+    away = np.full(beside.shape, np.inf)
+    away[beside] = distances(beside, road.mask) * road.grid.cell
+    return away

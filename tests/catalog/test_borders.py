@@ -61,3 +61,16 @@ def test_border_sides_are_cells_along_it(number):
     np.testing.assert_allclose(second[across], start - sign * 0.5)
     along = border.start[1 - across] - (1 if border.kind == "corner" else 0)
     np.testing.assert_allclose(np.sort(first[1 - across].ravel()), along + 0.5 + np.arange(length))
+
+
+def test_along_edges_has_cells_of_both_sides_from_the_start():
+    here = tile(0, 0)
+    for border in border_of(here, 20)[4:]:
+        eastings, northings = np.meshgrid(border.grid.eastings, border.grid.northings)
+        x, y = border.along(eastings), border.along(northings)
+        if border.kind == "east":
+            np.testing.assert_allclose(x, [here.eastings] * 2)
+            np.testing.assert_allclose(y[:, 0] - border.start[1], [0.5, -0.5])
+        else:
+            np.testing.assert_allclose(y, [here.northings[::-1]] * 2)
+            np.testing.assert_allclose(x[:, 0] - border.start[0], [-0.5, 0.5])
