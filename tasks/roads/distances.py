@@ -52,7 +52,8 @@ def _within(mask: Bools, reach: float) -> Bools:
     rows, cols = mask.shape
     aside, near, most = columns_aside(mask), np.zeros((rows, cols), np.bool_), min(int(reach), rows - 1)
     for down in range(-most, most + 1):
-        wide = int(math.sqrt(reach**2 - down**2))
+        # A row without a cell of the mask is further away than any column, not than any reach.
+        wide = min(int(math.sqrt(reach**2 - down**2)), cols - 1)
         for r in range(max(down, 0), min(rows + down, rows)):
             for c in range(cols):
                 near[r, c] |= abs(aside[r - down, c]) <= wide

@@ -40,6 +40,14 @@ def test_filled_raster_without_any_value_stays_empty():
     assert np.isnan(filled(np.full((3, 4), np.nan))).all()
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 1)])
+def test_within_a_reach_beyond_the_grid_needs_a_cell_of_the_mask(shape):
+    mask = np.zeros(shape, bool)
+    assert not within(mask, 1.0, 50.0).any()
+    mask[0, 0] = True
+    assert within(mask, 1.0, 50.0).all()
+
+
 @given(MASKS, st.sampled_from([1.0, 0.5, 0.2, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0, 2.5]))
 @settings(deadline=None)
 def test_within_measures_between_cell_centres(mask, cell, reach):
