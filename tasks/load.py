@@ -306,7 +306,8 @@ def _window(
     """Return the part of a file that covers a grid, None if there is none; see `_mosaic`."""
     from rasterio.enums import Resampling
 
-    from flexroad.tasks.io.raster import OtherCrs, read_window
+    from flexroad.tasks.io.raster import read_window
+    from flexroad.tasks.io.raster_header import OtherCrs
 
     heights = layer.name in HEIGHTS
     together = Resampling.average if heights else Resampling.mode

@@ -19,8 +19,9 @@ from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import LayerMissing, TaskError
-from flexroad.tasks.io.raster import Unreadable, opened, place
+from flexroad.tasks.io.raster import Unreadable, opened
 from flexroad.tasks.io.raster_grid import RasterGrid
+from flexroad.tasks.io.raster_header import place
 from flexroad.tasks.types import Bools, Orthophoto, Source
 
 BITS = {"uint8": 8, "uint16": 16}

@@ -9,32 +9,29 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rasterio.enums import MaskFlags, Resampling
+from rasterio.enums import Resampling
 from rasterio.io import MemoryFile
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import reproject
 from rasterio.windows import Window
 
-from flexroad.catalog.crs import bounds_in, in_plan, same, short
-from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.crs import short
+from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
+from flexroad.catalog.headers.raster_faults import heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import Location, is_remote, stat
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.raster_grid import RasterGrid
+from flexroad.tasks.io.raster_header import header, place
 from flexroad.tasks.types import Floats
 
 EXACT = 1e-9
 """Largest error of transformed positions, in cells; GDAL interpolates them with 0.125 by default, and takes 0
 for no value."""
-
-
-class OtherCrs(TaskError):
-    """A file is in another CRS than the grid that it overlaps."""
 
 
 class Unreadable(TaskError):
@@ -129,7 +126,7 @@ def read_window(
         step = lattice.step_for(grid)
         slices = lattice.whole_steps(step, *slices)
         values, unit = _values(src, lattice, step, slices, resampling), src.units[0] or ""
-        crs = src.crs.to_wkt() if src.crs else crs
+        crs = header(src).crs or crs
     return RasterWindow(name, str(path), values, lattice.cut(*slices).coarser(step), unit, crs, step=step)
 
 
@@ -298,58 +295,6 @@ def misalignment(lattice: RasterGrid, grid: Grid) -> str:
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
 
 
-def place(
-    src: Any,
-    path: Location,
-    name: str,
-    grid: Grid,
-    core: Grid,
-    crs: str | None,
-    reproject: bool = False,
-) -> RasterGrid | None:
-    """Return the lattice of a file, or None if it is in another CRS and outside the grid; see `read_window`.
-
-    Raises
-    ------
-    TaskError
-        If the file is rotated, overlaps the grid in another CRS, or its position is unknown.
-    """
-    transform = src.transform
-    if transform.is_identity:
-        if src.shape == core.shape:
-            return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
-        raise TaskError(
-            f"{name} has no georeference and has {src.width} x {src.height} cells, "
-            f"the tile {core.width} x {core.height}; give it a world file",
-            str(path),
-        )
-    fault = georeference_fault(src)
-    if fault:
-        raise TaskError(f"{name} {fault}", str(path))
-    if transform.b or transform.d:
-        raise TaskError(f"{name} is rotated; turn it north up with gdalwarp", str(path))
-    lattice = RasterGrid.of(transform, src.width, src.height)
-    file_crs = src.crs.to_wkt() if src.crs else crs
-    if file_crs is None:
-        raise TaskError(f"{name} has no CRS; build the catalog again with --crs", str(path))
-    if same(file_crs, grid.crs):
-        return lattice
-    if not _overlap(bounds_in(grid.crs, file_crs, lattice.bounds), grid.bounds):
-        return None
-    if reproject:
-        return replace(lattice, crs=in_plan(file_crs))
-    raise OtherCrs(
-        f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
-        f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}, or make the catalog with --reproject",
-        str(path),
-    )
-
-
-def _overlap(a: Bounds, b: Bounds) -> bool:
-    # Written so that bounds that cannot be transformed (inf, NaN) count as overlapping: they are an error.
-    return not (a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1])
-
-
 def _values(
     src: Any, lattice: RasterGrid, step: int, slices: tuple[slice, slice], resampling: Resampling
 ) -> Floats:
@@ -378,9 +323,9 @@ def _part(
     values: Floats = src.read(1, **how).astype(np.float64)
     if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
         values = values * src.scales[0] + src.offsets[0]
+    has_nan, all_valid = header(src).nan_is_nodata, header(src).all_valid
     # Cells whose nodata value is NaN are NaN already.
-    is_nan = step == 1 and src.mask_flag_enums[0] == [MaskFlags.nodata] and math.isnan(src.nodata)
-    if not is_nan and MaskFlags.all_valid not in src.mask_flag_enums[0]:
+    if not all_valid and not (has_nan and step == 1):
         how |= {"resampling": Resampling.mode} if step > 1 else {}
         values[src.read_masks(1, **how) == 0] = np.nan
     return values[::-1] if lattice.northward else values

@@ -30,8 +30,8 @@ def between(values: Floats, cells: Bools) -> Floats:
     given, cells, unknown = np.pad(values, 1), np.pad(cells, 1), np.pad(unknown, 1)
     row, col = np.nonzero(unknown)
     number = np.full(given.shape, -1)
-    number[row, col] = np.arange(row.size)
-    degree, right, parts = np.full(row.size, HELD), np.zeros(row.size), []
+    number[row, col] = own = np.arange(row.size)
+    degree, right, joints = np.full(row.size, HELD), np.zeros(row.size), []
     for down, east in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         place = row + down, col + east
         known = cells[place] & ~unknown[place]
@@ -39,8 +39,8 @@ def between(values: Floats, cells: Bools) -> Floats:
         degree[known] += 1
         degree[joined] += 1
         right[known] += given[place][known]
-        parts.append((joined, number[place][joined]))
-    rows, cols = (np.concatenate(ends) for ends in zip(*parts, strict=True))
-    matrix = sparse.diags(degree) - sparse.coo_matrix((np.ones(rows.size), (rows, cols)), 2 * (row.size,))
-    given[row, col] = spsolve(matrix.tocsc(), right)
+        joints.append((joined, number[place][joined], np.full(joined.size, -1.0)))
+    rows, cols, weights = (np.concatenate(part) for part in zip((own, own, degree), *joints, strict=True))
+    matrix = sparse.csc_matrix((weights, (rows, cols)), 2 * (row.size,))
+    given[row, col] = spsolve(matrix, right)
     return given[1:-1, 1:-1]
