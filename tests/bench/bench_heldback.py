@@ -11,14 +11,15 @@ within the 90% interval, and how many of the worst tenth are among the tenth wit
 
 Small places have few such squares, so they are run with several draws of them (`DRAWN`), pooled.
 
-Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...]``; each NAME is a
-further configuration, production with options: ``--set soft=fit.bending_m3=20``. Real places need
-FLEXROAD_REAL_DATA.
+Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
+each NAME is a further configuration, production with options: ``--set soft=fit.bending_m3=20``. Another
+number of the first draw gives other squares and other made scenes. Real places need FLEXROAD_REAL_DATA.
 Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import tempfile
@@ -44,7 +45,7 @@ from flexroad.tasks.synthetic import SceneOptions, make_scene
 from flexroad.tasks.synthetic.points import DECK, GROUND, scan
 from flexroad.tasks.types import Bools, Floats
 
-SIDE_M, SHARE, SEED = 5.0, 0.06, 7
+SIDE_M, SHARE, FIRST = 5.0, 0.06, 7
 """Side of the squares, the share of them that is withheld, and the number of the first draw."""
 DRAWN = {"IGN": 6, "Brighton Beach": 6}
 """Number of draws of a place, else 1."""
@@ -231,11 +232,11 @@ def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path, draw: 
 
 
 def made(stratum: str, folder: Path, draw: int) -> Place:
-    """Withhold points of a made scan of two by two tiles; the true surface is the truth."""
+    """Withhold points of a made scan of two by two tiles, a scene for each draw; truth is its surface."""
     whole = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
     options = SceneOptions(dsm_noise_m=(0.0, 0.0))
-    scene = make_scene(whole, SEED, stratum, options)
-    points = scan(scene, per_m2=8, noise_m=0.03, seed=SEED)
+    scene = make_scene(whole, draw, stratum, options)
+    points = scan(scene, per_m2=8, noise_m=0.03, seed=draw)
     left = rasterise(points[~squares(points.easting, points.northing, draw)[1]], whole, Options(), None)
     layers = {
         "dsm": left.dsm, "dtm": left.dtm, "road_height": left.top.height, "road_mask": scene.road_mask,
@@ -414,24 +415,27 @@ def compare(name: str, places: Sequence[Place], folder: Path, configs: Configs) 
                 print(f"{title} L2 of production minus {other} {mean_of(change, group)}", flush=True)
 
 
-def main(words: list[str]) -> None:
-    given = [words[k + 1] for k, word in enumerate(words) if word == "--set"]
-    names = [word for k, word in enumerate(words) if word != "--set" and (not k or words[k - 1] != "--set")]
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("places", nargs="*", metavar="PLACE", help="names of places; all by default")
+    parser.add_argument("--set", action="append", default=[], help="NAME=OPTION=VALUE of a configuration")
+    parser.add_argument("--draw", type=int, default=FIRST, help="number of the first draw")
+    chosen = parser.parse_args()
     configs: Configs = dict(CONFIGS)
-    for text in given:
+    for text in chosen.set:
         name, _, option = text.partition("=")
         configs[name] = ("production", (*configs.get(name, ("", ()))[1], option))
     data = os.environ.get("FLEXROAD_REAL_DATA")
     there = places(Path(data) if data else None, Path(__file__).parents[1] / "real" / "roads")
-    for name in names or there:
+    for name in chosen.places or there:
         with tempfile.TemporaryDirectory() as scratch:
             folders = [Path(scratch) / f"draw {number}" for number in range(DRAWN.get(name, 1))]
             made_places = []
             for number, folder in enumerate(folders):
                 folder.mkdir()
-                made_places.append(there[name](folder, SEED + number))
+                made_places.append(there[name](folder, chosen.draw + number))
             compare(name, made_places, Path(scratch), configs)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
