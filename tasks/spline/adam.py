@@ -72,10 +72,11 @@ def minimise(
     mean, variance = np.zeros(start.size), np.zeros(start.size)
     limits = np.broadcast_to(limit, start.shape).ravel()
     losses: list[float] = []
+    lowest = math.inf
     while True:
         loss, gradient = objective(variables)
-        if not losses or loss < min(losses):
-            best = variables.copy()
+        if loss < lowest or not losses:
+            lowest, best = loss, variables.copy()
         losses.append(loss)
         if schedule.has_finished(losses):
             return (variables if schedule.last else best), losses

@@ -45,7 +45,7 @@ class Objective:
 
     def __call__(self, variables: Floats) -> tuple[float, Floats]:
         """Return the loss (m) and its gradient at ``variables``, ``(2, m, n)``: z and rho."""
-        gradient = np.zeros_like(variables)
+        gradient = np.zeros(variables.shape)
         z, w = variables[0], np.exp(variables[1])
         loss, by_a, by_w = self._data_terms(z, w)
         # A = e^rho z and W = e^rho.
@@ -62,7 +62,7 @@ class Objective:
 
     def _data_terms(self, z: Floats, w: Floats) -> tuple[float, Floats, Floats]:
         """Return the road and terrain terms (m) and their gradient by A = w z and by W = w."""
-        by_a, by_w = np.zeros_like(z), np.zeros_like(z)
+        by_a, by_w = np.zeros(z.shape), np.zeros(z.shape)
         loss = _data_terms(
             w * z, w, self.target, self.factor,
             self.start_u, self.along_u, self.start_v, self.along_v,
