@@ -178,7 +178,7 @@ def _glb(leaf: Leaf, place: Place, texture: TileTexture) -> bytes:
         data = read(file)
         tile.check_unchanged()
         return data
-    return glb.encode(tile.mesh, (*place.origin, 0.0), texture.image)
+    return glb.encode(tile.mesh, (*place.origin, 0.0), texture.image, tile.surface)
 
 
 def _without_photo(ids: Sequence[str]) -> str:

@@ -74,7 +74,7 @@ def piece(item: Shown, look: Look) -> Piece:
         seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(
         tile.id,
-        glb.encode(tile.mesh, (*look.origin, 0.0), photo),
+        glb.encode(tile.mesh, (*look.origin, 0.0), photo, surface),
         source.grid,
         corners(source),
         quality.support,

@@ -104,8 +104,8 @@ def products(
 def _glb(
     graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
 ) -> dict[Kind, bytes]:
-    origin = (*reference.origin, 0.0)
-    return {GLB: glb.encode(evaluate(nodes["sample"]), origin, reference.texture)}
+    mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
+    return {GLB: glb.encode(mesh, (*reference.origin, 0.0), reference.texture, surface)}
 
 
 def _ply(

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.meshing.normals import vertex_normals
+from flexroad.tasks.meshing.normals import mesh_normals, vertex_normals
 from flexroad.tasks.meshing.parts import part, texture_coordinates
 from flexroad.tasks.meshing.relief import Sheet
-from flexroad.tasks.types import Floats, Mesh, Orthophoto
+from flexroad.tasks.types import Floats, Mesh, Orthophoto, Surface
 
-VERSION = 2
+VERSION = 3
 NAME = ".glb"
 MEDIA_TYPE = "model/gltf-binary"
 
@@ -76,7 +76,12 @@ def jpeg(colour: NDArray[np.uint8], quality: int) -> bytes:
     return encoded.getvalue()
 
 
-def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture | None = None) -> bytes:
+def encode(
+    mesh: Mesh,
+    run_origin: tuple[float, float, float],
+    texture: Texture | None = None,
+    surface: Surface | None = None,
+) -> bytes:
     """Return a mesh as GLB.
 
     Parameters
@@ -88,6 +93,8 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture 
     texture : Texture, optional
         The image seen from above; by default road and terrain have one colour each. Positions, normals and
         faces do not depend on it.
+    surface : Surface, optional
+        That of the mesh, for the normals on the border of the tile (`mesh_normals`).
 
     Returns
     -------
@@ -96,7 +103,7 @@ def encode(mesh: Mesh, run_origin: tuple[float, float, float], texture: Texture 
         ``terrain`` (a class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs
         give equal bytes.
     """
-    normals = vertex_normals(mesh.vertices, mesh.faces)
+    normals = mesh_normals(mesh, surface)
     uv = texture_coordinates(mesh, texture.bounds) if texture else None
     file = _File()
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()

@@ -8,10 +8,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.types import Floats
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats, Mesh, Surface
 
 SMALLEST_ANGLE = 1e-8
 """Faces with a smaller angle (radians) are lines and have no normal."""
+ROUNDING_M = 1e-6
+"""Vertices this near to the border of a surface are on it (m)."""
+
+
+def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
+    """Return unit normals of a mesh's vertices, ``(V, 3)``, by its faces; those on its border by its surface.
+
+    Tiles of one surface have equal normals on their common border, so that no line is seen along it. By the
+    faces of each tile alone they would differ.
+
+    Parameters
+    ----------
+    surface : Surface, optional
+        That of the mesh. A spline over more than the tile has no border there, and other surfaces have none.
+    """
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    if isinstance(surface, NurbsSurface):
+        x, y = (mesh.vertices[:, :2] + mesh.origin[:2]).T
+        west, south, east, north = surface.bounds
+        away = np.min([np.abs(x - west), np.abs(x - east), np.abs(y - south), np.abs(y - north)], axis=0)
+        border = away <= ROUNDING_M
+        normals[border] = surface.normal(x[border], y[border])
+    return normals
 
 
 def vertex_normals(points: Floats, faces: NDArray[np.int32]) -> Floats:

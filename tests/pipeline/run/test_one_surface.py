@@ -123,6 +123,31 @@ def test_exported_meshes_of_tiles_join_without_open_edges(alone, end, read):
 
 
 @pytest.mark.slow
+def test_meshes_have_equal_normals_where_tiles_meet(alone):
+    """So that no line is seen between them."""
+    path, folder = alone
+    seen: dict[tuple[float, ...], dict[str, tuple[float, ...]]] = {}
+    for tile in Catalog.read(path).tiles:
+        scene = trimesh.load(product(folder, tile.id, ".glb"), process=False)
+        west, south, east, north = tile.grid.bounds
+        for node in scene.graph.nodes_geometry:
+            matrix, name = scene.graph[node]
+            part = scene.geometry[name]
+            origin = scene.metadata["run_origin"]
+            x, y, z = (part.vertices + matrix[:3, 3]).T
+            for place, normal in zip(
+                zip(x + origin[0], origin[1] - z, y.astype(np.float32), strict=True),
+                part.vertex_normals.astype(np.float32),
+                strict=True,
+            ):
+                if place[0] in (west, east) or place[1] in (south, north):
+                    seen.setdefault(place, {})[tile.id] = tuple(normal)
+    met = [normals for normals in seen.values() if len(normals) > 1]
+    assert len(met) > 200
+    assert all(len(set(normals.values())) == 1 for normals in met)
+
+
+@pytest.mark.slow
 def test_tiles_processed_together_have_the_same_bytes(alone, tmp_path):
     """Whether its neighbours are in the run, fail or come first changes no byte of a tile's surface."""
     path, folder = alone

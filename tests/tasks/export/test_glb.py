@@ -11,7 +11,10 @@ from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
 from flexroad.tasks.export import glb
+from flexroad.tasks.meshing.normals import mesh_normals
+from flexroad.tasks.meshing.parts import part
 from flexroad.tasks.meshing.relief import Relief, Sheet, sheet
+from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Orthophoto
 from tests.validators.gltf import gltf_issues
 
@@ -108,6 +111,25 @@ def test_encode_shading_has_no_seam_at_road_edge():
         inner = at_edge & (part.vertices[:, 2] < -0.1) & (part.vertices[:, 2] > -9.9)
         assert inner.sum() == 19
         np.testing.assert_allclose(part.vertex_normals[inner], np.tile(truth, (19, 1)), atol=5e-3)
+
+
+def test_encode_normals_on_the_border_are_those_of_the_surface():
+    mesh = hills()
+    west, south, _ = ORIGIN
+    bounds = west, south, west + 10.0, south + 10.0
+    knots = np.repeat([0.0, 10.0], 3)
+    spline = {"crs": "EPSG:25832", "degree": (2, 2), "knots_u": knots, "knots_v": knots, "datum": 0.0}
+    heights = np.random.default_rng(0).uniform(0, 3, (3, 3))
+    surface = NurbsSurface(bounds=bounds, A=heights, W=np.ones((3, 3)), origin=ORIGIN[:2], **spline)
+    normals, faces_alone = (mesh_normals(mesh, each) for each in (surface, None))
+    x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
+    border = (x == 0) | (x == 10) | (y == 0) | (y == 10)
+    truth = surface.normal(x + west, y + south)
+    np.testing.assert_array_equal(normals, np.where(border[:, None], truth, faces_alone))
+    written = attribute(glb.encode(mesh, RUN_ORIGIN, surface=surface), "road", "NORMAL")
+    used, _ = part(mesh, mesh.road)
+    east, north, up = normals[used].T
+    np.testing.assert_allclose(written, np.c_[east, up, -north], atol=1e-6)
 
 
 @pytest.mark.parametrize(("columns", "nodes"), [(0, {"terrain"}), (20, {"road"})])
