@@ -85,7 +85,8 @@ def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
 
 
 def test_ci_runs_lint_all_tests_and_the_fuzzer():
-    *_, install, lint, tests, fuzz = (ROOT / ".ci" / "run").read_text().splitlines()
-    assert [install, lint] == ["make -j 2 setup validators", "make lint"]
-    assert tests == "FLEXROAD_VALIDATORS=.validators make test-all"
-    assert fuzz.startswith("make fuzz FUZZ_SECONDS=20 ")
+    lines = (ROOT / ".ci" / "run").read_text().splitlines()
+    *_, install, tests, fuzz = [line for line in lines if not line.startswith("#")]
+    assert {"setup", "validators", "lint"} <= set(install.split())
+    assert tests == "PYTEST_ADDOPTS=--hypothesis-profile=ci FLEXROAD_VALIDATORS=.validators make test-all"
+    assert fuzz.startswith("make fuzz FUZZ_SECONDS=10 ")
