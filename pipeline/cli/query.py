@@ -87,7 +87,7 @@ def query(
     The output is CSV: the columns of the points and height_m, nx, ny, nz, tile and class; with --line also
     distance and grade.
     """
-    from flexroad.pipeline.inspect.answers import along_lines, at_points, outside, required_crs
+    from flexroad.pipeline.inspect.answers import along_lines, at_points, beyond_survey, outside, required_crs
     from flexroad.pipeline.inspect.point_files import LONLAT, parse_csv, read_points
     from flexroad.pipeline.inspect.points import Ground
     from flexroad.pipeline.inspect.profile import read_lines
@@ -117,5 +117,5 @@ def query(
             f"the last finished state; next: flexroad rerun {shlex.quote(str(path))}",
             err=True,
         )
-    for note in filter(None, (*result.notes, outside(result, ground))):
+    for note in filter(None, (*result.notes, outside(result, ground), beyond_survey(result))):
         echo(f"note: {note}", err=True)

@@ -70,6 +70,7 @@ def piece(item: Shown, look: Look) -> Piece:
         window = data.grid.window(data.core)
         dsm, dtm = data.dsm[window], data.dtm[window]
         height = surface.lattice(data.core.eastings, data.core.northings)
+        height[tile.road.outside[window]] = np.nan
         small = viewer.picture(height, tile.road.mask[window], data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(

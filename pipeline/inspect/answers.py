@@ -164,6 +164,15 @@ def _columns(answer: Answer) -> dict[str, Any]:
     return {"height_m": answer.height, **normal, "tile": answer.tile, "class": answer.kind}
 
 
+def beyond_survey(result: AnswerTable) -> str:
+    """Return a line about the points where a tile has no data, empty if there are none."""
+    number = int(((result.answer.tile != "") & np.isnan(result.answer.height)).sum())
+    if not number:
+        return ""
+    verb, whose = ("lies", "its") if number == 1 else ("lie", "their")
+    return f"{count(number, 'point')} {verb} beyond the survey; {whose} height, normal and class are empty"
+
+
 def outside(result: AnswerTable, ground: Ground) -> str:
     """Return a line about the points that lie on no finished tile, empty if there are none.
 

@@ -27,7 +27,10 @@ from flexroad.tasks.types import Floats, RoadMask, Surface
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Values at n points; NaN and empty strings outside the finished tiles."""
+    """Values at n points; NaN and empty strings off the finished tiles.
+
+    Beyond the survey, where a surface is but has no data, only the tile is given.
+    """
 
     height: Floats
     """``(n,)``, m."""
@@ -81,7 +84,8 @@ class Ground:
     def at(self, easting: Floats, northing: Floats) -> Answer:
         """Return height, normal, tile and class at n points (m, in the run's CRS).
 
-        A point on the edge of two finished tiles belongs to the one first in the catalog.
+        A point on the edge of two finished tiles belongs to the one first in the catalog. A surface goes on
+        beyond the survey, but its heights there are no heights of the ground.
         """
         easting = np.atleast_1d(np.asarray(easting, dtype=np.float64))
         northing = np.atleast_1d(np.asarray(northing, dtype=np.float64))
@@ -98,10 +102,11 @@ class Ground:
                 continue
             surface, road = found
             earlier += [] if status.done else [graph.tile.id]
+            tile[selected] = graph.tile.id
+            selected = selected[~road.outside[road.grid.cells(easting[selected], northing[selected])]]
             east, north = easting[selected], northing[selected]
             height[selected] = surface.height(east, north)
             normal[selected] = surface.normal(east, north)
-            tile[selected] = graph.tile.id
             kind[selected] = np.where(road.mask[road.grid.cells(east, north)], "road", "terrain")
         return Answer(height, normal, tile.astype(str), kind.astype(str), tuple(earlier))
 

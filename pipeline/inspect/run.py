@@ -148,7 +148,7 @@ class RunView:
         Returns
         -------
         ndarray
-            Heights (m) in the broadcast shape; NaN outside the finished tiles.
+            Heights (m) in the broadcast shape; NaN off the finished tiles and beyond the survey.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class RunView:
         Returns
         -------
         ndarray, (..., 3)
-            East, north and up components; NaN outside the finished tiles.
+            East, north and up components; NaN off the finished tiles and beyond the survey.
 
         Raises
         ------
@@ -202,10 +202,10 @@ class RunView:
         Returns
         -------
         xarray.Dataset, (y, x)
-            ``height`` (m, float32; NaN outside the finished tiles) and ``road`` (bool, the filtered mask),
-            backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is computed. Coordinates
-            ``x`` (ascending) and ``y`` (descending) are eastings and northings (m); ``.rio.crs`` is set.
-            Where tiles overlap, the first one in the catalog is used.
+            ``height`` (m, float32; NaN off the finished tiles and beyond the survey) and ``road`` (bool, the
+            filtered mask), backed by Dask: one chunk per tile, read from the tile's GeoTIFF when it is
+            computed. Coordinates ``x`` (ascending) and ``y`` (descending) are eastings and northings (m);
+            ``.rio.crs`` is set. Where tiles overlap, the first one in the catalog is used.
 
         Raises
         ------

@@ -105,7 +105,7 @@ def picture(height: Floats, road: Bools, cell: float) -> bytes:
     Parameters
     ----------
     height : (H, W) array
-        The surface (m).
+        The surface (m); NaN beyond the survey, where the picture is transparent.
     road : (H, W) array of bool
     cell : float
         Size of a cell (m).
@@ -116,10 +116,13 @@ def picture(height: Floats, road: Bools, cell: float) -> bytes:
     east, north, up = np.array(SUN) / np.linalg.norm(SUN)
     light = (-by_east * east + by_south * north + up) / np.sqrt(1 + by_east**2 + by_south**2)
     shade = np.where(road, ROAD_SHADE, TERRAIN_SHADE) * (1 + 1.5 * (light - up))
-    grey = Image.fromarray((255 * np.clip(shade, 0, 1)).astype(np.uint8))
-    grey.thumbnail((PICTURE_PX, PICTURE_PX), Image.Resampling.BOX)
+    unknown = np.isnan(shade)
+    image = Image.fromarray((255 * np.clip(np.where(unknown, 0, shade), 0, 1)).astype(np.uint8))
+    if unknown.any():
+        image.putalpha(Image.fromarray(np.where(unknown, 0, 255).astype(np.uint8)))
+    image.thumbnail((PICTURE_PX, PICTURE_PX), Image.Resampling.BOX)
     encoded = io.BytesIO()
-    grey.save(encoded, "WEBP", quality=PICTURE_QUALITY)
+    image.save(encoded, "WEBP", quality=PICTURE_QUALITY)
     return encoded.getvalue()
 
 

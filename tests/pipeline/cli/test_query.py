@@ -11,6 +11,7 @@ import pyproj
 import pytest
 from shapely import LineString, MultiLineString, MultiPoint, Point
 
+from flexroad import open_run
 from tests import command_line
 from tests.make_rasters import UTM, write
 
@@ -24,12 +25,11 @@ def ground(easting, northing):
     return 100.0 + EAST_SLOPE * (easting - WEST) + NORTH_SLOPE * (northing - SOUTH)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    """A run whose surface is the made ground, with a road of 10 m in the middle."""
-    folder = tmp_path_factory.mktemp("ground")
+def made_run(folder: Path, columns: int = SIZE) -> Path:
+    """Return a run whose surface is the made ground, with data in the first columns and a road of 10 m."""
     centres = np.arange(SIZE) + 0.5
     heights = ground(WEST + centres[None, :], SOUTH + centres[::-1, None])
+    heights[:, columns:] = np.nan
     road = np.zeros((SIZE, SIZE), np.uint8)
     road[15:25] = 1
     for name, values in (("dsm", heights), ("dtm", heights), ("road_mask", road)):
@@ -41,6 +41,11 @@ def run(tmp_path_factory) -> Path:
     words = ["--config", config, "--catalog", catalog, "--executor", "serial"]
     command_line.call("run", *words, "--out", folder / "run").expected(0)
     return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return made_run(tmp_path_factory.mktemp("ground"))
 
 
 def answer(said, **form) -> pd.DataFrame:
@@ -180,6 +185,23 @@ def test_profile_of_several_lines_counts_them(run, flexroad, tmp_path):
     assert list(table.line) == [1] * 4 + [2] * 3 + [3] * 4
     assert list(table.distance_m) == [0, 1, 2, 3, 0, 1, 2, 0, 1, 2, 3]
     assert set(table.grade_percent.round(2)) == {5.0, -2.0}
+
+
+def test_query_of_points_beyond_the_survey_gives_no_heights(flexroad, tmp_path):
+    """The surface goes on there, but nobody measured the ground."""
+    path = made_run(tmp_path, columns=30)
+    places = np.array([*POINTS, (WEST + 29.5, SOUTH + 5)])
+    points = csv(tmp_path / "points.csv", "x,y", places, "{},{}")
+    said = flexroad("query", path, "--points", points)
+    table = answer(said)
+    assert said.err == "note: 1 point lies beyond the survey; its height, normal and class are empty\n"
+    np.testing.assert_allclose(table.height_m[[0, 2]], ground(*places[[0, 2]].T), atol=2e-3)
+    assert table.loc[1, ["height_m", "nx", "ny", "nz", "class"]].isna().all()
+    assert table.tile.nunique() == 1
+    view = open_run(path)
+    east, north = POINTS.T
+    assert list(np.isnan(view.height(east, north))) == [False, True]
+    assert np.isnan(view.normal(east, north)[1]).all()
 
 
 def test_query_of_points_beside_all_tiles_says_where_the_tiles_are(run, flexroad, tmp_path):

@@ -100,6 +100,15 @@ def test_picture_has_roads_darker_and_slopes_to_the_sun_brighter():
     assert towards[16, 10] > away[16, 10] + 30
 
 
+def test_picture_is_transparent_beyond_the_survey():
+    height = np.zeros((100, 200))
+    height[:, 100:] = np.nan
+    seen = np.asarray(Image.open(io.BytesIO(picture(height, np.zeros(height.shape, bool), 1.0))))
+    assert seen.shape == (32, 64, 4)
+    assert (seen[:, :30, 3] > 250).all()
+    assert (seen[:, 34:, 3] < 5).all()
+
+
 def test_texts_of_the_index_stay_texts():
     script = encode_run({"name": '</script>"\u2028ä', "values": [float("nan"), 1.5]})
     assert script.isascii()
