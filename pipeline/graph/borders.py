@@ -11,7 +11,8 @@ around it, and not from a tile: neighbouring tiles have the same node, and the f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,12 +25,13 @@ from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.config.models import Chain, Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.stages import stage_function, stage_module
-from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.load import READS, load_border
 from flexroad.tasks.load import Options as LoadOptions
 from flexroad.tasks.options import Options
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
+from flexroad.tasks.spline.lattice import check_spacing
 from flexroad.tasks.types import RoadMask, TileData
 
 STAGE = "border"
@@ -162,8 +164,8 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
     Raises
     ------
     ConfigError
-        If two of them differ in size, cell or lattice (the message names both), or if control points act
-        farther than catalogs list files.
+        If two of them differ in size, cell or lattice (the message names both), if control points act
+        farther than catalogs list files, or if they are closer than cells.
     """
     joined = [chain["fit"] for chain in config.chains.values() if has_borders(chain["fit"])]
     tiles = catalog.usable
@@ -171,6 +173,7 @@ def check_tiles(config: Config, catalog: Catalog) -> None:
         return
     size_m = max(grid.cell * max(grid.shape) for grid in (tile.grid for tile in tiles))
     _check_acting(joined, size_m)
+    _check_spacing(joined, {tile.grid.cell for tile in tiles})
     lattices = [_lattice(tile.grid) for tile in tiles]
     if len(set(lattices)) <= 1:
         return
@@ -196,6 +199,14 @@ def _check_acting(fits: Sequence[Options], tile_m: float) -> None:
                 f"fit.degree times fit.spacing_m is {acting_m:g} m: control points would act farther than "
                 f"the {REACH_M:g} m up to which catalogs list files; lower fit.spacing_m"
             )
+
+
+def _check_spacing(fits: Sequence[Any], cells: Iterable[float]) -> None:
+    for fit, cell in itertools.product(fits, cells):
+        try:
+            check_spacing(fit.spacing_m, cell)
+        except TaskError as error:
+            raise ConfigError(str(error)) from error
 
 
 def _lattice(grid: Grid) -> tuple[object, ...]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.space import Space
 from flexroad.tasks.spline.surface import uniform_knots
 
@@ -36,7 +37,13 @@ class Lattice:
         """Return the lattice whose lines are at most the given distance apart (m).
 
         A tile has at least ``degree`` intervals, so that no control point acts on two parallel edges.
+
+        Raises
+        ------
+        TaskError
+            As of `check_spacing`.
         """
+        check_spacing(spacing_m, cell)
         n, m = (max(degree, math.ceil(round(count * cell / spacing_m, 6))) for count in cells)
         return cls(cells, cell, (n, m), degree)
 
@@ -91,6 +98,18 @@ class Lattice:
             self.unit_m,
         )
         return space, (rows, cols)
+
+
+def check_spacing(spacing_m: float, cell: float) -> None:
+    """Check the distance of control points.
+
+    Raises
+    ------
+    TaskError
+        If they would be closer than the cells, which cannot determine them.
+    """
+    if spacing_m < cell * (1 - 1e-9):
+        raise TaskError(f"fit.spacing_m is {spacing_m:g} m, less than a cell of {cell:g} m; raise it")
 
 
 def _between(values: np.ndarray, ends: Range) -> slice:

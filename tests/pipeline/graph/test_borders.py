@@ -16,6 +16,8 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE, BorderStages, check_tiles
 from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.spline.lattice import Lattice
 
 NIGHTLY = load_config("nightly")
 SIZE_M = 250
@@ -210,10 +212,24 @@ def test_control_points_that_act_beyond_listed_files_are_refused(spacing_m, size
             check_tiles(config, placed(square(0, 0, size)))
 
 
+@pytest.mark.parametrize("spacing_m", [0.9, 1e-9])
+def test_control_points_closer_than_cells_are_refused(spacing_m):
+    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": spacing_m}}, "fine")
+    with pytest.raises(ConfigError, match=r"^fit\.spacing_m is .* m, less than a cell of 1 m; raise it$"):
+        check_tiles(config, placed(square(0, 0)))
+    with pytest.raises(TaskError, match="less than a cell of 1 m"):
+        Lattice.of((250, 250), 1.0, 3, spacing_m)
+
+
+def test_control_points_as_close_as_cells_are_accepted():
+    config = compose({"fit": {"method": "smoothing_spline", "spacing_m": 0.1}}, "fine")
+    check_tiles(config, placed(square(0, 0, 25, 0.1)))
+
+
 def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
     by_prepared(survey).write(survey / "catalog.json")
     words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
-    out = flexroad("run", "--config", "nightly", *words).expected(0).out
+    out = flexroad("run", "--config", "nightly", "--set", "fit.spacing_m=10", *words).expected(0).out
     assert "  border   40 to do" in out.splitlines()
 
 
