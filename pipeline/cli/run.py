@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from flexroad.pipeline.config.models import Config
     from flexroad.pipeline.execute import Executor
     from flexroad.pipeline.run.record import Run
+    from flexroad.pipeline.run.summary import Summary
     from flexroad.pipeline.worker.tile import TileResult
 
 StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
@@ -316,8 +318,16 @@ def _run_tiles(
             "no tile of this run has a road that the filter keeps; if there are roads, check the road source "
             "of the catalog and the options of segment and ecsrc"
         )
+    _echo_next(summary, folder)
+
+
+def _echo_next(summary: Summary, folder: str) -> None:
     if summary.failed:
         echo(f"next: flexroad status {folder}, then flexroad rerun {folder} --failed")
+    elif summary.pending:
+        # The exit code is 1 although the selected tiles are done.
+        tiles, have = count(summary.pending, "tile"), "has" if summary.pending == 1 else "have"
+        echo(f"{tiles} {have} no result of the present files and options; next: flexroad rerun {folder}")
     elif not summary.exit_code:
         echo(f"next: flexroad report {folder} --format html")
 

@@ -251,7 +251,8 @@ def test_query_after_edit_of_configuration_answers_from_the_last_finished_state(
     before = flexroad("query", run, "--points", points)
     config = run / "config.yaml"
     config.write_text(config.read_text().replace("iterations: 3", "iterations: 4"))
-    flexroad("rerun", run, "--tile", "499980_5599980", "--executor", "serial", expect=1)
+    said = flexroad("rerun", run, "--tile", "499980_5599980", "--executor", "serial", expect=1)
+    assert f"3 tiles have no result of the present files and options; next: flexroad rerun {run}\n" in said
     *after, note = flexroad("query", run, "--points", points).splitlines()
     # The first point is on the tile that was computed again, the second one is not.
     assert after[1] != before.splitlines()[1]
