@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.storage.paths import Location, remove, write
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export import (
     along_roads,
@@ -27,11 +28,14 @@ from flexroad.pipeline.export.photo import Photographed
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
 from flexroad.pipeline.export.source import FinishedTile, Source
 from flexroad.pipeline.graph.borders import has_borders
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
 from flexroad.tasks.export import road_lines as line_file
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
 """Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
+
+Check = Callable[[Source, Options], object]
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Format:
     """Largest distance of a point from the run's mesh or surface (m); None if its files or figures say it."""
     needs_datum: bool = False
     """Whether heights above the ellipsoid are needed."""
-    check: Callable[[Source, Options], object] | None = None
+    check: Check | None = None
     """Raises an error, before anything is written, if the format cannot be."""
 
 
@@ -107,8 +111,21 @@ def _write_each(
     return figures(write_pieces(tiles, folder, version, encode, source.vertical, executor))
 
 
-def _per_tile(title: str, version: int, encode: Encode, precision_m: float | None) -> Format:
-    return Format(title, partial(_write_each, version, encode), version, precision_m)
+def _per_tile(
+    title: str, version: int, encode: Encode, precision_m: float | None, check: Check | None = None
+) -> Format:
+    return Format(title, partial(_write_each, version, encode), version, precision_m, check=check)
+
+
+def _needs_rhino(source: Source, options: Options) -> None:
+    try:
+        rhino.library()
+    except TaskError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _needs_pmtiles(source: Source, options: Options) -> None:
+    terrain_tiles.library()
 
 
 def _along_roads(title: str, version: int, write: Write) -> Format:
@@ -125,8 +142,10 @@ FORMATS = {
     ),
     "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
-    "pmtiles": Format("Map tiles of heights", terrain_tiles.write_tiles, terrain_tiles.VERSION, 0.002),
-    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4),
+    "pmtiles": Format(
+        "Map tiles of heights", terrain_tiles.write_tiles, terrain_tiles.VERSION, 0.002, check=_needs_pmtiles
+    ),
+    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4, _needs_rhino),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
     "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),

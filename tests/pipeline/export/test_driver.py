@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -127,6 +128,16 @@ def test_selection_by_id_and_box(city):
         select(city, ids=[third.id])
     with pytest.raises(ConfigError, match="exports no variant 'plane'; it has flexroad"):
         select(city, variant="plane")
+
+
+@pytest.mark.parametrize(("name", "library"), [("3dm", "rhino3dm"), ("pmtiles", "pmtiles.writer")])
+def test_library_that_is_missing_is_named_before_any_file_is_written(
+    city, tmp_path, monkeypatch, name, library
+):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=r"^[^:]*needs? .*pip install 'flexroad\[export\]'$"):
+        export(select(city), tmp_path, ["landxml", name], OPTIONS, SerialExecutor())
+    assert not list(tmp_path.iterdir())
 
 
 def test_formats_that_cannot_be_written_are_refused_before_any_work():

@@ -1,7 +1,6 @@
 """Map tiles have the heights of the surface, and say so."""
 
 import io
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -110,14 +109,6 @@ def test_zoom_follows_from_the_cells_of_the_run(town, tmp_path):
     latitude = np.radians(header["center_lat_e7"] / 1e7)
     pixel = WORLD / SIZE / 2 ** header["max_zoom"] * np.cos(latitude)
     assert 0.5 < pixel <= 1.005
-
-
-def test_library_that_is_missing_is_named(town, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pmtiles.writer", None)
-    with pytest.raises(
-        ConfigError, match=r"needs the library pmtiles; install it with pip install 'flexroad"
-    ):
-        export(select(town.path), tmp_path, ["pmtiles"], Options(), SerialExecutor())
 
 
 def test_run_without_heights_leaves_no_file(town, tmp_path):
