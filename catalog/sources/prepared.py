@@ -8,8 +8,6 @@ bounds.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -18,16 +16,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 import shapely
 from numpy.typing import NDArray
 from rasterio.crs import CRS
-from rasterio.errors import CRSError, RasterioIOError
+from rasterio.errors import CRSError
+from rasterio.io import MemoryFile
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.paths import write
+from flexroad.catalog.text import reason
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "road_height", "reference")
@@ -161,32 +160,27 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
     count, height, width = bands.shape
     if name == PHOTO:
         grid = Grid(grid.crs, grid.west, grid.north, grid.width * grid.cell / width, width, height)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        target = output_file(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with rasterio.open(
-            temporary,
-            "w",
-            driver="GTiff",
-            width=width,
-            height=height,
-            count=count,
-            dtype=bands.dtype,
-            crs=CRS.from_string(grid.crs),
-            transform=grid.transform,
-            compress="deflate",
-            **profile,
-        ) as dataset:
-            dataset.write(bands)
-            dataset.update_tags(**tags)
-        temporary.replace(target)
-    except (OSError, RasterioIOError, CRSError) as error:
-        # rasterio's error has GDAL's error, with the reason, as its cause.
-        raise CatalogError(f"cannot write {path}: {error.__cause__ or error}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    # Encoded in memory: GDAL does not raise an error where a disk is full when it closes a file.
+    with MemoryFile() as memory:
+        try:
+            with memory.open(
+                driver="GTiff",
+                width=width,
+                height=height,
+                count=count,
+                dtype=bands.dtype,
+                crs=CRS.from_string(grid.crs),
+                transform=grid.transform,
+                compress="deflate",
+                **profile,
+            ) as dataset:
+                dataset.write(bands)
+                dataset.update_tags(**tags)
+            write(path, memory.getbuffer())
+        except (OSError, CRSError) as error:
+            # rasterio's error has GDAL's error, with the reason, as its cause.
+            why = getattr(error, "strerror", None) or reason(error.__cause__ or error)
+            raise CatalogError(f"cannot write {path}: {why}") from error
 
 
 def _read(path: Path) -> _File:

@@ -1,5 +1,8 @@
+import errno
+import os
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -294,3 +297,15 @@ def test_halo_has_the_heights_of_the_neighbours(tmp_path):
     assert np.isnan(corner[:50]).all()
     assert np.isnan(corner[:, :50]).all()
     assert not np.isnan(corner[50:, 50:]).any()
+
+
+def test_write_tile_on_full_disk_names_the_file_and_leaves_none(tmp_path, monkeypatch):
+    """GDAL itself says nothing when a disk is full as it closes a file."""
+
+    def full(self, data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(CatalogError, match=r"^cannot write .*/dsm/a\.tif: No space left on device$"):
+        write_tile(tmp_path, "a", GRID, {"dsm": heights()})
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
