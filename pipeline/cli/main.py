@@ -50,6 +50,11 @@ def main() -> None:
         for line in str(error).splitlines():
             echo(f"error: {line}", err=True)
         sys.exit(2)
+    except SystemExit as end:
+        # typer ends with 130 without a word. Commands that notice an interruption themselves have said so.
+        if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
+            echo("interrupted; repeat the command", err=True)
+        raise
     except OSError as error:
         echo(f"error: {error}; check the path and the disk, then repeat the command", err=True)
         sys.exit(2)

@@ -285,3 +285,12 @@ def test_train_setting_that_cannot_be_read_gives_one_line(flexroad):
     }.items():
         (line,) = flexroad(*command, setting).expected(2).errors
         assert message in line
+
+
+def test_interrupted_command_says_so(tmp_path, monkeypatch):
+    def interrupted(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Catalog, "read", interrupted)
+    said = call("catalog", "check", tmp_path / "catalog.parquet").expected(130)
+    assert (said.out, said.err) == ("", "interrupted; repeat the command\n")
