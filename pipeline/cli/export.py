@@ -146,7 +146,7 @@ def export(
                 track=track,
             )
             if source.left_out:
-                _note(f"left out {count(len(source.left_out), 'tile')} that are not finished")
+                _note(f"left out {count(len(source.left_out), 'unfinished tile')}")
             manifest = write(source, folder, names, chosen, runner, track, _note)
         except KeyboardInterrupt:
             echo("interrupted; the same command goes on from here", err=True)

@@ -88,6 +88,8 @@ def _show(folder: Path, found: Sequence[Download]) -> None:
         for download in downloads[:MAX_SHOWN]:
             about = f": {download.about}" if download.about else ""
             echo(f"  {download.path.relative_to(folder)}{about}")
+        if len(downloads) > MAX_SHOWN:
+            echo(f"  and {len(downloads) - MAX_SHOWN} more")
     asked: dict[str, list[str]] = defaultdict(list)
     for download in found:
         if download.question:

@@ -160,7 +160,8 @@ def _existing(name: str | Path) -> Path:
         raise ConfigError(f"configuration '{given}': {error.strerror}; name a YAML file") from error
     if special:
         raise ConfigError(f"configuration '{given}' is not a regular file; name a YAML file")
-    near = difflib.get_close_matches(Path(name).name, configs, n=1)
+    begun = [config for config in configs if config.startswith(str(name))]
+    near = begun or difflib.get_close_matches(Path(name).name, configs, n=1)
     hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
     raise ConfigError(f"no configuration '{given}': neither a file nor a shipped name{hint}")
 

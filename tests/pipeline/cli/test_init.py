@@ -83,6 +83,17 @@ def test_init_names_unclear_files_with_their_question(downloads, flexroad):
     assert "houses.gpkg -o" not in said
 
 
+def test_init_says_how_many_files_it_does_not_list(downloads, flexroad):
+    for number in range(7):
+        (downloads / f"part_{number}.zip").write_bytes(b"PK")
+    lines = flexroad("init", downloads).expected(0).out.splitlines()
+    start = lines.index("archives: 7")
+    assert [line.split(".")[0] for line in lines[start + 1 : start + 6]] == [
+        f"  part_{number}" for number in range(5)
+    ]
+    assert lines[start + 6] == "  and 2 more"
+
+
 def test_init_folder_of_mixed_crs_gives_one_command_that_reprojects(downloads, flexroad):
     """The terrain is in the next zone, the mask in degrees."""
     (x,), (y,) = transform("EPSG:25832", "EPSG:25833", [WEST + 60], [NORTH - 30])

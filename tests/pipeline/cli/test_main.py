@@ -288,7 +288,7 @@ def test_train_setting_that_cannot_be_read_gives_one_line(flexroad):
 
 
 def test_interrupted_command_says_so(tmp_path, monkeypatch):
-    def interrupted(path):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Catalog, "read", interrupted)

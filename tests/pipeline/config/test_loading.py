@@ -163,6 +163,11 @@ def test_extends_reads_no_file_but_yaml_and_shows_nothing_of_it(tmp_path):
         assert "password" not in refusal(mine)
 
 
+@pytest.mark.parametrize(("name", "meant"), [("prod", "production"), ("papr", "paper")])
+def test_unknown_name_suggests_a_shipped_one(name, meant):
+    assert refusal(name).endswith(f"neither a file nor a shipped name; did you mean {meant}?")
+
+
 def test_extends_endless_chain_raises(tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("extends: mine.yaml\n")

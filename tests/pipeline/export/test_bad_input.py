@@ -46,7 +46,7 @@ def refused(flexroad):
 @each_format
 def test_tiles_that_failed_or_are_missing_are_left_out(made_city, whole, flexroad, tmp_path, name):
     said = flexroad("export", made_city.path, "--format", name, *DATUM, "-o", tmp_path / "out").expected(0)
-    assert "note: left out 2 tiles that are not finished" in said.err.splitlines()
+    assert "note: left out 2 unfinished tiles" in said.err.splitlines()
     assert contents(tmp_path / "out" / name) == contents(whole / name)
     manifest = json.loads((tmp_path / "out" / "export.json").read_text())
     assert manifest["tiles"] == 2
