@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -19,6 +20,8 @@ COLOURS = "YlOrRd"
 LIMIT_M = 0.5
 """End of the colour bar: beyond it all is equally bad."""
 CIRCLE, RING = "#1c2430", "#ffffff"
+NEAR, LINE = 0.3, 0.04
+"""Distance across which labels may overlap, and that of their lines, as shares of the width of the map."""
 
 
 def estimate_picture(
@@ -61,15 +64,19 @@ def _circles(axes: Axes, grid: Grid, places: Mapping[str, Place]) -> None:
     names: dict[Place, list[str]] = {}
     for flag, place in places.items():
         names.setdefault(place, []).append(flag)
-    width = grid.width * grid.cell
-    for (east, north), flags in names.items():
+    width, last = grid.width * grid.cell, (-math.inf, -math.inf)
+    for (east, north), flags in sorted(names.items(), key=lambda item: item[0][1]):
         x, y = east - grid.west, north - grid.south
         for colour, line in ((RING, 3.4), (CIRCLE, 1.6)):
             axes.plot(x, y, "o", ms=15, mfc="none", mec=colour, mew=line)
         on_left = x < width / 2
+        # From south to north, each label at least a line above the one before it, if both are near.
+        near = abs(x - last[0]) < NEAR * width
+        label = max(y, last[1] + LINE * width) if near else y
+        last = x, label
         axes.annotate(
             ", ".join(flags),
-            (x, y),
+            (x, label),
             (10 if on_left else -10, 0),
             textcoords="offset points",
             ha="left" if on_left else "right",

@@ -119,6 +119,6 @@ def _finished(tile: TilePictures, view: bytes | None) -> TilePictures:
     """Add the view of the mesh, if there is one, and make the pictures small."""
     if not tile.pictures:
         return tile
-    views, notes = ((("The road from the south", view),), ()) if view else ((), (NO_MESH,))
+    views, notes = ((("The mesh of the road", view),), ()) if view else ((), (NO_MESH,))
     pictures = tuple((caption, webp(png)) for caption, png in (*tile.pictures, *views))
     return replace(tile, pictures=pictures, notes=(*tile.notes, *notes))
