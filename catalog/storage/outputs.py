@@ -39,6 +39,26 @@ def atomic_path(where: Path, flushed: bool = False) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def made_folder(where: Path) -> Iterator[None]:
+    """Make a folder and its parents if they do not exist; if the block fails, remove those that are empty.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made, or is a file.
+    """
+    new = [folder for folder in (where, *where.parents) if not folder.exists()]
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for folder in new:
+                folder.rmdir()
+        raise
+
+
 def flush_path(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk.
 

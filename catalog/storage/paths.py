@@ -14,7 +14,7 @@ import contextlib
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from stat import S_ISREG
@@ -184,6 +184,28 @@ def _pages(folder: UPath, options: dict[str, str]) -> Iterator[tuple[str, FileSt
         if not page.get("IsTruncated"):
             return
         request["ContinuationToken"] = page["NextContinuationToken"]
+
+
+def visible_entry(folder: Location, without: Collection[str] = ()) -> str | None:
+    """Return a file or folder in a folder by its name; None if it has none, or does not exist.
+
+    Hidden files (``.DS_Store``), ``lost+found``, which a new disk has, and the names in ``without`` do not
+    count. Of a large folder in a bucket only the first page of names is requested.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read, or the storage does not answer.
+    """
+    if isinstance(folder, Path):
+        try:
+            names = iter(sorted(os.listdir(folder)))  # noqa: PTH208 (iterdir gives no names)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+    else:
+        names = (name.partition("/")[0] for name, _ in entries(folder))
+    left_out = {"lost+found", *without}
+    return next((name for name in names if not name.startswith(".") and name not in left_out), None)
 
 
 def sidecars(where: UPath) -> set[str]:

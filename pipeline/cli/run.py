@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -209,37 +209,32 @@ def _named(work: str) -> Iterator[None]:
 def _locked(path: Location, create: bool = False) -> Iterator[bool]:
     """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty.
 
+    A folder with files of others is then refused, before anything is written.
+
     Yields whether the process that held the lock before has died: one of the tiles may have ended it.
     """
+    from flexroad.catalog.storage.outputs import made_folder
+    from flexroad.pipeline.run.folder import check_folder
     from flexroad.pipeline.run.lock import run_lock
 
-    made: list[Path] = []
     taken_over: list[str] = []
 
     def notify(line: str) -> None:
         taken_over.append(line)
         warn(line, "note")
 
-    try:
-        if create and isinstance(path, Path):
-            made = [folder for folder in (path, *path.parents) if not folder.exists()]
-            path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        _remove_empty(made)
-        raise ConfigError(f"cannot write the run to {path}: {error}; choose another --out") from error
-    try:
-        with run_lock(path, notify):
-            yield bool(taken_over)
-    except BaseException:
-        _remove_empty(made)
-        raise
-
-
-def _remove_empty(folders: Sequence[Path]) -> None:
-    """Remove folders, the innermost first, up to the first one that is not empty."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
-            folder.rmdir()
+    with contextlib.ExitStack() as stack:
+        if create:
+            check_folder(path)
+            if isinstance(path, Path):
+                try:
+                    stack.enter_context(made_folder(path))
+                except OSError as error:
+                    raise ConfigError(
+                        f"cannot write the run to {path}: {error}; choose another --out"
+                    ) from error
+        stack.enter_context(run_lock(path, notify))
+        yield bool(taken_over)
 
 
 def _executor(

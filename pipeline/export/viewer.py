@@ -14,7 +14,7 @@ from typing import Any
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.crs import in_plan, name, short
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.storage.paths import Location, absolute, listing, read, remove, write
+from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, visible_entry, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import write_pieces
@@ -157,14 +157,16 @@ def _claim(out: Location, run: Run) -> None:
             raise ConfigError(f"{out} lies in {place}, which belongs to the run; choose another with -o")
     if isinstance(out, Path) and out.is_file():
         raise ConfigError(f"{out} is a file; choose a folder with -o")
-    names = set(listing(out))
-    owner = read(out / OWNER).decode(errors="replace") if OWNER in names else ""
+    owner = read(out / OWNER).decode(errors="replace") if exists(out / OWNER) else ""
     own = str(absolute(run.path))
     # A folder inside the run may have been moved with it.
     if owner and owner != own and absolute(run.path) not in absolute(out).parents:
         raise ConfigError(f"{out} has the viewer of {owner}; choose another folder with -o, or remove it")
-    if names and not owner and not (PAGE in names and MARK in read(out / PAGE)):
-        raise ConfigError(f"{out} has files that are not of a viewer; choose another folder with -o")
+    other = None if owner or (exists(out / PAGE) and MARK in read(out / PAGE)) else visible_entry(out)
+    if other is not None:
+        raise ConfigError(
+            f"{out} has files that are not of a viewer, such as {other}; choose another folder with -o"
+        )
     write(out / OWNER, own.encode())
     remove(out / PAGE)
 

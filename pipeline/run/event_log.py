@@ -25,13 +25,15 @@ from flexroad.catalog.storage.staging import StagedFile
 from flexroad.pipeline.worker.profiling import utc_now
 from flexroad.pipeline.worker.tile import TileResult
 
+NAME = "log.jsonl"
+
 
 class EventLog:
     """Appends events to the log; a context manager. Write errors (full disk) are ignored and stop no run."""
 
     def __init__(self, run: Location) -> None:
         start = utc_now().replace(":", "").replace("+0000", "Z")
-        self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / "log.jsonl")
+        self._staged = StagedFile(run / "log" / f"{start}.jsonl" if is_remote(run) else run / NAME)
         self._file: IO[str] | None = None
 
     def __enter__(self) -> EventLog:

@@ -20,6 +20,7 @@ from flexroad.catalog.storage.paths import Location, absolute, entries, exists, 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import PROBLEM, STAGE_NAMES
+from flexroad.pipeline.run.folder import RECORD
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
@@ -73,7 +74,7 @@ def exclusive(
         runs = [run]
         for path in _others(run, without):
             remedy = f"restore it, or `flexroad clean {run.path} --forget {path}` if it no longer exists"
-            if not exists(path / "run.json"):
+            if not exists(path / RECORD):
                 raise ConfigError(f"{path} uses the store {run.store}, but is missing; {remedy}")
             stack.enter_context(run_lock(path, notify))
             try:

@@ -48,6 +48,7 @@ from flexroad.pipeline.graph.graph import Pattern, TileGraph
 from flexroad.pipeline.graph.layers import check_layers
 from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
+from flexroad.pipeline.run.folder import RECORD, check_folder
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
@@ -97,7 +98,7 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder or the store cannot be written, no tile can be used, or `check_inputs` raises.
+            If the folder or the store cannot be written, or `planned` raises.
         """
         run = cls.planned(path, config, catalog, store, checksum)
         try:
@@ -125,8 +126,9 @@ class Run:
         Raises
         ------
         ConfigError
-            If no tile can be used, or `check_inputs` raises.
+            If the folder has files of others (`check_folder`), no tile can be used, or `check_inputs` raises.
         """
+        check_folder(path)
         if not catalog.usable:
             raise ConfigError(f"no tile can be used: {catalog.tiles[0].fault}")
         check_inputs(config, catalog)
@@ -207,6 +209,10 @@ class Run:
         return TileProducts.of(self.path, tile_id)
 
     def _write(self) -> None:
+        if not exists(self.path / RECORD):
+            # An interrupted creation is known by this file, which says nothing yet (`check_folder`).
+            write(self.path / RECORD, checked_json.dumps({}), flushed=True)
+            flush_names(self.path)
         config = yaml.safe_dump(self.config.raw, sort_keys=False).encode()
         write(self.path / "config.yaml", config, flushed=True)
         self.catalog.write(self.path / "catalog.parquet", movable=False)
@@ -222,7 +228,7 @@ class Run:
             "exported": list(self.exported),
             "collection": self.collection,
         }
-        write(self.path / "run.json", checked_json.dumps(record), flushed=True)
+        write(self.path / RECORD, checked_json.dumps(record), flushed=True)
         # The run's folder may be new.
         flush_names(self.path, self.path.parent)
 
@@ -314,11 +320,11 @@ def _config(path: Location) -> Config:
 def _record(run: Location) -> dict[str, Any] | None:
     """Return the content of run.json, None if it is missing or damaged."""
     try:
-        record = checked_json.loads(read(run / "run.json"))
+        record = checked_json.loads(read(run / RECORD))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:
         # After an access or connection error it is unknown whether there is a run.
-        raise ConfigError(f"cannot read {run / 'run.json'}: {error.strerror or error}") from error
+        raise ConfigError(f"cannot read {run / RECORD}: {error.strerror or error}") from error
     required = {"config", "store", "shared_store", "origin", "checksum", "versions"}
     return record if required <= record.keys() else None

@@ -37,6 +37,17 @@ def test_written_files_can_be_listed_and_read(folder):
     assert paths.exists(folder / "a.bin")
 
 
+def test_visible_entry_leaves_out_hidden_and_given_names(folder):
+    assert paths.visible_entry(folder / "no") is None
+    for name in (".DS_Store", ".cache/a.bin", "lost+found/b.bin", "lock.json"):
+        paths.write(folder / name, b"x")
+    assert paths.visible_entry(folder) == "lock.json"
+    assert paths.visible_entry(folder, {"lock.json"}) is None
+    assert paths.visible_entry(folder / "lock.json") is None
+    paths.write(folder / "z" / "c.bin", b"x")
+    assert paths.visible_entry(folder, {"lock.json"}) == "z"
+
+
 def test_changed_content_changes_version(folder):
     paths.write(folder / "a", b"one")
     before = paths.stat(folder / "a")

@@ -1,5 +1,6 @@
 """Nightly operation: repeated runs, notifications of failures, clean."""
 
+import errno
 import json
 import os
 import shutil
@@ -12,7 +13,9 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from flexroad.catalog import Catalog, Layer
+from flexroad.catalog.storage import paths
 from flexroad.pipeline.cli.main import main
+from flexroad.pipeline.run import record
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.store import checked_json
 from tests.command_line import same_signals
@@ -170,6 +173,41 @@ def test_refused_run_leaves_folders_as_they_were(flexroad, nightly, survey, tmp_
     assert empty.is_dir()
     flexroad("rerun", new, expect=2)
     assert not (tmp_path / "new").exists()
+
+
+def test_run_into_folder_with_other_files_changes_nothing(flexroad, nightly, survey, notification):
+    before = paths.listing(survey.parent)
+    message = (
+        f"{survey.parent} has other files, such as catalog.parquet, and is no run; choose an empty or new"
+    )
+    for words in (["--dry-run"], notification.words):
+        assert message in flexroad(*nightly, "--out", survey.parent, *words, expect=2)
+    assert message in notification.received["text"]
+    assert paths.listing(survey.parent) == before
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "catalog.parquet"])
+def test_run_whose_creation_failed_goes_on(flexroad, nightly, tmp_path, monkeypatch, name):
+    out, write_file = tmp_path / "run", record.write
+
+    def fails(where, *args, **options):
+        if where.name == name:
+            raise OSError(errno.ENOSPC, "No space left on device", str(where))
+        write_file(where, *args, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "write", fails)
+        patch.setattr(Catalog, "write", lambda catalog, path, **options: fails(path))
+        assert "No space left on device" in flexroad(*nightly, expect=2)
+    assert (out / "run.json").exists()
+    assert "is no run: run.json is missing or damaged" in flexroad("status", out, expect=2)
+    assert "4 done" in flexroad(*nightly)
+
+
+def test_run_into_empty_disk_is_accepted(flexroad, nightly, tmp_path):
+    (tmp_path / "run" / "lost+found").mkdir(parents=True)
+    (tmp_path / "run" / ".DS_Store").write_bytes(b"x")
+    assert "4 done" in flexroad(*nightly)
 
 
 def test_run_interrupted_notifies_and_failed_notification_only_warns(

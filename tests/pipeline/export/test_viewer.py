@@ -126,9 +126,16 @@ def test_interrupted_writing_leaves_no_page(city, folder, tmp_path, monkeypatch)
 @pytest.mark.parametrize("name", [PAGE, "notes.txt"])
 def test_folder_with_files_of_others_is_refused(city, tmp_path, name):
     (tmp_path / name).write_text("<h1>mine</h1>")
-    with pytest.raises(ConfigError, match="has files that are not of a viewer; choose another folder"):
+    message = f"has files that are not of a viewer, such as {name}; choose another folder"
+    with pytest.raises(ConfigError, match=message):
         write_viewer(Run.open(city), tmp_path, SerialExecutor())
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "<h1>mine</h1>")]
+
+
+def test_folder_with_hidden_files_alone_is_taken(city, tmp_path):
+    (tmp_path / ".DS_Store").write_bytes(b"x")
+    write_viewer(Run.open(city), tmp_path, SerialExecutor())
+    assert MARK in (tmp_path / PAGE).read_bytes()
 
 
 @pytest.mark.parametrize("inside", [".", "..", "tiles", "tiles/viewer", "store"])
