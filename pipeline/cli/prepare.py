@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -70,7 +71,24 @@ def _log(line: str) -> None:
     echo(line, err=True)
 
 
-def _run(make: Callable[[], PreparedDataset]) -> None:
+@contextlib.contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """Make the output folder, check that it can be written, and hold its lock; no empty one is left."""
+    from flexroad.catalog.storage.outputs import made_folder
+    from flexroad.pipeline.prepare.output import check_replaced, disk_errors
+    from flexroad.pipeline.run.lock import run_lock
+    from flexroad.pipeline.store.artefacts import check_writable
+
+    check_replaced(out)
+    with contextlib.ExitStack() as stack:
+        with disk_errors(out):
+            stack.enter_context(made_folder(out))
+            check_writable(out)
+        stack.enter_context(run_lock(out, lambda line: _log(f"note: {line}")))
+        yield
+
+
+def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
     """Run a command and print its result; SIGTERM is handled like Ctrl-C, and leaves no files behind."""
     import signal
 
@@ -79,7 +97,8 @@ def _run(make: Callable[[], PreparedDataset]) -> None:
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        dataset = make()
+        with _held(out):
+            dataset = make()
     except TaskError as error:
         raise ConfigError(str(error)) from error
     except KeyboardInterrupt:
@@ -164,7 +183,10 @@ def prepare_points(
         ground_classes=ground_class,
         bridge_classes=bridge_class or BRIDGE_CLASSES[class_scheme],
     )
-    _run(lambda: points.prepare_points(files, output, common, options, _executor(workers), _log, ground))
+    _run(
+        output,
+        lambda: points.prepare_points(files, output, common, options, _executor(workers), _log, ground),
+    )
 
 
 @prepare.command("mesh", cls=Command)
@@ -195,7 +217,10 @@ def prepare_mesh(
 
     mesh_options = meshes.MeshOptions(up, offset, density, seed, dop=not no_dop, refine=not no_refine)
     options = _points_options(slope, radius, fill, void, ground="filter")
-    _run(lambda: meshes.prepare_mesh(mesh, output, common, mesh_options, options, _executor(workers), _log))
+    _run(
+        output,
+        lambda: meshes.prepare_mesh(mesh, output, common, mesh_options, options, _executor(workers), _log),
+    )
 
 
 @prepare.command("odm", cls=Command)
@@ -220,7 +245,10 @@ def prepare_odm(
 
     mesh_options = mesh.MeshOptions(density=density, seed=seed)
     options = _points_options(slope, radius, fill, void, ground="filter")
-    _run(lambda: odm.prepare_odm(project, output, common, mesh_options, options, _executor(workers), _log))
+    _run(
+        output,
+        lambda: odm.prepare_odm(project, output, common, mesh_options, options, _executor(workers), _log),
+    )
 
 
 @prepare.command("photos", cls=Command)
@@ -292,7 +320,8 @@ def prepare_photos(
     )
     options = _points_options(slope, radius, fill, void, ground="filter")
     _run(
+        output,
         lambda: photos.prepare_photos(
             images, output, common, photos_options, options, _executor(workers), _log
-        )
+        ),
     )

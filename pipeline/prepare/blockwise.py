@@ -16,11 +16,11 @@ from flexroad.catalog import Grid
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.pipeline.prepare.point_buckets import (
     BlockIndex,
     BucketedPoints,
     PointBuckets,
-    disk_errors,
 )
 from flexroad.pipeline.prepare.raster_writer import GROUND, RasterWriter
 from flexroad.tasks import memory

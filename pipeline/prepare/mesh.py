@@ -16,6 +16,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions, written
+from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.pipeline.prepare.point_buckets import (
     PER_METRE,
     RECORD,
@@ -23,7 +24,6 @@ from flexroad.pipeline.prepare.point_buckets import (
     BucketedPoints,
     PointBuckets,
     block_edge,
-    disk_errors,
 )
 from flexroad.pipeline.prepare.raster_writer import GROUND, PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads

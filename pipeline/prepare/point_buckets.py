@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, CatalogError, Grid
 from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
 from flexroad.catalog.to_metres import MetricTransform
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.limits import check_extent
+from flexroad.pipeline.prepare.output import disk_errors
 from flexroad.tasks.acquire.types import Points
 
 PER_METRE = 10_000
@@ -297,23 +297,6 @@ def _records(
         records["colour"] = colours.bytes(chunk.colour[valid])
     plan = np.stack([easting[valid], northing[valid]])
     return np.rint(plan * PER_METRE).astype(np.int64), records
-
-
-@contextlib.contextmanager
-def disk_errors(out: Path) -> Iterator[None]:
-    """Context manager that turns an `OSError` of the disk into a `ConfigError` of one line.
-
-    Raises
-    ------
-    ConfigError
-        If the disk is full or the folder cannot be written.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise ConfigError(
-            f"cannot write to {out}: {error.strerror or error}; free disk space and repeat"
-        ) from error
 
 
 @contextlib.contextmanager

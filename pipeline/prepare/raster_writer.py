@@ -33,6 +33,7 @@ from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.prepare.output import CATALOG, LAYER_TAG, NAMES, write_error
 from flexroad.tasks.types import Orthophoto
 
 PHOTO = "dop"
@@ -40,7 +41,6 @@ GROUND = "ground"
 """Cells with ground points: an intermediate layer, not published."""
 BLOCK = 256
 """Side of the internal tiles of the temporary GeoTIFFs (cells)."""
-CATALOG = "catalog.parquet"
 HEIGHT_PROFILE = {"dtype": "float32", "nodata": np.nan, "count": 1}
 ROAD_HEIGHT_PROFILE = {**HEIGHT_PROFILE, "count": len(ROAD_HEIGHT_BANDS)}
 MASK_PROFILE = {"dtype": "uint8", "nodata": None, "count": 1}
@@ -106,7 +106,7 @@ class RasterWriter:
         """Folder for temporary files, also of the caller; removed when the context ends."""
         try:
             out.mkdir(parents=True, exist_ok=True)
-            for name in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
+            for name in NAMES:
                 # Refused at the start and not after the rasters are computed.
                 output_file(out / name)
             _remove_stale(out)
@@ -226,7 +226,7 @@ class RasterWriter:
 
     def _replace(self, names: list[str]) -> None:
         # A catalog must only exist beside complete rasters: removed first, written last.
-        for name in (CATALOG, *(f"{layer}.tif" for layer in LAYERS)):
+        for name in NAMES:
             output_file(self.out / name).unlink(missing_ok=True)
         for layer in names:
             (self.scratch / f"{layer}.tif").replace(output_file(self.out / f"{layer}.tif"))
@@ -282,7 +282,7 @@ class RasterWriter:
                 BIGTIFF="IF_SAFER",
                 **profile,
             )
-            raster.update_tags(**self.tags, LAYER=layer)
+            raster.update_tags(**self.tags, **{LAYER_TAG: layer})
             if layer == "road_height":
                 raster.descriptions, raster.units = zip(*ROAD_HEIGHT_BANDS, strict=True)
             self._open[layer] = raster
@@ -292,12 +292,12 @@ class RasterWriter:
     def _writing(self, layer: str) -> Iterator[None]:
         try:
             yield
-        except (OSError, RasterioError, CRSError) as error:
-            # rasterio's error is raised from GDAL's, which has the reason.
-            reason = error.__cause__ or error
+        except CRSError as error:
             raise ConfigError(
-                f"cannot write {self.out / layer}.tif: {reason}; free disk space and repeat"
+                f"cannot write {self.out / layer}.tif: {error}; choose another CRS with --to-crs"
             ) from error
+        except (OSError, RasterioError) as error:
+            raise write_error(self.out / f"{layer}.tif", error) from error
 
 
 def _profile(layer: str) -> Mapping[str, Any]:

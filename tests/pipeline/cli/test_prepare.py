@@ -1,16 +1,20 @@
 """``flexroad prepare`` on the command line: output, exit code and output folder."""
 
+import os
 import signal
 import subprocess
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from shapely import box
 
 from flexroad.catalog import Catalog
+from flexroad.pipeline.run.lock import Owner, run_lock
 from tests.command_line import PROCESS, call
 from tests.make_clouds import write_cloud
+from tests.permissions import permissions_enforced
 
 WEST, SOUTH = 356_000.0, 5_699_000.0
 AHN = ("--class-scheme", "ahn")
@@ -93,6 +97,58 @@ def test_prepare_invalid_input_is_one_line_and_leaves_no_folder(cloud, tmp_path,
     (error,) = (line for line in output.splitlines() if line.startswith("error: "))
     assert message in error
     assert not (tmp_path / "out").exists()
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def refusal(*words) -> str:
+    output = flexroad("prepare", *words, "--workers", 1, expect=2)
+    (error,) = (line for line in output.splitlines() if line.startswith("error: "))
+    assert "reading" not in output
+    return error
+
+
+@pytest.mark.parametrize("command", ["points", "mesh", "odm", "photos"])
+def test_prepare_into_folder_with_raster_of_others_changes_nothing(cloud, tmp_path, command):
+    (tmp_path / "dtm.tif").write_bytes(b"mine")
+    assert f"{tmp_path / 'dtm.tif'} is not of an earlier" in refusal(command, cloud, "-o", tmp_path)
+    assert contents(tmp_path) == {"dtm.tif": b"mine"}
+
+
+def test_prepare_again_replaces_own_outputs(cloud, tmp_path):
+    for _ in range(2):
+        flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
+    assert not (tmp_path / "lock.json").exists()
+
+
+def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
+    with run_lock(tmp_path):
+        error = refusal("points", cloud, "-o", tmp_path)
+        assert f"{tmp_path} is in use by pid {os.getpid()} " in error
+        assert f"end it with `kill {os.getpid()}`" in error
+        assert contents(tmp_path).keys() == {"lock.json"}
+
+
+def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_path):
+    (tmp_path / "lock.json").write_bytes(replace(Owner.me(), boot="before").data)
+    said = flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
+    assert "note: took over the lock of pid" in said
+    assert not (tmp_path / "lock.json").exists()
+
+
+def test_prepare_into_folder_that_cannot_be_written_names_the_remedy(cloud, tmp_path):
+    (tmp_path / "closed").mkdir(mode=0o555)
+    with permissions_enforced():
+        error = refusal("points", cloud, "-o", tmp_path / "closed")
+    remedy = "Permission denied; correct that or choose another folder with -o"
+    assert error == f"error: cannot write to {tmp_path / 'closed'}: {remedy}"
+    (tmp_path / "file").write_text("mine")
+    error = refusal("points", cloud, "-o", tmp_path / "file")
+    assert error == f"error: {tmp_path / 'file'} is a file; choose a folder with -o"
+    error = refusal("points", cloud, "-o", tmp_path / "file" / "new")
+    assert f"cannot write to {tmp_path / 'file' / 'new'}: Not a directory; correct that" in error
 
 
 def test_prepare_misspelt_option_suggests_the_right_one(cloud, tmp_path):

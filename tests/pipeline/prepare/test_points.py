@@ -312,7 +312,7 @@ def test_prepare_points_full_disk_is_one_line_and_keeps_existing_files(tmp_path)
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, unlimited[1]))
     try:
-        with pytest.raises(ConfigError, match="cannot write to .*out: .*; free disk space and repeat"):
+        with pytest.raises(ConfigError, match="cannot write to .*out: File too large; correct that"):
             prepare(files, tmp_path / "out")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
