@@ -66,7 +66,7 @@ def export(
     for kind in chosen.values():
         if kind.check:
             kind.check(source, options)
-    with held(out, source.run, notify):
+    with held(out, source.run, chosen, notify):
         written = _earlier(out, source, options, chosen, notify)
         for name, kind in chosen.items():
             written[name] = _written(source, out / name, name, kind, options, executor, track, notify)

@@ -1,34 +1,40 @@
-"""The folder of an export: one export at a time writes it, and it is not a part of the run."""
+"""The folder of an export: outside the run, written by one export at a time; files of others stay."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from flexroad.catalog.storage.outputs import output_file
-from flexroad.catalog.storage.paths import Location, absolute, listing
+from flexroad.catalog.storage.paths import Location, absolute, exists, listing, read, visible_entry, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.artefacts import PROBE, check_writable
 
 MANIFEST = "export.json"
+BEGUN = ".flexroad-export"
+"""File with the formats of the folder: written first, so that an interrupted export is known, too."""
 
 
 @contextmanager
-def held(out: Location, run: Run, notify: Callable[[str], None]) -> Iterator[None]:
+def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
     """Make the folder and hold its lock; a context manager.
 
     Parameters
     ----------
+    formats : collection of str
+        The formats to write, each into a folder of its name.
     notify : callable
         Receives one line when the lock of a dead process is taken over.
 
     Raises
     ------
     ConfigError
-        If the folder is the run, its store or inside one of them, or another process writes there.
+        If the folder is the run, its store or inside one of them, has files of others that would be replaced,
+        or another process writes there.
     OSError
         If it, or its manifest, cannot be written.
     """
@@ -36,12 +42,52 @@ def held(out: Location, run: Run, notify: Callable[[str], None]) -> Iterator[Non
         inside = [str(absolute(place)) for place in (out, *out.parents)]
         if str(absolute(folder)) in inside:
             raise ConfigError(f"--output {out} lies in the run ({folder}); choose a folder outside")
+    begun = _begun(out, formats)
     check_writable(out)
     if isinstance(out, Path):
         output_file(out / MANIFEST)
     with run_lock(out, notify):
         remove_unfinished(out)
+        write(out / BEGUN, "".join(f"{name}\n" for name in sorted(begun)).encode())
         yield
+
+
+def _begun(out: Location, formats: Collection[str]) -> set[str]:
+    """Return the formats of the folder that this or an earlier export has written or begun.
+
+    Raises
+    ------
+    ConfigError
+        If the manifest, or a file in the folder of a format, is not of an earlier export.
+    """
+    own = _formats(out)
+    if own is None and exists(out / MANIFEST):
+        raise _foreign(out / MANIFEST)
+    earlier = own or set()
+    for name in formats:
+        other = None if name in earlier else visible_entry(out / name)
+        if other is not None:
+            raise _foreign(out / name / other)
+    return {*earlier, *formats}
+
+
+def _formats(out: Location) -> set[str] | None:
+    """Return the formats of earlier exports into the folder, None if there was none."""
+    if exists(out / BEGUN):
+        return set(read(out / BEGUN).decode(errors="replace").split())
+    try:
+        # An export of an earlier version.
+        manifest = json.loads(read(out / MANIFEST)) if exists(out / MANIFEST) else {}
+        return set(manifest["formats"]) if manifest["flexroad"] else None
+    except (IsADirectoryError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _foreign(file: Location) -> ConfigError:
+    return ConfigError(
+        f"{file} is not of an earlier `flexroad export` and would be replaced; "
+        "choose another folder with -o, or move that file away"
+    )
 
 
 def remove_unfinished(folder: Location, below: bool = False) -> None:

@@ -2,12 +2,14 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
+from flexroad.pipeline.export.output import BEGUN
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.lock import run_lock
 from tests.permissions import permissions_enforced
@@ -125,11 +127,43 @@ def test_manifest_that_is_a_folder_is_refused_before_any_work(made_city, refused
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"formats": 3}', "\x00"])
 def test_damaged_or_read_only_manifest_is_replaced(made_city, flexroad, tmp_path, content):
+    (tmp_path / BEGUN).write_text("obj\n")
     (tmp_path / "export.json").write_text(content)
     (tmp_path / "export.json").chmod(0o444)
     with permissions_enforced():
         flexroad("export", made_city.path, "--format", "obj", "-o", tmp_path).expected(0)
     assert json.loads((tmp_path / "export.json").read_text())["tiles"] == 2
+
+
+@pytest.mark.parametrize("content", ["", "mine", "[]", '{"formats": {}}'])
+@pytest.mark.parametrize("file", ["export.json", "mosaic/height.tif"])
+def test_files_of_others_are_refused_and_stay(made_city, refused, tmp_path, file, content):
+    (tmp_path / "mosaic").mkdir()
+    (tmp_path / file).write_text(content)
+    line = refused(made_city.path, "--format", "mosaic", "-o", tmp_path)
+    assert line.startswith(
+        f"error: {tmp_path / file} is not of an earlier `flexroad export` and would be replaced; "
+    )
+    assert [path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()] == [Path(file)]
+    assert (tmp_path / file).read_text() == content
+
+
+def test_files_of_others_in_the_folder_of_another_format_are_refused(made_city, refused, flexroad, tmp_path):
+    (tmp_path / "mosaic").mkdir()
+    (tmp_path / "mosaic" / "height.tif").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    flexroad("export", made_city.path, "--format", "obj", "-o", tmp_path).expected(0)
+    line = refused(made_city.path, "--format", "obj,mosaic", "-o", tmp_path)
+    assert str(tmp_path / "mosaic" / "height.tif") in line
+    assert (tmp_path / "mosaic" / "height.tif").read_text() == "mine"
+
+
+def test_export_of_an_earlier_version_goes_on(made_city, flexroad, tmp_path):
+    words = ["export", made_city.path, "--format", "obj", "-o", tmp_path]
+    flexroad(*words).expected(0)
+    (tmp_path / BEGUN).unlink()
+    flexroad(*words).expected(0)
+    assert (tmp_path / BEGUN).read_text() == "obj\n"
 
 
 def test_folder_that_another_export_writes_is_refused(made_city, refused, flexroad, tmp_path):

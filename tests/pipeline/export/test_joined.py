@@ -8,6 +8,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import joined, pieces
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.output import BEGUN
 from flexroad.pipeline.export.source import select
 from flexroad.tasks.export import cityjson, landxml
 
@@ -53,7 +54,7 @@ def test_only_the_file_is_left(made_city, tmp_path, name):
     write(made_city, tmp_path, name)
     (file,) = (tmp_path / name).iterdir()
     assert file.is_file()
-    assert {path.name for path in tmp_path.iterdir()} == {name, f".{name}.json", "export.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {name, f".{name}.json", "export.json", BEGUN}
 
 
 @each

@@ -13,6 +13,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
 from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.output import BEGUN
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -78,6 +79,7 @@ def test_command_writes_into_a_bucket(made_city, bucket, flexroad):
     left = bucket.fs.find(bucket.path)
     assert {path.rpartition("/area/")[2] for path in left} == {
         "out/export.json",
+        f"out/{BEGUN}",
         "out/.landxml.json",
         "out/landxml/city.xml",
     }
