@@ -22,6 +22,13 @@ class TaskError(Exception):
         self.layer = layer
 
 
+class Unusable(TaskError):
+    """A source file that is missing or broken, or does not have what its layer needs.
+
+    Tiles that do not need it leave it out.
+    """
+
+
 class LayerMissing(TaskError):
     """A tile lacks a layer that a stage needs; around a border of tiles it may end before the heights do."""
 

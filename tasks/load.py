@@ -6,8 +6,8 @@ in the north and NaN where there is no value.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,15 +15,15 @@ from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER
-from flexroad.catalog.storage.paths import Location, stat
+from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.height_units import absurd_note, check_units, in_metres, with_unit
+from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 if TYPE_CHECKING:
-    from flexroad.tasks.io.raster import RasterWindow, Unreadable
+    from flexroad.tasks.io.mosaic import Mosaic
 
 VERSION = 3
 
@@ -66,26 +66,6 @@ class Options(options.Options):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Mosaic:
-    """One layer on the tile's lattice."""
-
-    values: Floats
-    """``(H, W)``, heights in m or class values; NaN where no file has a value."""
-    patches: tuple[RasterWindow, ...]
-    """The parts read, in the order of the files."""
-    notes: tuple[str, ...]
-    broken: tuple[Unreadable, ...]
-    """The errors of missing and broken files."""
-
-    def reached(self, grid: Grid) -> Bools:
-        """Return the cells of a grid within the bounds of a file that was read, ``(H, W)``."""
-        cells = np.zeros(grid.shape, np.bool_)
-        for patch in self.patches:
-            cells |= patch.lattice.reached(grid)
-        return cells
-
-
 def load(tile: Tile, options: Options) -> TileData:
     """Read a tile's DSM, DTM, masks and reference onto its lattice, grown by the halo.
 
@@ -96,9 +76,9 @@ def load(tile: Tile, options: Options) -> TileData:
     Raises
     ------
     TaskError
-        If the tile's entry in the catalog cannot be used (`Tile.fault`), a file that the tile needs is
-        missing or broken, a file is in another CRS, the layers differ in
-        their unit of height, the tile has no DSM or DTM, or the DSM covers less than ``min_valid`` of it.
+        If the tile's entry in the catalog cannot be used (`Tile.fault`), a file that the tile needs cannot be
+        used (`Unusable`), the layers differ in their unit of height, the tile has no DSM or DTM, or the DSM
+        covers less than ``min_valid`` of it.
     """
     if tile.fault:
         raise TaskError(tile.fault)
@@ -107,6 +87,7 @@ def load(tile: Tile, options: Options) -> TileData:
             option = name.replace("_", "-")
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{option}")
     from flexroad.catalog.headers.rasters import quiet
+    from flexroad.tasks.io.mosaic import read_mosaic
 
     grid = tile.grid.buffered(options.halo_m)
     if grid.width * grid.height > MAX_CELLS:
@@ -115,19 +96,18 @@ def load(tile: Tile, options: Options) -> TileData:
             "catalog smaller tiles (--tile-size)"
         )
     tile = tile.within(grid.bounds)
-    core = grid.window(tile.grid)
     with quiet():
         mosaics = {
-            layer.name: _mosaic(tile, layer, grid, tile.grid)
+            layer.name: read_mosaic(tile, layer, grid, tile.grid)
             for layer in tile.layers
             if _is_read(layer, options)
         }
-    for layer in tile.layers:
-        if layer.name in mosaics:
-            _check_read(tile, layer, mosaics[layer.name], core, grid)
+        for mosaic in mosaics.values():
+            mosaic.check_read(tile.grid)
     check_units([patch for name in HEIGHTS if name in mosaics for patch in mosaics[name].patches])
-    _check_valid(mosaics["dsm"], core, options.min_valid)
-    _check_valid(mosaics["dtm"], core, 0.0)
+    with quiet():
+        mosaics["dsm"].check_valid(tile, options.min_valid)
+        mosaics["dtm"].check_valid(tile, 0.0)
     offset_dsm, remarks = _offset(tile, options)
     return TileData(
         tile_id=tile.id,
@@ -149,6 +129,8 @@ def load(tile: Tile, options: Options) -> TileData:
 def load_border(ground: Tile, core: Grid, options: Options | None = None) -> TileData:
     """Read the ground around a corner or an edge of tiles; it may be without data in part or everywhere.
 
+    Files that cannot be used (`Unusable`) are left out: they fail the tiles that they lie on.
+
     Parameters
     ----------
     ground : Tile
@@ -164,11 +146,12 @@ def load_border(ground: Tile, core: Grid, options: Options | None = None) -> Til
         If the layers differ in their unit of height.
     """
     from flexroad.catalog.headers.rasters import quiet
+    from flexroad.tasks.io.mosaic import read_mosaic
 
     grid, chosen = ground.grid, options or Options()
     with quiet():
         mosaics = {
-            layer.name: _mosaic(ground, layer, grid, core, around=True)
+            layer.name: read_mosaic(ground, layer, grid, core, around=True)
             for layer in ground.layers
             if _is_read(layer, chosen)
         }
@@ -232,7 +215,7 @@ def _optional(source: Source | None) -> Source | None:
     return replace(source, optional=True) if source else None
 
 
-def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:
+def _reference(mosaics: Mapping[str, Mosaic]) -> Floats | None:
     """Return the layer ``reference``, else the paper's extended DTM (DTM and bridge decks), else None."""
     if "reference" in mosaics:
         return mosaics["reference"].values
@@ -242,114 +225,7 @@ def _reference(mosaics: Mapping[str, _Mosaic]) -> Floats | None:
     return np.where(np.isfinite(decks), decks, mosaics["dtm"].values)
 
 
-def _mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> _Mosaic:
-    """Return a layer on a grid; files that are missing or broken are left out.
-
-    If the grid is ground ``around`` tiles, so are those in another CRS: they fail the tiles that they lie on.
-    """
-    from rasterio.enums import Resampling
-
-    from flexroad.tasks.io.raster import Unreadable, fill_from, joined
-
-    values = np.full(grid.shape, np.nan)
-    warped: list[RasterWindow] = []
-    broken: list[Unreadable] = []
-    heights = layer.name in HEIGHTS
-    resampling = Resampling.bilinear if heights else Resampling.nearest
-    patches: list[RasterWindow] = []
-    absurd_cells = 0
-    for name, path in zip(layer.files, tile.paths(layer), strict=True):
-        try:
-            patch = _window(tile, layer, name, path, grid, core, around)
-        except Unreadable as error:
-            broken.append(error)
-            continue
-        if patch is None:
-            continue
-        if heights:
-            patch, absurd = in_metres(with_unit(patch, layer))
-            absurd_cells += absurd
-        patches.append(patch)
-        if patch.lattice.crs:
-            warped.append(patch)
-            continue
-        fill_from(patch, grid, values, resampling)
-        if not np.isnan(values).any():
-            break
-    # After the files in the tile's CRS, which lose nothing.
-    for patch in joined(warped):
-        fill_from(patch, grid, values, resampling)
-    notes = _notes(layer, patches, grid)
-    notes += [f"a file that the tile does not need was left out: {error}" for error in broken]
-    if absurd_cells:
-        notes.append(absurd_note(layer.name, absurd_cells))
-    return _Mosaic(values, tuple(patches), tuple(notes), tuple(broken))
-
-
-def _check_read(tile: Tile, layer: Layer, mosaic: _Mosaic, core: tuple[slice, slice], grid: Grid) -> None:
-    """Raise an error if a layer is missing on the tile itself, or a file that it needs is broken."""
-    # A tile also lists files around it: a broken file fails only the tiles that need it.
-    if mosaic.broken and not mosaic.reached(grid)[core].all():
-        raise TaskError(str(mosaic.broken[0]), mosaic.broken[0].file)
-    if not mosaic.patches:
-        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
-        raise TaskError(
-            f"no {layer.name} file overlaps the tile ({bounds}): {', '.join(layer.files[:3])}; "
-            "build the catalog again",
-            str(tile.paths(layer)[0]),
-        )
-
-
-def _window(
-    tile: Tile, layer: Layer, name: str, path: Location, grid: Grid, core: Grid, around: bool
-) -> RasterWindow | None:
-    """Return the part of a file that covers a grid, None if there is none; see `_mosaic`."""
-    from rasterio.enums import Resampling
-
-    from flexroad.tasks.io.raster import read_window
-    from flexroad.tasks.io.raster_header import OtherCrs
-
-    heights = layer.name in HEIGHTS
-    together = Resampling.average if heights else Resampling.mode
-    title = f"{layer.name} {name}"
-    try:
-        return read_window(
-            path, title, grid, core, layer.crs, together, tile.allowed, heights, layer.reproject
-        )
-    except OtherCrs as error:
-        if around:
-            return None
-        raise TaskError(str(error), error.file) from error
-
-
-def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[str]:
-    """Return notes on patches that were resampled or reprojected, and on units that were assumed."""
-    from flexroad.tasks.io.raster import misalignment
-
-    notes = []
-    for patch in patches:
-        if reason := misalignment(patch.file_lattice, grid):
-            how = "reprojected" if patch.lattice.crs else "resampled"
-            notes.append(f"{layer.name} {how}: {reason}")
-        if patch.unit_assumed:
-            notes.append(f"{layer.name}: heights taken to be in {patch.unit}, as the file declares no unit")
-    return list(dict.fromkeys(notes))
-
-
-def _check_valid(mosaic: _Mosaic, core: tuple[slice, slice], min_valid: float) -> None:
-    first = mosaic.patches[0]
-    share = 1 - np.isnan(mosaic.values[core]).mean()
-    if share == 0:
-        raise TaskError(f"{first.name} has only nodata on this tile; leave the tile out", first.file)
-    if share < min_valid:
-        raise TaskError(
-            f"{first.name} has {share:.1%} valid cells on this tile, below {min_valid:.0%}; "
-            "lower load.min_valid to keep such tiles",
-            first.file,
-        )
-
-
-def _road(tile: Tile, name: str, mosaics: Mapping[str, _Mosaic]) -> Bools | None:
+def _road(tile: Tile, name: str, mosaics: Mapping[str, Mosaic]) -> Bools | None:
     """Return the road cells of a mask, or None if the tile has no such layer."""
     layer = tile.layer(name)
     if layer is None:

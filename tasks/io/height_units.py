@@ -12,7 +12,7 @@ import numpy as np
 from flexroad.catalog.crs import Unit, height_unit, is_projected, plan_unit
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import Layer
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights outside this range are taken as undeclared nodata."""
 
+SMALLER = {"cm": 100, "mm": 1000}
+"""Units that heights outside the range may be in, with their number in a metre."""
+
 METRE: Unit = ("metre", 1.0)
 
 UNITS = {
@@ -28,6 +31,7 @@ UNITS = {
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
     **dict.fromkeys(("us-ft", "us-foot", "ftus", "foot_us", "us survey foot", "us survey feet"), 1200 / 3937),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
 }
 """Size (m) of the units of height that bands declare; names in lower case."""
 
@@ -60,13 +64,36 @@ def absurd_note(layer: str, removed: int) -> str:
     return f"{layer}: {count(removed, 'cell')} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
 
 
+def smaller_unit_fault(patch: RasterWindow) -> str | None:
+    """Return that all heights are outside the range as they are in a smaller unit, to follow the file's name.
+
+    None if they vary too little or too much for heights in one of `SMALLER`.
+    """
+    heights = patch.values * _unit(patch)[1]
+    most = max(SMALLER.values())
+    heights = heights[(heights >= LOWEST_M * most) & (heights <= HIGHEST_M * most)]
+    heights = heights[(heights < LOWEST_M) | (heights > HIGHEST_M)]
+    low, high = (heights.min(), heights.max()) if heights.size else (0.0, 0.0)
+    fitting = [
+        unit for unit, number in SMALLER.items() if LOWEST_M <= low / number <= high / number <= HIGHEST_M
+    ]
+    if low == high or not fitting:
+        return None
+    numbers = " or ".join(str(SMALLER[unit]) for unit in fitting)
+    return (
+        f": all {heights.size} heights on this tile are outside {LOWEST_M:g} to {HIGHEST_M:g} m "
+        f"({low:.0f} to {high:.0f}); if they are in {' or '.join(fitting)}, divide them by {numbers}, "
+        "or declare that unit with gdal_edit.py -units"
+    )
+
+
 def _unit(patch: RasterWindow) -> Unit:
     """Return the unit of heights declared by the band, else by the CRS, else metres."""
     if not patch.unit:
         return (height_unit(patch.crs) if patch.crs else None) or METRE
     metres = UNITS.get(patch.unit.lower())
     if metres is None:
-        raise TaskError(
+        raise Unusable(
             f"{patch.name} has the unit {patch.unit!r}, which is not a supported unit of height; "
             "convert it, or correct the unit with gdal_edit.py -units m",
             patch.file,

@@ -18,8 +18,8 @@ from rasterio.vrt import WarpedVRT
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
-from flexroad.tasks.errors import LayerMissing, TaskError
-from flexroad.tasks.io.raster import Unreadable, opened
+from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
+from flexroad.tasks.io.raster import opened
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import place
 from flexroad.tasks.types import Bools, Orthophoto, Source
@@ -53,20 +53,20 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
     Raises
     ------
     TaskError
-        If a file that the area needs is missing or broken; if a file is rotated, in another CRS, or its
-        colours are not supported.
+        If a file that the area needs is missing or broken, is rotated, in another CRS, or its colours are
+        not supported.
     LayerMissing
         If no file reaches the grid.
     """
     photo: Orthophoto | None = None
-    broken: list[Unreadable] = []
+    unusable: list[Unusable] = []
     reached = np.zeros((1, 1), bool)
     with quiet():
         for path in source.paths:
             try:
                 part = _read(path, source, grid, gsd_m, finest_m)
-            except Unreadable as error:
-                broken.append(error)
+            except Unusable as error:
+                unusable.append(error)
                 continue
             if part is None:
                 continue
@@ -75,9 +75,9 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
             reached = reached | lattice.reached(piece.grid)
             if photo.known.all():
                 break
-    # A tile also lists files around it: a broken file fails only the tiles that need it.
-    if broken and not (source.optional or reached.all()):
-        raise TaskError(str(broken[0]), broken[0].file, source.name)
+    # A tile also lists files around it: an unusable file fails only the tiles that need it.
+    if unusable and not (source.optional or reached.all()):
+        raise TaskError(str(unusable[0]), unusable[0].file, source.name)
     if photo is None:
         bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         names = ", ".join(path.name for path in source.paths[:3])
@@ -126,11 +126,11 @@ def _depth(src: Any, path: Location, name: str) -> int:
     """Return the number of bits per colour."""
     kind = src.dtypes[0]
     if src.colorinterp[0] == ColorInterp.palette:
-        raise TaskError(
+        raise Unusable(
             f"{name} has a palette instead of colours; expand it with gdal_translate -expand rgb", str(path)
         )
     if kind not in BITS:
-        raise TaskError(
+        raise Unusable(
             f"{name} has colours in {kind}, not 8 or 16 bits; convert it with gdal_translate -ot Byte -scale",
             str(path),
         )

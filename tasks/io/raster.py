@@ -24,7 +24,7 @@ from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.paths import Location, is_remote, stat
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import header, place
 from flexroad.tasks.types import Floats
@@ -34,7 +34,7 @@ EXACT = 1e-9
 for no value."""
 
 
-class Unreadable(TaskError):
+class Unreadable(Unusable):
     """A file that is missing or broken, so that its position is unknown."""
 
 
@@ -112,13 +112,13 @@ def read_window(
     ------
     Unreadable
         If the file is missing or broken.
-    TaskError
+    Unusable
         If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
     """
     with opened(path, name, allowed, kept_raster) as src:
         fault = heights_fault(src) if heights else None
         if fault:
-            raise TaskError(f"{name} {fault}", str(path))
+            raise Unusable(f"{name} {fault}", str(path))
         lattice = place(src, path, name, grid, core, crs, reproject)
         slices = lattice.window_for(grid) if lattice else None
         if lattice is None or slices is None:

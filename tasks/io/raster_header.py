@@ -13,12 +13,8 @@ from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.headers.raster_faults import georeference_fault
 from flexroad.catalog.storage.paths import Location
-from flexroad.tasks.errors import TaskError
+from flexroad.tasks.errors import Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
-
-
-class OtherCrs(TaskError):
-    """A file is in another CRS than the grid that it overlaps."""
 
 
 @dataclass(frozen=True)
@@ -77,30 +73,30 @@ def place(
 
     Raises
     ------
-    TaskError
+    Unusable
         If the file is rotated, overlaps the grid in another CRS, or its position is unknown.
     """
     found = header(src)
     if found.fault:
-        raise TaskError(f"{name} {found.fault}", str(path))
+        raise Unusable(f"{name} {found.fault}", str(path))
     lattice, file_crs = found.lattice, found.crs or crs
     if lattice is None:
         if src.shape == core.shape:
             return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
-        raise TaskError(
+        raise Unusable(
             f"{name} has no georeference and has {src.width} x {src.height} cells, "
             f"the tile {core.width} x {core.height}; give it a world file",
             str(path),
         )
     if file_crs is None:
-        raise TaskError(f"{name} has no CRS; build the catalog again with --crs", str(path))
+        raise Unusable(f"{name} has no CRS; build the catalog again with --crs", str(path))
     if same(file_crs, grid.crs):
         return lattice
     if not _overlap(bounds_in(grid.crs, file_crs, lattice.bounds), grid.bounds):
         return None
     if reproject:
         return replace(lattice, crs=in_plan(file_crs))
-    raise OtherCrs(
+    raise Unusable(
         f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
         f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}, or make the catalog with --reproject",
         str(path),

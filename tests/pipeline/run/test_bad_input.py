@@ -157,7 +157,7 @@ FAULTS = (
     Fault(_a_pipe, "dsm", "is not a regular file; replace it by one"),
     Fault(_a_vrt_of_the_web, "dtm", "is a VRT that names '/vsicurl/.*; only mosaics of local files"),
     Fault(_a_text, "road_mask", "cannot be read: .*; fetch it again"),
-    Fault(_elsewhere, "dsm", r"no dsm file overlaps the tile \(.*\): .*; build the catalog again"),
+    Fault(_elsewhere, "dsm", "does not reach the tile now: it lies at .*; build the catalog again"),
     Fault(_other_crs, "dtm", "is in EPSG:25833, the tile in EPSG:25832; .*gdalwarp -t_srs EPSG:25832"),
     Fault(_in_feet, "dtm", "has heights in metre, dtm .* in ft; convert one, or correct its unit"),
     Fault(_in_fathoms, "dsm", "has the unit 'fathom', which is not a supported unit of height; convert it"),

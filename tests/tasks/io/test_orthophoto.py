@@ -170,3 +170,10 @@ def test_read_photo_broken_file_fails_only_where_needed(tmp_path):
     west = Grid(UTM, GRID.west, GRID.north, 1.0, 10, 12)
     assert read_photo(source(gone, half), west).known.all()
     fails("gone.tif is missing", gone, half)
+
+
+def test_read_photo_unusable_file_fails_only_where_needed(tmp_path):
+    whole = write(tmp_path / "whole.tif", bands())
+    bare = write(tmp_path / "bare.tif", bands(), crs=None)
+    photo = read_photo(source(bare, whole), GRID)
+    np.testing.assert_array_equal(photo.colour, bands())

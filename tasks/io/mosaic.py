@@ -1,0 +1,242 @@
+"""One layer on a grid: the files that a tile lists for it, laid over each other.
+
+A tile also lists files around it. A file that cannot be used is left out, and fails only tiles that need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rasterio.enums import Resampling
+
+from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.crs import bounds_in, in_plan, same, short
+from flexroad.catalog.grid import FARTHEST, Bounds, overlap
+from flexroad.catalog.headers.kept_rasters import kept_raster
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.tile import HEIGHTS, TOUCH_M
+from flexroad.tasks.errors import TaskError, Unusable
+from flexroad.tasks.io.height_units import absurd_note, in_metres, smaller_unit_fault, with_unit
+from flexroad.tasks.io.raster import RasterWindow, fill_from, joined, misalignment, opened, read_window
+from flexroad.tasks.io.raster_header import header
+from flexroad.tasks.types import Bools, Floats
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file of a layer, as the catalog lists it."""
+
+    title: str
+    """Its name in messages: ``dsm a.tif``."""
+    path: Location
+    extent: Bounds | None
+    """West, south, east and north in the catalog (m, in the tile's CRS), None if they are unknown."""
+
+    def may_lie_on(self, grid: Grid) -> bool:
+        """Return whether the file lies on a grid, as far as the catalog knows."""
+        return self.extent is None or overlap(self.extent, grid.bounds, TOUCH_M)
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """One layer on the tile's lattice."""
+
+    values: Floats
+    """``(H, W)``, heights in m or class values; NaN where no file has a value."""
+    grid: Grid
+    """The lattice."""
+    layer: Layer
+    files: tuple[SourceFile, ...]
+    """All files of the layer, those that are not read as well."""
+    patches: tuple[RasterWindow, ...]
+    """The parts read, in the order of the files."""
+    notes: tuple[str, ...]
+    left_out: tuple[tuple[SourceFile, Unusable], ...]
+    """Files that cannot be used."""
+
+    def reached(self, core: Grid) -> Bools:
+        """Return the cells of a tile within the bounds of a file that was read, ``(h, w)``."""
+        cells = np.zeros(core.shape, np.bool_)
+        for patch in self.patches:
+            cells |= patch.lattice.reached(core)
+        return cells
+
+    def main_file(self, core: Grid) -> SourceFile:
+        """Return the file that covers most of a tile: by its extent in the catalog, else by what was read."""
+        read = {patch.file: patch.lattice.bounds for patch in self.patches if not patch.lattice.crs}
+        return max(
+            self.files, key=lambda file: _shared_m2(file.extent or read.get(str(file.path)), core.bounds)
+        )
+
+    def check_read(self, core: Grid) -> None:
+        """Raise an error if the layer is missing on the tile itself, or a file that it needs is left out."""
+        needed = [error for file, error in self._left_out_from_main(core) if file.may_lie_on(core)]
+        if needed and not self.reached(core).all():
+            raise TaskError(str(needed[0]), needed[0].file)
+        if not self.patches:
+            bounds = " ".join(f"{edge:.10g}" for edge in self.grid.bounds)
+            raise TaskError(
+                f"no {self.layer.name} file overlaps the tile ({bounds}): {', '.join(self.layer.files[:3])}; "
+                "build the catalog again",
+                str(self.files[0].path),
+            )
+
+    def check_valid(self, tile: Tile, min_valid: float) -> None:
+        """Raise an error if the layer has no heights on the tile, or in less than a share of its cells."""
+        share = 1 - np.isnan(self.values[self.grid.window(tile.grid)]).mean()
+        if share > 0 and share >= min_valid:
+            return
+        main = self.main_file(tile.grid)
+        for file, error in self.left_out:
+            if file == main:
+                raise TaskError(str(error), error.file)
+        if share > 0:
+            fault = (
+                f" has {share:.1%} valid cells on this tile, below {min_valid:.0%}; "
+                "lower load.min_valid to keep such tiles"
+            )
+        else:
+            fault = self._smaller_unit(main, tile) or " has only nodata on this tile; leave the tile out"
+        raise TaskError(f"{main.title}{fault}", str(main.path))
+
+    def _left_out_from_main(self, core: Grid) -> list[tuple[SourceFile, Unusable]]:
+        """Return the files left out; the one that covers most of the tile comes first."""
+        main = self.main_file(core)
+        return sorted(self.left_out, key=lambda pair: pair[0] != main)
+
+    def _smaller_unit(self, file: SourceFile, tile: Tile) -> str | None:
+        """Return that the file's heights on the tile may be in a smaller unit than metres, None if not."""
+        patch = _window(tile, self.layer, file, tile.grid, tile.grid)
+        return smaller_unit_fault(with_unit(patch, self.layer)) if patch else None
+
+
+def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool = False) -> Mosaic:
+    """Return a layer on a grid; files that cannot be used are left out.
+
+    Parameters
+    ----------
+    tile : Tile
+        With the files to read (`Tile.within`, `Tile.around`).
+    layer : Layer
+        The layer of the tile.
+    grid : Grid
+        The cells of the result.
+    core : Grid
+        The tile that the files are of: the position of a file without georeference and of unknown extent.
+    around : bool
+        Whether the grid is ground around tiles: then it is not checked whether files have moved.
+    """
+    values = np.full(grid.shape, np.nan)
+    heights = layer.name in HEIGHTS
+    resampling = Resampling.bilinear if heights else Resampling.nearest
+    files = _files(tile, layer)
+    warped: list[RasterWindow] = []
+    patches: list[RasterWindow] = []
+    left_out: list[tuple[SourceFile, Unusable]] = []
+    absurd_cells = 0
+    for file in files:
+        try:
+            patch = _window(tile, layer, file, grid, core)
+            if not around:
+                _check_place(tile, layer, file, patch)
+            if patch and heights:
+                patch, absurd = in_metres(with_unit(patch, layer))
+                absurd_cells += absurd
+        except Unusable as error:
+            left_out.append((file, error))
+            continue
+        if patch is None:
+            continue
+        patches.append(patch)
+        if patch.lattice.crs:
+            warped.append(patch)
+            continue
+        fill_from(patch, grid, values, resampling)
+        if not np.isnan(values).any():
+            break
+    # After the files in the tile's CRS, which lose nothing.
+    for patch in joined(warped):
+        fill_from(patch, grid, values, resampling)
+    notes = _notes(layer, patches, grid)
+    notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
+    if absurd_cells:
+        notes.append(absurd_note(layer.name, absurd_cells))
+    return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), tuple(left_out))
+
+
+def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:
+    extents: Iterable[Bounds | None] = layer.extents or [None] * len(layer.files)
+    return tuple(
+        SourceFile(f"{layer.name} {name}", path, extent)
+        for name, path, extent in zip(layer.files, tile.paths(layer), extents, strict=True)
+    )
+
+
+def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) -> RasterWindow | None:
+    """Return the part of a file that covers a grid, None if there is none; see `read_window`."""
+    heights = layer.name in HEIGHTS
+    return read_window(
+        file.path,
+        file.title,
+        grid,
+        _position(file, core),
+        layer.crs,
+        Resampling.average if heights else Resampling.mode,
+        tile.allowed,
+        heights,
+        layer.reproject,
+    )
+
+
+def _position(file: SourceFile, core: Grid) -> Grid:
+    """Return where a file lies if it has no georeference: at its extent, which is the same for all tiles."""
+    if file.extent is None or max(map(abs, file.extent)) > FARTHEST:
+        return core
+    return Grid.covering(core.crs, file.extent, core.cell)
+
+
+def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow | None) -> None:
+    """Raise an error if a file lies on the tile by the catalog, but does not now.
+
+    Its place is compared with the catalog's, because an extent in another CRS holds more than the file.
+    """
+    core = tile.grid
+    if file.extent is None or not file.may_lie_on(core) or (patch and patch.lattice.reached(core).any()):
+        return
+    with opened(file.path, file.title, tile.allowed, kept_raster) as raster:
+        found = header(raster)
+    crs = in_plan(found.crs or layer.crs or core.crs)
+    if found.lattice is None:
+        return
+    bounds = found.lattice.bounds
+    now = bounds if same(crs, core.crs) else bounds_in(core.crs, crs, bounds)
+    if all(abs(a - b) <= core.cell for a, b in zip(now, file.extent, strict=True)):
+        return
+    raise Unusable(
+        f"{file.title} does not reach the tile now: it lies at {' '.join(f'{edge:.10g}' for edge in bounds)} "
+        f"in {short(crs)}, elsewhere than the catalog says; build the catalog again",
+        str(file.path),
+    )
+
+
+def _shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
+    """Return the area that an extent shares with a tile (m2), 0 if it is None."""
+    if extent is None:
+        return 0.0
+    width = min(extent[2], bounds[2]) - max(extent[0], bounds[0])
+    height = min(extent[3], bounds[3]) - max(extent[1], bounds[1])
+    return max(width, 0.0) * max(height, 0.0)
+
+
+def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[str]:
+    """Return notes on patches that were resampled or reprojected, and on units that were assumed."""
+    notes = []
+    for patch in patches:
+        if reason := misalignment(patch.file_lattice, grid):
+            how = "reprojected" if patch.lattice.crs else "resampled"
+            notes.append(f"{layer.name} {how}: {reason}")
+        if patch.unit_assumed:
+            notes.append(f"{layer.name}: heights taken to be in {patch.unit}, as the file declares no unit")
+    return list(dict.fromkeys(notes))
