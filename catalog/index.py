@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -24,6 +24,7 @@ from pyproj.exceptions import CRSError
 
 from flexroad.catalog import geoparquet, ids
 from flexroad.catalog.area import Area
+from flexroad.catalog.crs import short
 from flexroad.catalog.entries import TileReader
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.geoparquet import Item, Unreadable
@@ -156,15 +157,39 @@ class Catalog:
                 raise CatalogError(f"no tile {tile_id!r} in the catalog; did you mean {', '.join(near)}?")
         tiles = [tile for tile in self.tiles if not ids or tile.id in set(ids)]
         if bbox is not None:
+            self._check_bbox(bbox)
             tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]
             if not tiles:
-                raise CatalogError(f"no tile touches --bbox {' '.join(f'{v:g}' for v in bbox)}")
+                raise CatalogError(f"no tile touches --bbox {_edges(bbox)}; {self._extent()}")
         if area is not None:
             usable = [tile for tile in tiles if not tile.fault]
             tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
             if not tiles:
                 raise area.none_touched()
         return Catalog(tuple(tiles))
+
+    def _check_bbox(self, bbox: Bounds) -> None:
+        west, south, east, north = bbox
+        if west > east or south > north:
+            raise CatalogError(
+                f"--bbox {_edges(bbox)} is empty; the order is west south east north; {self._extent()}"
+            )
+
+    def _extent(self) -> str:
+        """Return where the tiles lie, for a message."""
+        corners: dict[str, list[Bounds]] = defaultdict(list)
+        for tile in self.usable:
+            corners[tile.grid.crs].append(tile.grid.bounds)
+        places = []
+        for crs, bounds in corners.items():
+            west, south, east, north = zip(*bounds, strict=True)
+            edges = _edges((min(west), min(south), max(east), max(north)))
+            places.append(f"{edges} in {short(crs)}")
+        return f"the tiles lie within {' and '.join(places)}"
+
+
+def _edges(bounds: Bounds) -> str:
+    return " ".join(f"{edge:.10g}" for edge in bounds)
 
 
 def _location(path: Location | str) -> Location:

@@ -172,6 +172,13 @@ def test_select_by_id_and_bbox_returns_matching_tiles(tmp_path):
         catalog.select(ids=["295751_5629250"])
     with pytest.raises(CatalogError, match="no tile touches --bbox 0 0 1 1"):
         catalog.select(bbox=(0, 0, 1, 1))
+    within = "the tiles lie within 295500 5629250 296250 5629500 in EPSG:25832"
+    with pytest.raises(CatalogError, match=rf"no tile touches --bbox 0 0 1 1; {within}$"):
+        catalog.select(bbox=(0, 0, 1, 1))
+    order = "is empty; the order is west south east north"
+    for box in ((10, 10, 1, 11), (10, 10, 11, 1)):
+        with pytest.raises(CatalogError, match=rf"--bbox 10 10 \d+ \d+ {order}; {within}$"):
+            catalog.select(bbox=box)
 
 
 def test_select_by_area_returns_the_tiles_on_it(tmp_path):
