@@ -257,7 +257,7 @@ def _covered(
     root: Path, grids: Mapping[str, Grid], near: Mapping[str, _NearFiles], min_cover: float, reproject: bool
 ) -> tuple[dict[str, Grid], list[str]]:
     """Return the tiles of which the DSM covers at least ``min_cover``, and notes on the others."""
-    kept, thin, risky = dict[str, Grid](), list[str](), list[str]()
+    kept, thin, empty, risky = dict[str, Grid](), list[str](), list[str](), list[str]()
     for tile_id, grid in grids.items():
         cover = _cover(root, grid, near[tile_id], min_cover, reproject)
         if cover >= max(min_cover, 1e-9):
@@ -265,17 +265,21 @@ def _covered(
             risky += [tile_id] if min_cover and cover < MIN_COVER else []
         elif cover:
             thin.append(tile_id)
+        elif near[tile_id].in_core:
+            empty.append(tile_id)
     note = (
         f"left out {count(len(thin), 'tile')} with a DSM height in less than {min_cover:.0%} of the cells "
         f"(--min-cover 0 keeps them): {some(thin)}"
     )
+    void = f"left out {count(len(empty), 'tile')} where the DSM has only nodata: {some(empty)}"
+    notes = [note] * bool(thin or not empty) + [void] * bool(empty)
     if not kept:
-        raise CatalogError(f"no tile is left: {note}")
+        raise CatalogError(f"no tile is left: {'; '.join(notes)}")
     below = (
         f"{count(len(risky), 'tile')} with a DSM height in less than {MIN_COVER:.0%} of the cells will fail, "
         f"unless the configuration sets load: {{min_valid: {min_cover:g}}}: {some(risky)}"
     )
-    return kept, [note] * bool(thin) + [below] * bool(risky)
+    return kept, [note] * bool(thin) + [void] * bool(empty) + [below] * bool(risky)
 
 
 def _cover(root: Path, grid: Grid, near: _NearFiles, min_cover: float, reproject: bool) -> float:

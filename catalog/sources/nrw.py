@@ -19,6 +19,7 @@ from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import Tile
@@ -128,6 +129,7 @@ def index(
     if road_mask is not None:
         layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
         notes += skipped
+        notes += mask_notes(root, "road_mask", [file.name for file in layer_files["road_mask"]], road_values)
     indexed = cut(
         root,
         layer_files,

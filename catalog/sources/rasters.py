@@ -9,10 +9,11 @@ from pathlib import Path
 
 from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.tile import LAYERS
-from flexroad.catalog.tiling import NO_CONVERSION, Conversion, TilingResult, cut
+from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 
 
 def index(
@@ -69,6 +70,8 @@ def index(
         if name in patterns and name != "roads"
     }
     notes = [note for _, skipped in scanned.values() for note in skipped]
+    for name in (mask for mask in MASKS if mask in scanned):
+        notes += mask_notes(root, name, [file.name for file in scanned[name][0]], road_values)
     indexed = cut(
         root,
         {name: files for name, (files, _) in scanned.items()},

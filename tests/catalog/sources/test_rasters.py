@@ -152,6 +152,26 @@ def test_cover_counts_cells_with_heights_and_not_extents(declared, tmp_path):
     assert note.endswith("load: {min_valid: 0.1}: 295750_5629250")
 
 
+def test_tiles_of_nodata_are_left_out_with_note(tmp_path):
+    heights = np.full((250, 750), -9999.0, np.float32)
+    heights[:, :250] = 7
+    write(tmp_path / "a.tif", heights, nodata=-9999.0)
+    result = index(tmp_path, {"dsm": "a.tif"})
+    assert ids(result) == ["295500_5629250"]
+    note = "left out 2 tiles where the DSM has only nodata: 295750_5629250, 296000_5629250"
+    assert [line for line in result.notes if line.startswith("left out")] == [note]
+    write(tmp_path / "a.tif", np.full((250, 250), -9999.0, np.float32), nodata=-9999.0)
+    with pytest.raises(CatalogError, match="no tile is left: left out 1 tile where the DSM has only nodata"):
+        index(tmp_path, {"dsm": "a.tif"})
+
+
+def test_mask_whose_values_do_not_fit_is_noted(tmp_path):
+    write(tmp_path / "dsm.tif", FLAT)
+    write(tmp_path / "mask.tif", np.full((250, 250), 5, np.uint8))
+    result = index(tmp_path, {"dsm": "dsm.tif", "road_mask": "mask.tif"}, road_values=(99,))
+    assert "road_mask: no cell has --road-value 99 but 5, in the parts read of mask.tif" in result.notes
+
+
 def test_cover_counts_overlapping_files_once(tmp_path):
     write(tmp_path / "a.tif", FLAT[:, :100])
     write(tmp_path / "b.tif", FLAT[:, :100])
