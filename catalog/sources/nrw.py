@@ -19,9 +19,9 @@ from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
 from flexroad.catalog.headers.vectors import find, with_roads
+from flexroad.catalog.mask_values import mask_notes
 from flexroad.catalog.tile import Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
