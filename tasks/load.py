@@ -19,6 +19,7 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.below_ground import below_ground_note
 from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -109,6 +110,8 @@ def load(tile: Tile, options: Options) -> TileData:
         mosaics["dsm"].check_valid(tile, options.min_valid)
         mosaics["dtm"].check_valid(tile, 0.0)
     offset_dsm, remarks = _offset(tile, options)
+    if swapped := below_ground_note(mosaics["dsm"].values, mosaics["dtm"].values):
+        remarks = [*remarks, swapped]
     return TileData(
         tile_id=tile.id,
         grid=grid,

@@ -170,7 +170,15 @@ def test_load_other_lattice_is_interpolated_with_note(tmp_path, dtm):
     write(tmp_path / "dsm.tif", plane(off), off.west, off.north)
     data = load(tile(tmp_path), Options())
     np.testing.assert_allclose(data.dsm, plane(GRID), atol=1e-6)
-    assert data.notes == ("dsm resampled: its lattice is off by (0.09, 0.31) m",)
+    assert data.notes[0] == "dsm resampled: its lattice is off by (0.09, 0.31) m"
+
+
+def test_load_swapped_models_gives_note(tmp_path):
+    ground = plane(GRID)
+    write(tmp_path / "dtm.tif", ground + 4, GRID.west, GRID.north)
+    write(tmp_path / "dsm.tif", ground, GRID.west, GRID.north)
+    (note,) = load(tile(tmp_path), Options(halo_m=0)).notes
+    assert note.endswith("in 100% of the cells and above it in 0%: are their files swapped?")
 
 
 @pytest.mark.parametrize("cell", [0.25, 0.5, 2.0])
@@ -180,7 +188,7 @@ def test_load_other_cell_size_is_resampled_with_note(tmp_path, dtm, cell):
     write(tmp_path / "dsm.tif", plane(other), other.west, other.north, cell=cell)
     data = load(tile(tmp_path), Options())
     np.testing.assert_allclose(data.dsm, plane(GRID), atol=1e-6)
-    assert data.notes == (f"dsm resampled: its cells are {cell:g} m, the tile's 1 m",)
+    assert data.notes[0] == f"dsm resampled: its cells are {cell:g} m, the tile's 1 m"
 
 
 def test_load_resampling_ignores_cells_without_value(tmp_path, dtm):
