@@ -11,6 +11,7 @@ from rasterio.enums import Resampling
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.below_ground import below_ground_note
 from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid
@@ -61,13 +62,14 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     }
     core = _grid(patches["dsm"])
     grid = core.buffered(options.halo_m)
-    notes = [_absurd(patches[name]) for name in ("dsm", "dtm")]
+    notes: list[str | None] = [_absurd(patches[name]) for name in ("dsm", "dtm")]
     notes += [_misfit(patches[name], core) for name in ("dtm", "road_mask")]
     heights = {name: _onto(patches[name], grid, Resampling.bilinear) for name in ("dsm", "dtm")}
     window = grid.window(core)
     _check_valid("dsm", heights["dsm"][window], options.min_valid)
     _check_valid("dtm", heights["dtm"][window], 0.0)
     road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
+    notes += [below_ground_note(heights["dsm"], heights["dtm"])]
     notes += [] if road[window].any() else [WITHOUT_ROAD]
     return TileData(
         TILE_ID,
