@@ -48,7 +48,9 @@ def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[st
         output_file(out / MANIFEST)
     with run_lock(out, notify):
         remove_unfinished(out)
-        write(out / BEGUN, "".join(f"{name}\n" for name in sorted(begun)).encode())
+        names = "".join(f"{name}\n" for name in sorted(begun)).encode()
+        if not exists(out / BEGUN) or read(out / BEGUN) != names:
+            write(out / BEGUN, names)
         yield
 
 
