@@ -19,11 +19,12 @@ def below_ground_note(dsm: Floats, dtm: Floats) -> str | None:
     more of them above, unless the files are swapped.
     """
     above = dsm - dtm
-    above = above[np.isfinite(above)]
-    if not above.size:
+    known = np.count_nonzero(np.isfinite(above))
+    below = np.count_nonzero(above < -BELOW_M)
+    if not below or below < SHARE * known:
         return None
-    low, high = (above < -BELOW_M).mean(), (above > BELOW_M).mean()
-    if low < SHARE or low < TIMES * high:
+    low, high = below / known, np.count_nonzero(above > BELOW_M) / known
+    if low < TIMES * high:
         return None
     return (
         f"the DSM is more than {BELOW_M:g} m below the DTM in {low:.0%} of the cells and above it in "

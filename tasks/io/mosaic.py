@@ -203,7 +203,8 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     Its place is compared with the catalog's, because an extent in another CRS holds more than the file.
     """
     core = tile.grid
-    if file.extent is None or not file.may_lie_on(core) or (patch and patch.lattice.reached(core).any()):
+    # Files of neighbours only touch the tile.
+    if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
         return
     with opened(file.path, file.title, tile.allowed, kept_raster) as raster:
         found = header(raster)
@@ -219,6 +220,12 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
         f"in {short(crs)}, elsewhere than the catalog says; build the catalog again",
         str(file.path),
     )
+
+
+def _is_on(patch: RasterWindow, core: Grid) -> bool:
+    """Return whether a part of a file covers a cell of a tile."""
+    lattice = patch.lattice
+    return bool(lattice.reached(core).any()) if lattice.crs else _shared_m2(lattice.bounds, core.bounds) > 0
 
 
 def _shared_m2(extent: Bounds | None, bounds: Bounds) -> float:
