@@ -31,7 +31,7 @@ from flexroad.catalog.geoparquet import Item, Unreadable
 from flexroad.catalog.grid import Bounds, Grid, overlap
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
-from flexroad.catalog.text import printable
+from flexroad.catalog.text import edges, printable
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import AllowedFolders
 
@@ -160,7 +160,7 @@ class Catalog:
             self._check_bbox(bbox)
             tiles = [tile for tile in tiles if not tile.fault and overlap(tile.grid.bounds, bbox)]
             if not tiles:
-                raise CatalogError(f"no tile touches --bbox {_edges(bbox)}; {self._extent()}")
+                raise CatalogError(f"no tile touches --bbox {edges(bbox)}; {self._extent()}")
         if area is not None:
             usable = [tile for tile in tiles if not tile.fault]
             tiles = list(compress(usable, area.touched(tile.grid for tile in usable)))
@@ -172,7 +172,7 @@ class Catalog:
         west, south, east, north = bbox
         if west > east or south > north:
             raise CatalogError(
-                f"--bbox {_edges(bbox)} is empty; the order is west south east north; {self._extent()}"
+                f"--bbox {edges(bbox)} is empty; the order is west south east north; {self._extent()}"
             )
 
     def _extent(self) -> str:
@@ -183,13 +183,9 @@ class Catalog:
         places = []
         for crs, bounds in corners.items():
             west, south, east, north = zip(*bounds, strict=True)
-            edges = _edges((min(west), min(south), max(east), max(north)))
-            places.append(f"{edges} in {short(crs)}")
+            whole = edges((min(west), min(south), max(east), max(north)))
+            places.append(f"{whole} in {short(crs)}")
         return f"the tiles lie within {' and '.join(places)}"
-
-
-def _edges(bounds: Bounds) -> str:
-    return " ".join(f"{edge:.10g}" for edge in bounds)
 
 
 def _location(path: Location | str) -> Location:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
 
 MAX_SHOWN = 160
 """Longest text of a value in a message."""
@@ -28,6 +29,11 @@ def count(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
+def edges(bounds: Iterable[float]) -> str:
+    """Return bounds for messages: west, south, east and north with up to ten digits."""
+    return " ".join(f"{edge:.10g}" for edge in bounds)
+
+
 def shown(value: object) -> str:
     """Return a value from a file in a short form, for messages."""
     text = printable(_REPR.repr(value))
@@ -38,6 +44,11 @@ def reason(error: BaseException) -> str:
     """Return the first line of an error's message in a short form: libraries repeat what a file contains."""
     text = printable(str(error).strip().partition("\n")[0])
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}..."
+
+
+def write_reason(error: BaseException) -> str:
+    """Return why a file could not be written: the system's words, or GDAL's, the cause of rasterio's."""
+    return getattr(error, "strerror", None) or reason(error.__cause__ or error)
 
 
 def one_line(error: BaseException) -> str:

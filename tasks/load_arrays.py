@@ -10,6 +10,7 @@ from rasterio.enums import Resampling
 
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.below_ground import below_ground_note
 from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
@@ -229,7 +230,7 @@ def _misfit(patch: RasterWindow, core: Grid) -> str:
 def _onto(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
     slices = patch.lattice.window_for(grid)
     if slices is None:
-        bounds = " ".join(f"{edge:.10g}" for edge in patch.lattice.bounds)
+        bounds = edges(patch.lattice.bounds)
         raise TaskError(f"{patch.name} ({bounds}) does not overlap the dsm; give arrays of the same area")
     cut = RasterWindow(
         patch.name,

@@ -26,7 +26,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.paths import write
-from flexroad.catalog.text import reason
+from flexroad.catalog.text import write_reason
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
 
 HEIGHTS = ("dsm", "dtm", "road_height", "reference")
@@ -178,9 +178,7 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
                 dataset.update_tags(**tags)
             write(path, memory.getbuffer())
         except (OSError, CRSError) as error:
-            # rasterio's error has GDAL's error, with the reason, as its cause.
-            why = getattr(error, "strerror", None) or reason(error.__cause__ or error)
-            raise CatalogError(f"cannot write {path}: {why}") from error
+            raise CatalogError(f"cannot write {path}: {write_reason(error)}") from error
 
 
 def _read(path: Path) -> _File:

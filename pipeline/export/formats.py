@@ -119,13 +119,13 @@ def _per_tile(
 
 def _needs_rhino(source: Source, options: Options) -> None:
     try:
-        rhino.library()
+        rhino.load_rhino3dm()
     except TaskError as error:
         raise ConfigError(str(error)) from error
 
 
 def _needs_pmtiles(source: Source, options: Options) -> None:
-    terrain_tiles.library()
+    terrain_tiles.load_writer()
 
 
 def _along_roads(title: str, version: int, write: Write) -> Format:

@@ -65,7 +65,7 @@ def write_tiles(
     OSError
         If the file cannot be written.
     """
-    writer = library()
+    writer = load_writer()
     grids = [tile.grid for tile in source.tiles]
     placed = np.array([bounds_in(terrarium.CRS, grid.crs, grid.bounds) for grid in grids])
     bounds: Bounds = (*placed[:, :2].min(axis=0).tolist(), *placed[:, 2:].max(axis=0).tolist())
@@ -90,7 +90,7 @@ def write_tiles(
             _write(archive, canvas, source, bounds, float(np.floor(lowest)) - 1)
 
 
-def library() -> Any:
+def load_writer() -> Any:
     """Return the class that writes PMTiles archives.
 
     Raises

@@ -11,6 +11,7 @@ from pathlib import Path
 from flexroad.catalog import LAYERS
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.text import write_reason
 from flexroad.pipeline.errors import ConfigError
 
 CATALOG = "catalog.parquet"
@@ -73,12 +74,10 @@ def disk_errors(where: Path) -> Iterator[None]:
 
 def write_error(where: Path, error: Exception) -> ConfigError:
     """Return the error of a file or folder that cannot be written: one line with reason and remedy."""
-    # rasterio's error is raised from GDAL's, which has the reason.
-    reason = getattr(error, "strerror", None) or error.__cause__ or error
     remedy = "correct that or choose another folder with -o"
     if _is_full(where, getattr(error, "errno", None)):
         remedy = "free disk space and repeat"
-    return ConfigError(f"cannot write to {where}: {reason}; {remedy}")
+    return ConfigError(f"cannot write to {where}: {write_reason(error)}; {remedy}")
 
 
 def _is_full(where: Path, number: int | None) -> bool:

@@ -53,7 +53,7 @@ def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: s
     TaskError
         If rhino3dm is missing, or if the bounds and the surface's domain do not overlap.
     """
-    rhino = library()
+    rhino = load_rhino3dm()
     model = rhino.File3dm()
     model.Settings.ModelUnitSystem = rhino.UnitSystem.Meters
     model.Settings.ModelAbsoluteTolerance = TOLERANCE_M
@@ -70,7 +70,7 @@ def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: s
     return base64.b64decode(model.Encode())
 
 
-def library() -> Any:
+def load_rhino3dm() -> Any:
     """Return the library rhino3dm.
 
     Raises

@@ -16,6 +16,7 @@ from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.grid import FARTHEST, Bounds, overlap
 from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.height_units import absurd_note, in_metres, smaller_unit_fault, with_unit
@@ -72,14 +73,14 @@ class Mosaic:
 
     def check_read(self, core: Grid) -> None:
         """Raise an error if the layer is missing on the tile itself, or a file that it needs is left out."""
-        needed = [error for file, error in self._left_out_from_main(core) if file.may_lie_on(core)]
+        left_out = self._left_out_from_main(core) if self.left_out else []
+        needed = [error for file, error in left_out if file.may_lie_on(core)]
         if needed and not self.reached(core).all():
             raise TaskError(str(needed[0]), needed[0].file)
         if not self.patches:
-            bounds = " ".join(f"{edge:.10g}" for edge in self.grid.bounds)
             raise TaskError(
-                f"no {self.layer.name} file overlaps the tile ({bounds}): {', '.join(self.layer.files[:3])}; "
-                "build the catalog again",
+                f"no {self.layer.name} file overlaps the tile ({edges(self.grid.bounds)}): "
+                f"{', '.join(self.layer.files[:3])}; build the catalog again",
                 str(self.files[0].path),
             )
 
@@ -216,8 +217,8 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     if all(abs(a - b) <= core.cell for a, b in zip(now, file.extent, strict=True)):
         return
     raise Unusable(
-        f"{file.title} does not reach the tile now: it lies at {' '.join(f'{edge:.10g}' for edge in bounds)} "
-        f"in {short(crs)}, elsewhere than the catalog says; build the catalog again",
+        f"{file.title} does not reach the tile now: it lies at {edges(bounds)} in {short(crs)}, "
+        "elsewhere than the catalog says; build the catalog again",
         str(file.path),
     )
 

@@ -18,6 +18,7 @@ from rasterio.vrt import WarpedVRT
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
 from flexroad.tasks.io.raster import opened
 from flexroad.tasks.io.raster_grid import RasterGrid
@@ -79,10 +80,10 @@ def read_photo(source: Source, grid: Grid, gsd_m: float | None = None, finest_m:
     if unusable and not (source.optional or reached.all()):
         raise TaskError(str(unusable[0]), unusable[0].file, source.name)
     if photo is None:
-        bounds = " ".join(f"{edge:.10g}" for edge in grid.bounds)
         names = ", ".join(path.name for path in source.paths[:3])
         raise LayerMissing(
-            f"no {source.name} file overlaps the tile ({bounds}): {names}; build the catalog again",
+            f"no {source.name} file overlaps the tile ({edges(grid.bounds)}): {names}; "
+            "build the catalog again",
             str(source.paths[0]),
             source.name,
         )

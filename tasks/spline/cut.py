@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexroad.catalog.grid import Bounds, overlap
+from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface, domain, exact
 from flexroad.tasks.types import Floats
@@ -32,7 +33,7 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
     """
     if not overlap(surface.bounds, bounds):
         raise TaskError(
-            f"bounds {_text(bounds)} lie beyond the surface's domain {_text(surface.bounds)}; choose others"
+            f"bounds {edges(bounds)} lie beyond the surface's domain {edges(surface.bounds)}; choose others"
         )
     west, south = np.maximum(surface.bounds[:2], bounds[:2]).tolist()
     east, north = np.minimum(surface.bounds[2:], bounds[2:]).tolist()
@@ -102,7 +103,3 @@ def _inserted(knots: Floats, points: Floats, degree: int, new: float) -> tuple[F
     share = ((new - knots[i]) / (knots[i + degree] - knots[i]))[:, None]
     between = share * points[i] + (1 - share) * points[i - 1]
     return np.insert(knots, span + 1, new), np.concatenate([points[: i[0]], between, points[i[-1] :]])
-
-
-def _text(bounds: Bounds) -> str:
-    return " ".join(f"{edge:.10g}" for edge in bounds)
