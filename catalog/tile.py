@@ -9,7 +9,7 @@ from itertools import compress
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
-from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.paths import Location, stat
 from flexroad.catalog.trust import AllowedFolders, full_name, located
 
 HEIGHTS = ("dsm", "dtm", "road_height", "reference", "bridges")
@@ -130,6 +130,8 @@ class Tile:
     tile has no layers, and its grid and date mean nothing (`faulty`)."""
     allowed: AllowedFolders | None = field(default=None, compare=False, repr=False)
     """Where its files may lie; None if the program itself has made the tile and has not read it."""
+    missing: frozenset[str] | None = field(default=None, compare=False, repr=False)
+    """Full names of its files that were missing when its graph was made; None if that is not known."""
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:
@@ -151,6 +153,10 @@ class Tile:
         if self.allowed and (outside := self.outside(layer)):
             raise self.allowed.refusal(f"tile {self.id}: {layer.name}", outside)
         return tuple(located(full_name(self.root, file)) for file in layer.files)
+
+    def lacks(self, path: Location) -> bool:
+        """Return whether a file of the tile is missing: when its graph was made, or if unknown, now."""
+        return stat(path) is None if self.missing is None else str(path) in self.missing
 
     def outside(self, layer: Layer) -> str | None:
         """Return the full name of the first file of a layer that may not be read, None if there is none."""

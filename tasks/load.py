@@ -15,7 +15,6 @@ from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.cover import MIN_COVER
-from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
@@ -208,9 +207,15 @@ def layer_source(tile: Tile, name: str) -> Source | None:
         return None
     needed = (layer.reaching(tile.grid.bounds) or layer).files
     paths = zip(layer.files, tile.paths(layer), strict=True)
-    files = tuple(path for file, path in paths if file in needed or stat(path))
+    files = tuple(path for file, path in paths if file in needed or not tile.lacks(path))
     return Source(
-        name, files, layer.crs, allowed=tile.allowed, reproject=layer.reproject, sublayer=layer.sublayer
+        name,
+        files,
+        layer.crs,
+        allowed=tile.allowed,
+        reproject=layer.reproject,
+        sublayer=layer.sublayer,
+        missing=tile.missing,
     )
 
 

@@ -34,6 +34,8 @@ class Source:
     """Whether rasters in another CRS than the tile's are warped; else they are an error."""
     sublayer: str | None = None
     """Layer of vector files that have several."""
+    missing: frozenset[str] | None = None
+    """Full names of files that are missing; None if that is not known."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ whose folder has, since it was opened is opened and checked again.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections import OrderedDict
@@ -73,6 +74,7 @@ class _Idle(threading.local):
         """Return the open file, None if there is none in this state."""
         before, dataset = self.files.pop(path, (None, None))
         if before == state:
+            _clear_error(dataset)
             return dataset
         self._close(before, dataset)
         return None
@@ -89,6 +91,16 @@ class _Idle(threading.local):
     def _close(state: _State | None, dataset: Any) -> None:
         if state and state.process == os.getpid():
             dataset.close()
+
+
+def _clear_error(dataset: Any) -> None:
+    """Clear the last error of this thread in GDAL, which may be of another file.
+
+    Opening a file clears it. For one that is open already, rasterio would raise it from a harmless call.
+    """
+    # This call raises the last error, whatever its file, and so clears it.
+    with contextlib.suppress(Exception):
+        _ = dataset.colorinterp
 
 
 _idle = _Idle()

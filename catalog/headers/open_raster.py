@@ -17,7 +17,7 @@ from typing import Any
 import rasterio
 from rasterio.errors import RasterioError
 
-from flexroad.catalog.headers.refused import Refused, head, require_regular
+from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.headers.vrt import sources
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 from flexroad.catalog.trust import AllowedFolders
@@ -115,6 +115,21 @@ def open_alone(path: Path) -> Any | None:
     return dataset
 
 
+def files_of(path: Path, depth: int = MAX_DEPTH) -> Iterator[Path]:
+    """Yield the files that a raster on disk consists of: itself, its side-car files, and those of a VRT.
+
+    Raises
+    ------
+    Refused, OSError
+        As of `open_raster`; OSError also if a file that a VRT names is missing.
+    """
+    yield path
+    yield from (side for side in _candidates(path) if side.exists())
+    if depth and _driver(path) == "VRT":
+        for name in sources(path):
+            yield from files_of(Path(name), depth - 1)
+
+
 @contextmanager
 def _remote(path: Any) -> Iterator[Any]:
     driver = SUFFIXES.get(path.suffix.lower())
@@ -206,7 +221,8 @@ def _side_cars(path: Path) -> list[Path]:
     found = [side for side in _candidates(path) if side.exists() or side.is_symlink()]
     for side in found:
         try:
-            require_regular(side)
+            # GDAL goes on without a side-car file that it cannot read.
+            head(side)
             _check_side_car(side)
         except FileNotFoundError:
             continue

@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import quote
 from xml.parsers import expat
 
-from flexroad.catalog.headers.refused import Refused, head, require_regular
+from flexroad.catalog.headers.refused import Refused, head
 
 UNKNOWN = (
     "is not a vector file: it is no GeoPackage, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
@@ -102,7 +102,8 @@ def _require_regular_parts(path: Path) -> None:
     for suffix in SHAPEFILE_PARTS:
         for part in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
             try:
-                require_regular(part)
+                # GDAL goes on without a part that it cannot read.
+                head(part)
             except FileNotFoundError:
                 continue
             except Refused as error:

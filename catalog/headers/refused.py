@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 
 HEAD_BYTES = 65536
+CHUNK_BYTES = 2**20
 
 
 class Refused(OSError):
@@ -27,6 +28,22 @@ def head(path: Path) -> bytes:
     # Opening a pipe would wait for a writer, if one has just taken the file's place.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as file:
         return file.read(HEAD_BYTES) or b""
+
+
+def read_through(path: Path) -> None:
+    """Read all bytes of a regular file.
+
+    Raises
+    ------
+    Refused
+        As of `head`.
+    OSError
+        If the system does not give all of them.
+    """
+    require_regular(path)
+    with path.open("rb", buffering=0) as file:
+        while file.read(CHUNK_BYTES):
+            pass
 
 
 def require_regular(path: Path) -> None:

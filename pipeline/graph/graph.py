@@ -82,7 +82,8 @@ class TileGraph:
     sources: list[Any]
     """The source layers as hashed in the fingerprints: name, files, values and CRS of each."""
     file_stats: dict[str, FileStat | None]
-    """Size and version of each file when the graph was made, by path; None if the file was missing."""
+    """Size and version of each file when the graph was made, by path; None if the file was missing, or was to
+    be hashed and could not be read."""
     fingerprint: str
     """Fingerprint of all requested results; the tile is done when its item has this fingerprint."""
 
@@ -212,6 +213,8 @@ class Pattern:
             for variant, numbers in self.variants.items()
         }
         fingerprint = self._fingerprint(tile, variants, sources)
+        missing = frozenset(path for path, file in sources.stats.items() if file is None)
+        own, tile = replace(own, missing=missing), replace(tile, missing=missing)
         return TileGraph(own, tile, nodes, variants, self.export, sources.entries, sources.stats, fingerprint)
 
     def _fingerprint(

@@ -44,7 +44,7 @@ class SourceFiles:
     recorded: Recorded = ()
     """Entries of an earlier graph, used for files that no longer exist."""
     stats: dict[str, FileStat | None] = field(default_factory=dict)
-    """Size and version of each file, by path; None if it was missing."""
+    """Size and version of each file, by path; None if it was missing, or could not be read to be hashed."""
     files: dict[tuple[str, str], File] = field(default_factory=dict)
     """Hashed description of each file, by layer and name."""
     layers: dict[str, Layer] = field(default_factory=dict)
@@ -60,9 +60,7 @@ class SourceFiles:
 
     def models(self, files: Iterable[Path]) -> str:
         """Return the checksums of files that options name, such as a model, as JSON."""
-        files = list(files)
-        self.stats |= {str(path): stat(path) for path in files}
-        return to_json([_checksum(path, self.stats[str(path)]) for path in files])
+        return to_json([self._checksum(path, stat(path)) for path in files])
 
     @property
     def entries(self) -> list[Entry]:
@@ -73,12 +71,19 @@ class SourceFiles:
         return [_entry(layer, by_layer.get(name, [])) for name, layer in self.layers.items()]
 
     def _file(self, layer: str, name: str, path: Location) -> File:
-        found = self.stats[str(path)] = self.stat_file(path)
+        found = self.stat_file(path)
         if found is not None and not self.checksum:
+            self.stats[str(path)] = found
             return [name, found.size, found.version]
         # `load` reports a missing file; the fingerprint changes when the file is restored.
-        file = [name, _checksum(path, found)]
+        file = [name, self._checksum(path, found)]
         return file if file[1] is not None else self._recorded.get((layer, name), file)
+
+    def _checksum(self, path: Location, found: FileStat | None) -> str | None:
+        """Return the SHA-256 of a file, None if it is missing or cannot be read; both count as missing."""
+        checksum = _checksum(path, found)
+        self.stats[str(path)] = found if checksum else None
+        return checksum
 
     @property
     def _recorded(self) -> dict[tuple[str, str], File]:

@@ -21,7 +21,7 @@ from flexroad.pipeline.execute.lazy import lazy_raster
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.export import cog
-from flexroad.tasks.io.raster import opened
+from flexroad.tasks.io.raster import read_raster
 
 
 class LayerFile(NamedTuple):
@@ -154,7 +154,6 @@ def _read(source: tuple[Window, str]) -> NDArray[Any]:
 
     window, suffix = source
     path = parse_location(window.stem + suffix)
-    with opened(path, path.name) as raster:
-        part = windows.Window(window.column, window.row, window.width, window.height)
-        values: NDArray[Any] = raster.read(1, window=part)
+    part = windows.Window(window.column, window.row, window.width, window.height)
+    values: NDArray[Any] = read_raster(path, path.name, lambda raster: raster.read(1, window=part))
     return values

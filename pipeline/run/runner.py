@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import exists, flush_names, parse_location
+from flexroad.catalog.storage.paths import exists, flush_names, parse_location, stat
 from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, Jobs
@@ -144,11 +144,13 @@ def plan_run(
 def _all_incomplete(run: Run, graph: TileGraph) -> str:
     """Return the error message of a run in which each tile lacks a file."""
     path = own_files_missing(graph)[0]
-    remedy = (
-        "it is not a regular file; replace it by one"
-        if exists(parse_location(path))
-        else "is the disk with the survey mounted?"
-    )
+    file = parse_location(path)
+    if stat(file):
+        remedy = "it cannot be read; make it readable"
+    elif exists(file):
+        remedy = "it is not a regular file; replace it by one"
+    else:
+        remedy = "is the disk with the survey mounted?"
     return (
         f"each of the {len(run.catalog.usable)} tiles lacks a file, "
         f"for example tile {graph.tile.id}: {path}; {remedy}"

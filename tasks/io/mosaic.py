@@ -20,7 +20,7 @@ from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.height_units import absurd_note, in_metres, smaller_unit_fault, with_unit
-from flexroad.tasks.io.raster import RasterWindow, fill_from, joined, misalignment, opened, read_window
+from flexroad.tasks.io.raster import RasterWindow, fill_from, joined, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.types import Bools, Floats
 
@@ -188,6 +188,7 @@ def _window(tile: Tile, layer: Layer, file: SourceFile, grid: Grid, core: Grid) 
         tile.allowed,
         heights,
         layer.reproject,
+        tile.missing,
     )
 
 
@@ -207,8 +208,7 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     # Files of neighbours only touch the tile.
     if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
         return
-    with opened(file.path, file.title, tile.allowed, kept_raster) as raster:
-        found = header(raster)
+    found = read_raster(file.path, file.title, header, tile.allowed, kept_raster, tile.missing)
     crs = in_plan(found.crs or layer.crs or core.crs)
     if found.lattice is None:
         return

@@ -20,7 +20,7 @@ from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
-from flexroad.tasks.io.raster import opened
+from flexroad.tasks.io.raster import read_raster
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import place
 from flexroad.tasks.types import Bools, Orthophoto, Source
@@ -103,17 +103,20 @@ def _read(
 ) -> tuple[Orthophoto, RasterGrid] | None:
     """Return a file's pixels over the grid, and the file's lattice; None if it does not overlap the grid."""
     name = f"{source.name} {path.name}"
-    with opened(path, name, source.allowed) as src:
+
+    def read(src: Any) -> tuple[Orthophoto, RasterGrid] | None:
         lattice = place(src, path, name, grid, grid, source.crs, source.reproject)
         if lattice is None or lattice.window_for(grid) is None:
             return None
         depth = _depth(src, path, name)
         pixels = Grid.covering(grid.crs, grid.bounds, gsd_m or max(_gsd_m(lattice, grid), finest_m))
         colour, known = _warped(src, lattice, pixels)
-    if src.count < 3:
-        colour = np.repeat(colour, 3, axis=0)
-    scaled = np.rint(colour * (255 / (2**depth - 1)))
-    return Orthophoto(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
+        if src.count < 3:
+            colour = np.repeat(colour, 3, axis=0)
+        scaled = np.rint(colour * (255 / (2**depth - 1)))
+        return Orthophoto(pixels, np.clip(scaled, 0, 255).astype(np.uint8), known), lattice
+
+    return read_raster(path, name, read, source.allowed, missing=source.missing)
 
 
 def _gsd_m(lattice: RasterGrid, grid: Grid) -> float:

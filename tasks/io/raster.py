@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from rasterio.enums import Resampling
@@ -18,16 +19,18 @@ from rasterio.windows import Window
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
-from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, files_of, open_raster
 from flexroad.catalog.headers.raster_faults import heights_fault
-from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.storage.paths import Location, is_remote, stat
+from flexroad.catalog.headers.refused import Refused, read_through
+from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import header, place
 from flexroad.tasks.types import Floats
+
+T = TypeVar("T")
 
 EXACT = 1e-9
 """Largest error of transformed positions, in cells; GDAL interpolates them with 0.125 by default, and takes 0
@@ -76,6 +79,7 @@ def read_window(
     allowed: AllowedFolders | None = None,
     heights: bool = False,
     reproject: bool = False,
+    missing: frozenset[str] | None = None,
 ) -> RasterWindow | None:
     """Read the part of a file that covers a grid.
 
@@ -102,6 +106,8 @@ def read_window(
         Whether the file must have heights: one band of real numbers.
     reproject : bool
         Whether the file may be in another CRS than the grid; the window is then on its own lattice.
+    missing : frozenset of str, optional
+        See `read_raster`.
 
     Returns
     -------
@@ -110,12 +116,13 @@ def read_window(
 
     Raises
     ------
-    Unreadable
-        If the file is missing or broken.
+    TaskError
+        As of `read_raster`.
     Unusable
         If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
     """
-    with opened(path, name, allowed, kept_raster) as src:
+
+    def read(src: Any) -> RasterWindow | None:
         fault = heights_fault(src) if heights else None
         if fault:
             raise Unusable(f"{name} {fault}", str(path))
@@ -126,40 +133,108 @@ def read_window(
         step = lattice.step_for(grid)
         slices = lattice.whole_steps(step, *slices)
         values, unit = _values(src, lattice, step, slices, resampling), src.units[0] or ""
-        crs = header(src).crs or crs
-    return RasterWindow(name, str(path), values, lattice.cut(*slices).coarser(step), unit, crs, step=step)
+        shown, file_crs = lattice.cut(*slices).coarser(step), header(src).crs or crs
+        return RasterWindow(name, str(path), values, shown, unit, file_crs, step=step)
+
+    return read_raster(path, name, read, allowed, kept_raster, missing)
 
 
-@contextmanager
-def opened(
+def read_raster(
     path: Location,
     name: str,
+    read: Callable[[Any], T],
     allowed: AllowedFolders | None = None,
     by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]] = open_raster,
-) -> Iterator[Any]:
-    """Open a raster; errors inside the block become `Unreadable` or, for a file in a bucket, `TaskError`.
+    missing: frozenset[str] | None = None,
+) -> T:
+    """Return what a function reads from an open raster.
 
-    For a file in a bucket the cause may be the file or the storage. So the tile fails and can be run again;
-    the file is not left out.
+    Only a file whose own bytes are at fault is `Unreadable`, so that it may be left out. What is computed
+    while a disk or object storage does not give the file must not be stored as if the file had been read.
+
+    Parameters
+    ----------
+    path, name, allowed
+        As of `read_window`.
+    read : callable
+        Takes the open raster.
+    by : callable
+        Opens it.
+    missing : frozenset of str, optional
+        Full names of the files that are known to be missing; None if that is not known.
+
+    Raises
+    ------
+    Unreadable
+        If the file is damaged: the system reads all of it, and GDAL fails twice; or if it is missing.
+    TaskError
+        If the system or object storage does not give the file, or it is missing but not in ``missing``.
     """
     try:
+        return _attempt(path, name, read, allowed, by, missing)
+    except Unreadable:
+        # The system may have failed in between, and a damaged file fails again.
+        return _attempt(path, name, read, allowed, by, missing)
+
+
+def _attempt(
+    path: Location,
+    name: str,
+    read: Callable[[Any], T],
+    allowed: AllowedFolders | None,
+    by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]],
+    missing: frozenset[str] | None,
+) -> T:
+    try:
         with by(path, allowed) as src:
-            yield src
-    except FileNotFoundError as error:
-        raise _missing(path, name) from error
-    except Refused as error:
-        raise Unreadable(f"{name} {error}", str(path)) from error
+            return read(src)
     except ERRORS as error:
-        if not is_remote(path) and stat(path) is None:
-            raise _missing(path, name) from error
-        why = reason(error.__cause__ or error)
-        if is_remote(path):
-            raise TaskError(f"{name} cannot be read: {why}; run again, or repair it", str(path)) from error
-        raise Unreadable(f"{name} cannot be read: {why}; fetch it again", str(path)) from error
+        raise _fault(path, name, error, missing) from error
 
 
-def _missing(path: Location, name: str) -> Unreadable:
-    return Unreadable(f"{name} is missing; restore it or build the catalog again", str(path))
+def _fault(path: Location, name: str, error: Exception, missing: frozenset[str] | None) -> TaskError:
+    """Return the error of a file that could not be opened or read; see `read_raster`."""
+    absent = missing is not None and str(path) in missing
+    if isinstance(error, FileNotFoundError) or _is_gone(path):
+        if missing is None or absent:
+            return Unreadable(f"{name} is missing; restore it or build the catalog again", str(path))
+        return TaskError(f"{name} was there when the run looked, and is missing now; run again", str(path))
+    why = reason(error.__cause__ or error)
+    if isinstance(path, Path):
+        if unread := _unread(path):
+            kind = Unreadable if absent else TaskError
+            return kind(f"{name} cannot be read: {unread}; mend that and run again", str(path))
+    elif not isinstance(error, Refused):
+        return TaskError(f"{name} cannot be read: {why}; run again, or repair it", str(path))
+    if isinstance(error, Refused):
+        return Unreadable(f"{name} {error}", str(path))
+    return Unreadable(f"{name} cannot be read: {why}; fetch it again", str(path))
+
+
+def _is_gone(path: Location) -> bool:
+    """Return whether there is no such file on disk."""
+    if is_remote(path):
+        return False
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _unread(path: Path) -> str:
+    """Return why the system does not give all bytes of a raster on disk; empty if it does."""
+    try:
+        for file in files_of(path):
+            read_through(file)
+    except Refused:
+        return ""
+    except OSError as error:
+        which = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
+        return f"{error.strerror or error}{which}"
+    return ""
 
 
 def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
 
@@ -30,17 +32,22 @@ def survey_difference(tile: Tile) -> tuple[str, str]:
 def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
     """Return date and vertical CRS of each file of a layer, "" where it declares none."""
     from flexroad.catalog.headers.rasters import date_of, quiet
-    from flexroad.tasks.io.raster import Unreadable, opened
+    from flexroad.tasks.io.raster import Unreadable, read_raster
 
     layer = tile.layer(name)
     found: list[tuple[str, str]] = []
     with quiet():
         for path in tile.paths(layer) if layer else ():
             try:
-                with opened(path, name, tile.allowed) as raster:
-                    crs = raster.crs.to_wkt() if raster.crs else layer.crs if layer else None
-                    taken = date_of({**raster.tags(), **raster.tags(ns="IMAGERY")})
+                crs, tags = read_raster(path, name, _crs_and_tags, tile.allowed, missing=tile.missing)
             except Unreadable:
                 continue
+            taken, crs = date_of(tags), crs or (layer.crs if layer else None)
             found.append((f"{taken:%Y-%m-%d}" if taken else "", (vertical(crs) if crs else None) or ""))
     return found
+
+
+def _crs_and_tags(raster: Any) -> tuple[str | None, dict[str, str]]:
+    """Return the CRS of an open raster as WKT, None if it has none, and its tags."""
+    tags = {**raster.tags(), **raster.tags(ns="IMAGERY")}
+    return raster.crs.to_wkt() if raster.crs else None, tags

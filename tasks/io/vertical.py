@@ -18,11 +18,12 @@ def vertical_crs(tile: Tile) -> str | None:
     Raises
     ------
     TaskError
-        If object storage does not answer.
+        If a file cannot be read at the moment.
     """
     from flexroad.catalog.headers.kept_rasters import kept_raster
     from flexroad.catalog.headers.rasters import quiet
-    from flexroad.tasks.io.raster import Unreadable, opened
+    from flexroad.tasks.io.raster import Unreadable, read_raster
+    from flexroad.tasks.io.raster_header import header
 
     found: set[str | None] = set()
     tile = tile.within(tile.grid.bounds)
@@ -30,9 +31,9 @@ def vertical_crs(tile: Tile) -> str | None:
         for layer in (layer for layer in tile.layers if layer.name in LAYERS):
             for path in tile.paths(layer):
                 try:
-                    with opened(path, layer.name, tile.allowed, kept_raster) as raster:
-                        declared = raster.crs.to_wkt() if raster.crs else layer.crs
+                    file = read_raster(path, layer.name, header, tile.allowed, kept_raster, tile.missing)
                 except Unreadable:
                     continue
+                declared = file.crs or layer.crs
                 found.add(vertical(declared) if declared else None)
     return found.pop() if len(found) == 1 else None

@@ -1,0 +1,329 @@
+"""A source that cannot be read for one night: the next night gives what a run from scratch gives.
+
+Its size and time stay the same, so no fingerprint shows that it was not read.
+"""
+
+import builtins
+import errno
+import io
+import os
+import threading
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+
+from flexroad.catalog import Catalog
+from flexroad.catalog.headers import kept_rasters, open_raster
+from flexroad.catalog.sources import rasters
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.graph import sources
+from flexroad.pipeline.graph.graph import Pattern
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.io import vectors
+from tests.permissions import permissions_enforced
+from tests.whole_run import products, rows
+
+pytestmark = pytest.mark.slow
+
+SIZE_M = 40
+LIGHT = ["fit.spacing_m=8"]
+NAMES = ("dsm", "dtm", "road_mask")
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    """Four tiles, each layer of each tile in a file of its own."""
+    folder = tmp_path_factory.mktemp("survey")
+    write_scenes(folder, 4, seed=5, size_m=SIZE_M)
+    return folder
+
+
+def catalog_of(survey, name="catalog.json", **patterns):
+    patterns = {name: f"{name}/*.tif" for name in NAMES} | patterns
+    Catalog(rasters.index(survey, patterns, tile_size_m=SIZE_M).tiles).write(survey / name)
+    return survey / name
+
+
+def night(out, catalog, config="production", settings=LIGHT, checksum=False):
+    """Run a catalog as a new process does, with no file open; return summary and failures."""
+    for cached in (vectors._layers, vectors._part, sources._sha256):
+        cached.cache_clear()
+    results = []
+
+    def run():
+        opened = Run.create(out, load_config(config, settings), Catalog.read(catalog), checksum=checksum)
+        failures = []
+        summary = run_tiles(opened, SerialExecutor(), watch=lambda result: failures.extend(result.failures))
+        results.append((summary, failures))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    return results[0]
+
+
+def assert_equal(out, scratch):
+    assert products(out) == products(scratch)
+    pd.testing.assert_frame_equal(rows(out), rows(scratch), check_exact=True)
+
+
+def one_file(survey, name="dsm"):
+    """A file of one tile, which the other three see in their halos and along their borders."""
+    return sorted((survey / name).glob("*.tif"))[1]
+
+
+class denied:
+    """A file that may not be read."""
+
+    def __init__(self, path):
+        self.path, self.mode = path, path.stat().st_mode
+
+    def __enter__(self):
+        self.path.chmod(0)
+        # Capabilities belong to a thread, and a new one inherits them.
+        self.enforced = permissions_enforced()
+        self.enforced.__enter__()
+
+    def __exit__(self, *error):
+        self.enforced.__exit__(*error)
+        self.path.chmod(self.mode)
+
+
+class failing:
+    """A disk that gives no byte of a file."""
+
+    def __init__(self, path):
+        self.path = path
+        error = OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+        def refusing(plain, read_error):
+            def opened(file, *more, **options):
+                if not isinstance(file, int) and Path(file) == path:
+                    raise read_error
+                return plain(file, *more, **options)
+
+            return opened
+
+        of_gdal = rasterio.errors.RasterioIOError("Read failed. See previous exception for details.")
+        self.patches = [
+            mock.patch.object(rasterio, "open", refusing(rasterio.open, of_gdal)),
+            *(mock.patch.object(module, "open", refusing(open, error)) for module in (io, builtins)),
+        ]
+
+    def __enter__(self):
+        for patch in self.patches:
+            patch.start()
+
+    def __exit__(self, *error):
+        for patch in self.patches:
+            patch.stop()
+
+
+class absent_while_opened:
+    """A mount that blinks: the file is absent for the moment in which it is opened."""
+
+    def __init__(self, path):
+        self.path, self.times = path, 0
+        plain = open_raster.open_alone
+
+        def opened(file):
+            if file != path:
+                return plain(file)
+            hidden = path.with_suffix(".away")
+            path.rename(hidden)
+            self.times += 1
+            try:
+                return plain(file)
+            finally:
+                hidden.rename(path)
+
+        self.patch = mock.patch.object(kept_rasters, "open_alone", opened)
+
+    def __enter__(self):
+        self.patch.start()
+
+    def __exit__(self, *error):
+        self.patch.stop()
+        assert self.times
+
+
+@pytest.fixture(scope="module")
+def scratch(survey, tmp_path_factory):
+    out = tmp_path_factory.mktemp("scratch") / "run"
+    summary, _ = night(out, catalog_of(survey))
+    assert summary.exit_code == 0
+    return out
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("fault", [denied, failing, absent_while_opened])
+def test_raster_unreadable_for_one_night_leaves_no_trace(name, fault, survey, scratch, tmp_path):
+    path, catalog = one_file(survey, name), catalog_of(survey)
+    with fault(path):
+        summary, failures = night(tmp_path / "run", catalog)
+    assert summary.exit_code == 1
+    assert summary.failed > 0
+    assert {failure.file for failure in failures} == {str(path)}
+    summary, _ = night(tmp_path / "run", catalog)
+    assert summary.exit_code == 0
+    assert_equal(tmp_path / "run", scratch)
+    assert all("\n" not in failure.message for failure in failures)
+    assert all("run again" in failure.message for failure in failures)
+
+
+def test_raster_read_at_the_second_attempt_is_used(survey, scratch, tmp_path, monkeypatch):
+    path, attempts = one_file(survey), []
+    plain = open_raster.open_alone
+
+    def opened(file):
+        if file == path:
+            attempts.append(file)
+            if len(attempts) % 2:
+                raise rasterio.errors.RasterioIOError("Read failed. See previous exception for details.")
+        return plain(file)
+
+    monkeypatch.setattr(kept_rasters, "open_alone", opened)
+    summary, _ = night(tmp_path / "run", catalog_of(survey))
+    assert attempts
+    assert summary.exit_code == 0
+    assert_equal(tmp_path / "run", scratch)
+
+
+def vrt_of(survey, name):
+    """Write a mosaic of the files of a layer, as gdalbuildvrt does; return its path."""
+    files = sorted((survey / name).glob("*.tif"))
+    with rasterio.open(files[0]) as first:
+        crs, kind = first.crs.to_wkt(), {"float32": "Float32", "uint8": "Byte"}[first.dtypes[0]]
+    places = {}
+    for file in files:
+        with rasterio.open(file) as raster:
+            places[file] = raster.bounds
+    west, north = min(box.left for box in places.values()), max(box.top for box in places.values())
+    east, south = max(box.right for box in places.values()), min(box.bottom for box in places.values())
+    sources = "".join(
+        f'<SimpleSource><SourceFilename relativeToVRT="1">{name}/{file.name}</SourceFilename>'
+        f'<SourceBand>1</SourceBand><SrcRect xOff="0" yOff="0" xSize="{SIZE_M}" ySize="{SIZE_M}"/>'
+        f'<DstRect xOff="{box.left - west}" yOff="{north - box.top}" xSize="{SIZE_M}" ySize="{SIZE_M}"/>'
+        "</SimpleSource>"
+        for file, box in places.items()
+    )
+    path = survey / f"{name}.vrt"
+    path.write_text(
+        f'<VRTDataset rasterXSize="{east - west:.0f}" rasterYSize="{north - south:.0f}"><SRS>{crs}</SRS>'
+        f"<GeoTransform>{west}, 1, 0, {north}, 0, -1</GeoTransform>"
+        f'<VRTRasterBand dataType="{kind}" band="1">{sources}</VRTRasterBand></VRTDataset>'
+    )
+    return path
+
+
+def test_member_of_vrt_unreadable_for_one_night_leaves_no_trace(survey, tmp_path):
+    path = one_file(survey)
+    catalog = catalog_of(survey, "vrt.json", dsm=vrt_of(survey, "dsm").name)
+    summary, _ = night(tmp_path / "scratch", catalog)
+    assert summary.exit_code == 0
+    with denied(path):
+        summary, failures = night(tmp_path / "run", catalog)
+    assert summary.failed > 0
+    assert all(f"Permission denied ({path})" in failure.message for failure in failures)
+    assert night(tmp_path / "run", catalog)[0].exit_code == 0
+    assert_equal(tmp_path / "run", tmp_path / "scratch")
+
+
+def test_side_car_unreadable_for_one_night_leaves_no_trace(survey, tmp_path):
+    """GDAL takes a raster without a side-car file that it may not open: here, without its nodata value."""
+    path = one_file(survey, "dtm")
+    side = path.with_name(f"{path.name}.aux.xml")
+    side.write_text(
+        '<PAMDataset><PAMRasterBand band="1"><NoDataValue>-9999</NoDataValue></PAMRasterBand></PAMDataset>'
+    )
+    try:
+        catalog = catalog_of(survey)
+        assert night(tmp_path / "scratch", catalog)[0].exit_code == 0
+        with denied(side):
+            summary, failures = night(tmp_path / "run", catalog)
+        assert summary.failed > 0
+        assert all(f"Permission denied ({side})" in failure.message for failure in failures)
+        assert night(tmp_path / "run", catalog)[0].exit_code == 0
+        assert_equal(tmp_path / "run", tmp_path / "scratch")
+    finally:
+        side.unlink()
+
+
+def test_roads_unreadable_for_one_night_leave_no_trace(survey, tmp_path):
+    path, catalog = survey / "roads.gpkg", catalog_of(survey, "roads.json", roads="roads.gpkg")
+    assert night(tmp_path / "scratch", catalog, "production_vector")[0].exit_code == 0
+    with denied(path):
+        summary, failures = night(tmp_path / "run", catalog, "production_vector")
+    assert summary.failed == 4
+    assert {failure.file for failure in failures} == {str(path)}
+    assert night(tmp_path / "run", catalog, "production_vector")[0].exit_code == 0
+    assert_equal(tmp_path / "run", tmp_path / "scratch")
+
+
+def test_missing_file_fails_only_its_tile_and_is_used_when_restored(survey, scratch, tmp_path):
+    path, catalog = one_file(survey), catalog_of(survey)
+    hidden = path.with_suffix(".away")
+    path.rename(hidden)
+    try:
+        summary, failures = night(tmp_path / "run", catalog)
+    finally:
+        hidden.rename(path)
+    assert (summary.done, summary.failed) == (3, 1)
+    assert "is missing; restore it" in failures[0].message
+    assert night(tmp_path / "run", catalog)[0].exit_code == 0
+    assert_equal(tmp_path / "run", scratch)
+
+
+def test_damaged_file_fails_only_its_tile(survey, tmp_path):
+    path, catalog = one_file(survey), catalog_of(survey)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    try:
+        summary, failures = night(tmp_path / "run", catalog)
+    finally:
+        path.write_bytes(data)
+    assert (summary.done, summary.failed) == (3, 1)
+    assert failures[0].file == str(path)
+    assert "fetch it again" in failures[0].message
+
+
+def test_damaged_pixels_fail_only_their_tile(survey, tmp_path):
+    path, catalog = one_file(survey), catalog_of(survey)
+    data = path.read_bytes()
+    with rasterio.open(path) as raster:
+        values, profile = raster.read(), raster.profile | {"compress": "deflate", "tiled": False}
+    with rasterio.open(path, "w", **profile) as raster:
+        raster.write(values)
+    damaged = bytearray(path.read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 100] = np.random.default_rng(0).bytes(100)
+    path.write_bytes(damaged)
+    try:
+        summary, failures = night(tmp_path / "run", catalog)
+    finally:
+        path.write_bytes(data)
+    assert [failure.tile_id for failure in failures] == [path.stem]
+    assert (summary.done, summary.failed) == (3, 1)
+    assert failures[0].file == str(path)
+
+
+def test_file_that_cannot_be_hashed_counts_as_missing(survey):
+    """Else a result of its bytes would be stored under the fingerprint of a missing file."""
+    path = one_file(survey)
+    tile = next(tile for tile in Catalog.read(catalog_of(survey)).tiles if tile.id == path.stem)
+    pattern = Pattern.of(load_config("production", LIGHT))
+    readable = pattern.graph(tile, checksum=True)
+    sources._sha256.cache_clear()
+    with denied(path):
+        unreadable = pattern.graph(tile, checksum=True)
+    assert readable.file_stats[str(path)] is not None
+    assert unreadable.file_stats[str(path)] is None
+    assert str(path) in unreadable.tile.missing
+    assert unreadable.fingerprint != readable.fingerprint
