@@ -246,21 +246,12 @@ def _executor(
     dashboard: bool,
     say: Callable[[str], None],
 ) -> Executor:
-    from flexroad.pipeline.execute import AdaptiveExecutor, BatchExecutor, DaskExecutor, SerialExecutor
-    from flexroad.pipeline.graph.stages import in_batches
-
-    cluster = config.cluster
+    from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, SerialExecutor
 
     if name == "serial":
         return SerialExecutor()
-    together = cluster.batch > 1 and any(in_batches(chain["fit"]) for chain in config.chains.values())
-    # Jobs of SLURM and pods are alike: one with a GPU beside others needs a scheduler of its own.
-    gpu = together and (cluster.kind == "local" or scheduler is not None)
-    parallel: Executor = DaskExecutor(workers, scheduler, cluster, dashboard, say, gpu)
-    if gpu:
-        from flexroad.pipeline.worker.batch import fit_together, prepare
-
-        parallel = BatchExecutor(parallel, prepare, partial(fit_together, cluster), cluster.batch)
+    cluster = config.cluster
+    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say)
     if name == "dask" or died or scheduler or dashboard or cluster.needs_workers:
         return parallel
     return AdaptiveExecutor(workers or cluster.workers, parallel, say)

@@ -46,22 +46,6 @@ class Cluster(Options):
     patience_s: float = Field(
         60, ge=0, le=86_400, description="waiting time for a new worker when all workers are lost (s)"
     )
-    device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="device of a batch of fits (fit.engine: torch); auto: a GPU if its worker has one"
-    )
-    batch: int = Field(
-        64,
-        ge=1,
-        le=4096,
-        description="most tiles that are fitted together, with fit.engine: torch, on a worker that declares "
-        "the resource GPU; 1: each tile by itself, on the CPU",
-    )
-    batch_memory: ByteSize | None = Field(
-        None,
-        ge=1024**2,
-        description="memory of a batch of fits; by default 2 GiB, on the CPU at most half of its worker's; "
-        "more tiles are solved in parts",
-    )
     flush: bool = Field(
         True,
         description="write each tile's products and marker to the disk (fsync) before it counts as done; "

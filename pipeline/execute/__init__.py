@@ -3,22 +3,18 @@
 The only package that imports Dask.
 
 One Dask task is one tile. Its graph is computed inside a single process, so that no raster is sent between
-processes (``docs/decisions.md`` has the measurement against one task per stage). Tiles that are fitted
-together are the exception: `pipeline.execute.batches`.
+processes (``docs/decisions.md`` has the measurement against one task per stage).
 """
 
 from flexroad.pipeline.execute.adaptive import AdaptiveExecutor, Jobs
-from flexroad.pipeline.execute.batches import BatchExecutor, Ready
 from flexroad.pipeline.execute.dask import DaskExecutor
 from flexroad.pipeline.execute.executor import Executor
 from flexroad.pipeline.execute.serial import SerialExecutor
 
 __all__ = [
     "AdaptiveExecutor",
-    "BatchExecutor",
     "DaskExecutor",
     "Executor",
     "Jobs",
-    "Ready",
     "SerialExecutor",
 ]

@@ -8,17 +8,15 @@ import logging
 import shutil
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
-from functools import partial
 from typing import Any
 
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.batches import GPU
 
 SETTINGS = {
     "distributed.worker.memory.target": False,
@@ -65,11 +63,9 @@ class ClusterTarget:
 
 @contextlib.contextmanager
 def open_cluster(
-    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool, gpu: bool = False
+    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
 ) -> Iterator[ClusterTarget]:
     """Connect to, start or request a cluster; on exit, stop it if it was started here.
-
-    With ``gpu`` one of the workers of this machine declares the resource GPU.
 
     Raises
     ------
@@ -83,9 +79,7 @@ def open_cluster(
         cluster = cluster.model_copy(update={"workers": workers})
     import dask
 
-    makers: dict[str, Callable[[Cluster, str, bool], Any]]
-    makers = {"local": partial(local, gpu=gpu), "slurm": slurm, "kubernetes": kubernetes}
-    make = makers[cluster.kind]
+    make = {"local": local, "slurm": slurm, "kubernetes": kubernetes}[cluster.kind]
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
         stack.enter_context(dask.config.set(settings(cluster)))
@@ -102,8 +96,8 @@ def settings(cluster: Cluster) -> dict[str, Any]:
     return SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
 
 
-def local(cluster: Cluster, scratch: str, dashboard: bool, gpu: bool = False) -> Any:
-    """Return a cluster of single-threaded processes on this machine; with ``gpu`` one declares a GPU.
+def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
+    """Return a cluster of single-threaded processes on this machine.
 
     Raises
     ------
@@ -116,8 +110,8 @@ def local(cluster: Cluster, scratch: str, dashboard: bool, gpu: bool = False) ->
 
     workers = workers_here(cluster)
     try:
-        opened = LocalCluster(
-            n_workers=1 if gpu else workers,
+        return LocalCluster(
+            n_workers=workers,
             threads_per_worker=1,
             processes=True,
             memory_limit=bytes_of_worker(cluster),
@@ -126,14 +120,7 @@ def local(cluster: Cluster, scratch: str, dashboard: bool, gpu: bool = False) ->
             local_directory=scratch,
             env=ONE_THREAD,
             silence_logs=logging.CRITICAL,
-            resources=GPU if gpu else None,
         )
-        if gpu:
-            # Further workers do not declare the GPU.
-            plain = opened.new_spec["options"] | {"resources": None}
-            opened.new_spec = opened.new_spec | {"options": plain}
-            opened.scale(workers)
-        return opened
     except (OSError, RuntimeError) as error:
         raise ConfigError(
             f"cannot start {workers} worker processes here: {_one_line(error).rstrip('.')}; use fewer "

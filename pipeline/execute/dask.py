@@ -39,8 +39,6 @@ class DaskExecutor:
         Serve Dask's dashboard; its address is passed to ``say``.
     say : callable
         Prints one line for the user: the address of the dashboard, a wait for workers.
-    gpu : bool
-        Whether jobs need the resource GPU; one of the local workers declares it.
     """
 
     def __init__(
@@ -50,19 +48,17 @@ class DaskExecutor:
         cluster: Cluster = LOCAL,
         dashboard: bool = False,
         say: Callable[[str], None] = lambda line: None,
-        gpu: bool = False,
     ) -> None:
         self.workers = workers
         self.scheduler = scheduler
         self.cluster = cluster
         self.dashboard = dashboard
         self.say = say
-        self.gpu = gpu
 
     def map(
         self,
         function: Callable[[J], R],
-        jobs: Iterable[J | None],
+        jobs: Iterable[J],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
@@ -72,18 +68,13 @@ class DaskExecutor:
         if not first:
             # Without jobs no cluster is started.
             return
-        from flexroad.pipeline.execute.session import Session, declared
+        from flexroad.pipeline.execute.session import Session
 
         with (
             _quiet(),
-            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard, self.gpu) as target,
+            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as target,
             self._connected(target) as client,
         ):
-            if self.gpu and "GPU" not in declared(client):
-                raise ConfigError(
-                    f"{target.name} has no worker with the resource GPU; start one (`dask worker ADDRESS "
-                    "--nthreads 1 --resources GPU=1`), or set cluster.batch to 1"
-                )
             check = _check_workers(client, target, probe)
             session = Session(
                 client,

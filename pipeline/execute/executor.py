@@ -26,11 +26,9 @@ class Executor(Protocol):
         function : callable
             Takes a job, returns its result; runs in the worker processes.
         jobs : iterable
-            The jobs; taken one by one as workers become free. A job with ``resources`` runs on a worker that
-            declares them. None, for executors that run batches: there is no job until the next result.
+            The jobs; taken one by one as workers become free.
         lost : callable
-            Takes a job and the reason, returns the result of a job whose worker process died twice; of a
-            job with ``resources``, once.
+            Takes a job and the reason, returns the result of a job whose worker process died twice.
         probe : callable, optional
             Raises OSError if a process cannot do the work; called in every process before its first job.
 

@@ -13,11 +13,10 @@ class SerialExecutor:
     def map(
         self,
         function: Callable[[J], R],
-        jobs: Iterable[J | None],
+        jobs: Iterable[J],
         lost: Callable[[J, str], R],
         probe: Callable[[], None] | None = None,
     ) -> Generator[R, None, None]:
         """Yield results in the order of the jobs; ``probe`` is not called, the caller has done so here."""
         for job in jobs:
-            if job is not None:
-                yield function(job)
+            yield function(job)

@@ -49,11 +49,6 @@ class InFlight(Generic[J]):
     """Whether no other job runs at the same time."""
     submitted: float = field(default_factory=time.monotonic)
 
-    @property
-    def resources(self) -> dict[str, int] | None:
-        """What its worker must declare, None if any worker will do."""
-        return getattr(self.job, "resources", None)
-
 
 class Session(Generic[J, R]):
     """Submits jobs over one connection and collects their results.
@@ -69,7 +64,7 @@ class Session(Generic[J, R]):
     function : callable
         Takes a job, returns its result.
     jobs : iterator
-        The jobs; taken as there is room. None: there is none until another one has finished.
+        The jobs; taken as there is room.
     lost : callable
         Takes a job and the reason, returns the result of a lost job.
     cluster : Cluster
@@ -84,7 +79,7 @@ class Session(Generic[J, R]):
         name: str,
         check: str,
         function: Callable[[J], R],
-        jobs: Iterator[J | None],
+        jobs: Iterator[J],
         lost: Callable[[J, str], R],
         cluster: Cluster,
         say: Callable[[str], None],
@@ -137,8 +132,6 @@ class Session(Generic[J, R]):
             # Twice the number of threads keeps all workers busy at constant memory.
             room = max(2, 2 * sum(self.workers.values())) - len(self.in_flight)
             for job in islice(self.jobs, max(0, room)):
-                if job is None:
-                    break
                 self._submit(InFlight(job))
         if len(self.in_flight) == len(reserved):
             for address in [address for address in self.workers if address not in reserved]:
@@ -160,9 +153,6 @@ class Session(Generic[J, R]):
             key=f"{name}-{self.check}-{number}",
             pure=False,
             workers=[flight.reserved_worker] if flight.reserved_worker else None,
-            resources=flight.resources,
-            # A batch goes first: many tiles wait for it.
-            priority=1 if flight.resources else 0,
         )
         self.in_flight[future] = flight
         future.add_done_callback(self.completed.put)
@@ -200,24 +190,16 @@ class Session(Generic[J, R]):
                 self._again(self.in_flight.pop(future))
                 future.release()
 
-    def _able(self) -> bool:
-        """Return whether there is a worker for all jobs in flight."""
-        needed = {name for flight in self.in_flight.values() for name in flight.resources or ()}
-        return bool(self.workers) and (not needed or needed <= declared(self.client))
-
     def _wait_for_workers(self, since_last_check: float) -> None:
-        if self._able():
+        if self.workers:
             self.without_worker_s = None
         elif self.without_worker_s is None:
             self.without_worker_s = 0.0
-            self.say(f"no worker{self._missing()} is left; waiting up to {self.patience_s:g} s for one")
+            self.say(f"no worker is left; waiting up to {self.patience_s:g} s for one")
         else:
             self.without_worker_s += since_last_check
             if self.without_worker_s > self.patience_s:
-                raise ClusterLost(f"no worker{self._missing()} was left for {self.patience_s:g} s")
-
-    def _missing(self) -> str:
-        return " with the resource GPU" if self.workers else ""
+                raise ClusterLost(f"no worker was left for {self.patience_s:g} s")
 
     def _outcome(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         error = future.exception() if future.status == "error" else None
@@ -258,16 +240,10 @@ class Session(Generic[J, R]):
 
     def _again(self, flight: InFlight[J]) -> None:
         """Queue a job again that nothing is known against: no worker died while it ran."""
-        if flight.resources:
-            # Not every worker could be reserved for it.
-            self._submit(InFlight(flight.job))
-        else:
-            (self.suspects if flight.alone else self.quarantined).append(flight.job)
+        (self.suspects if flight.alone else self.quarantined).append(flight.job)
 
     def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
-        if flight.resources:
-            yield self.lost(flight.job, "its worker died")
-        elif not flight.reserved_worker:
+        if not flight.reserved_worker:
             self.quarantined.append(flight.job)
         elif (reason := self._own_fault(flight, error)) or flight.alone:
             unknown = "the worker process died 3 times here; too little memory is the usual cause"
@@ -296,12 +272,3 @@ class Session(Generic[J, R]):
                     f"may use {limit}; give each worker more (cluster: memory, fewer --workers)"
                 )
         return ""
-
-
-def declared(client: Client) -> set[str]:
-    """Return the names of the resources that the workers declare, such as GPU."""
-    try:
-        workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    except OSError:
-        return set()
-    return {name for worker in workers for name in worker["resources"]}

@@ -46,8 +46,6 @@ STAGES = (
 
 
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
-PROBLEM = "problem"
-"""Folder of a store with what a batch of fits needs; a file is deleted after the fit."""
 
 
 def stage_module(options: Options) -> ModuleType:
@@ -65,11 +63,6 @@ def stage_function(stage: str, options: Options) -> Callable[..., Any]:
     """Return the function that computes a stage: the function named ``stage`` in the options' module."""
     function: Callable[..., Any] = getattr(stage_module(options), stage)
     return function
-
-
-def in_batches(options: Options) -> bool:
-    """Return whether tiles with these options of the fit are fitted together: by the function `solve`."""
-    return getattr(options, "engine", "") == "torch" and hasattr(stage_module(options), "solve")
 
 
 def model_files(options: Options) -> tuple[Path, ...]:

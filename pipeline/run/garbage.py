@@ -19,7 +19,7 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, absolute, entries, exists, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.stages import PROBLEM, STAGE_NAMES
+from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.run.folder import RECORD
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
@@ -148,14 +148,12 @@ def _needed(runs: Iterable[Run]) -> set[bytes]:
 
 
 def _in_store(store: Location, needed: set[bytes]) -> Iterator[Garbage]:
-    # A problem has the fingerprint of its fit, and is left only by a run that was killed.
-    by_stage = dict.fromkeys((*STAGE_NAMES, BORDER), needed) | {PROBLEM: set()}
-    for stage, kept in by_stage.items():
+    for stage in (*STAGE_NAMES, BORDER):
         for folder, files in _folders(store / stage):
             yield from _temporary(folder, files)
             for name, size in files.items():
                 artefact = ARTEFACT.fullmatch(name)
-                if artefact and name[:2] == folder.name and bytes.fromhex(artefact[1]) not in kept:
+                if artefact and name[:2] == folder.name and bytes.fromhex(artefact[1]) not in needed:
                     yield Garbage("artefacts", folder / name, size)
 
 

@@ -11,7 +11,6 @@ a bucket by one request. A reader therefore reads a complete file or none, even 
 
 from __future__ import annotations
 
-import contextlib
 import uuid
 import zipfile
 import zlib
@@ -52,11 +51,6 @@ class ArtefactStore:
         data = codec.encode(value, seconds)
         paths.write(self._path(node.stage, node.fingerprint), data)
         return len(data)
-
-    def remove(self, stage: str, fingerprint: str) -> None:
-        """Delete an artefact; a missing one is ignored."""
-        with contextlib.suppress(FileNotFoundError):
-            paths.remove(self._path(stage, fingerprint))
 
     def has(self, node: Node) -> bool:
         """Return whether the artefact exists; its content is not checked."""

@@ -20,7 +20,6 @@ from flexroad.pipeline.config.methods import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
 from flexroad.tasks.spline.moving import MovingNurbs
-from flexroad.tasks.spline.problem import TileProblem
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
@@ -75,7 +74,7 @@ def _plain(item: Any) -> Any:
 def _types() -> dict[str, type]:
     shared = (
         Corner, Edge, Mesh, Metrics, MovingNurbs, NurbsSurface, Quality, RoadClusters, RoadMask,
-        SteppedSurface, TileProblem,
+        SteppedSurface,
     )  # fmt: skip
     types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():

@@ -60,8 +60,6 @@ class Evaluator:
     """Cost of each stage in this process."""
     errors: dict[str, StageError] = field(default_factory=dict)
     """Errors by fingerprint."""
-    computed: frozenset[str] = frozenset()
-    """Fingerprints of nodes that were computed for this tile in another process: ``force`` is done."""
 
     def __call__(self, fingerprint: str) -> Any:
         """Return the result of a node.
@@ -75,13 +73,12 @@ class Evaluator:
             raise self.errors[fingerprint]
         if fingerprint not in self.results:
             node = self.graph.nodes[fingerprint]
-            forced = node.stage in self.force and fingerprint not in self.computed
-            artefact = self.store.get(node) if node.stored and not forced else None
+            artefact = self.store.get(node) if node.stored and node.stage not in self.force else None
             if artefact is None:
                 self._compute(node)
             else:
                 self.results[fingerprint], self.chain_seconds[fingerprint] = artefact
-                self.spans[node.stage].reused += fingerprint not in self.computed
+                self.spans[node.stage].reused += 1
         return self.results[fingerprint]
 
     def _compute(self, node: Node) -> None:
@@ -97,13 +94,13 @@ class Evaluator:
             self.errors[node.fingerprint] = failed
             raise failed from error
         span.computed += 1
-        seconds = self.seconds_before(node)
+        seconds = self._seconds_before(node)
         seconds[node.stage] = span.seconds - before
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
         if node.stored and self.keep:
             self._store(node, result, seconds)
 
-    def seconds_before(self, node: Node) -> dict[str, float]:
+    def _seconds_before(self, node: Node) -> dict[str, float]:
         """Return the computing time of each stage before a node (s); that of a border is its own alone."""
         if node.border:
             return {}

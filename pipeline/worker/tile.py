@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -42,18 +41,6 @@ Status = Literal["done", "failed", "cached"]
 
 
 @dataclass(frozen=True)
-class Start:
-    """What was done for a tile before `process_tile` (`pipeline.worker.batch`)."""
-
-    fits: tuple[str, ...] = ()
-    """Fingerprints of the fits that are computed in a batch."""
-    computed: frozenset[str] = frozenset()
-    """Fingerprints of the nodes that were computed."""
-    spans: dict[str, StageCost] = field(default_factory=dict)
-    """Cost of each stage."""
-
-
-@dataclass(frozen=True)
 class TileJob:
     """One tile to process and the paths of its results; sent to a worker."""
 
@@ -68,9 +55,6 @@ class TileJob:
     """Stages to compute even if their results are in the store."""
     flushed: bool = False
     """Whether products and marker are on the disk before the tile counts as done or failed."""
-
-    start: Start = field(default_factory=Start)
-    """What was done before."""
 
     @property
     def key(self) -> str:
@@ -135,14 +119,7 @@ class TileResult:
 def process_tile(job: TileJob) -> TileResult:
     """Bring one tile up to date with its graph; errors of the tile are returned as failures, not raised."""
     graph = job.graph
-    evaluator = Evaluator(
-        graph,
-        ArtefactStore(parse_location(job.store)),
-        job.force,
-        keep=True,
-        spans=defaultdict(StageCost, job.start.spans),
-        computed=job.start.computed,
-    )
+    evaluator = Evaluator(graph, ArtefactStore(parse_location(job.store)), job.force, keep=True)
     rows, failures = [], []
     for variant in graph.variants:
         try:

@@ -12,26 +12,20 @@ neighbours have one surface, although no tile waits for another (docs/mosaic.md)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from flexroad.catalog.borders import Border
-    from flexroad.catalog.grid import Grid
-    from flexroad.tasks.errors import TaskError
-    from flexroad.tasks.spline.batch import Engine
     from flexroad.tasks.spline.frame import Corner, Edge, Frame
     from flexroad.tasks.spline.lattice import Lattice, Range
-    from flexroad.tasks.spline.problem import Problem, TileProblem
     from flexroad.tasks.spline.space import Space
-    from flexroad.tasks.spline.stepped import Beside
     from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 8
@@ -43,8 +37,6 @@ BEYOND_DATA_M = 15.0
 """The distance is at least this (m) larger than that of the corner or edge to the farthest ground."""
 BORDER_TOLERANCE = 1e-6
 """Tolerance of corners and edges at most: they are small, and in a void the loss changes little."""
-BATCH_DEGREE = 3
-"""Largest degree of `fit_batch`: above it, its conjugate gradients converge too slowly."""
 
 
 class Options(BaseOptions):
@@ -70,18 +62,28 @@ class Options(BaseOptions):
     stop_tolerance: float = Field(
         1e-4, ge=0, description="stop when the relative decrease of the loss is below this"
     )
-    engine: Literal["numba", "torch"] = Field(
-        "numba",
-        description="numba: one tile after the other, on the CPU; torch: many tiles at once, on the GPU of a "
-        "worker; surfaces differ by less than 1 mm (docs/operations.md)",
+    engine: Literal["numba"] = Field(
+        "numba", description="library that computes the fit; kept for one release, as fingerprints contain it"
     )
 
-    @model_validator(mode="after")
-    def _torch_has_its_degree(self) -> Options:
-        if self.engine == "torch" and self.degree > BATCH_DEGREE:
-            limit = f"degree {BATCH_DEGREE} or less, not {self.degree}"
-            raise ValueError(f"engine torch needs {limit}; choose engine numba")
-        return self
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The loss of one tile, corner or edge, and the control heights to start from."""
+
+    space: Space
+    heights: Floats
+    """Heights to fit above the datum, ``(H, W)``, m; NaN cells are ignored."""
+    weight: Floats
+    """Weight of the height differences, ``(H, W)``, before the division by the number of cells."""
+    stiffness: Floats
+    """Weight of the squared curvature, ``(H, W)``, m3, before that division."""
+    first: Floats
+    """Control heights at the start, ``(m, n)``, m above the datum."""
+    held: Bools
+    """Control points that keep their height, ``(m, n)``."""
+    datum: float
+    """Height above sea level that has been subtracted from all heights (m)."""
 
 
 def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None) -> NurbsSurface:
@@ -98,122 +100,22 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
-    if options.engine == "torch":
-        from flexroad.tasks.spline.batch import Engine
+    from flexroad.tasks.roads.road_height import with_road_heights
+    from flexroad.tasks.spline.space import check_cells, surface_on
+    from flexroad.tasks.spline.stepped import ground_beside, with_steps
 
-        (surface,) = solve([tile_problem(data, clusters, options, frame)], options, Engine())
-        return surface
-    problem, held = _tile_problem(data, clusters, options, frame)
-    heights = _with_held(held, _minimum_of(problem, options) + problem.datum)
-    return _surface(data.core, problem.space, heights, _beside(data, clusters, options, frame))
-
-
-def fit_batch(
-    tiles: Sequence[tuple[TileData, RoadClusters, Frame | None]], options: Options, engine: Engine
-) -> list[NurbsSurface | TaskError]:
-    """Fit the surfaces of many tiles like `fit`, those of one shape together, in torch.
-
-    Parameters
-    ----------
-    tiles : sequence
-        The arguments of `fit` for each tile.
-    options : Options
-        The options of all tiles.
-    engine : Engine
-        The device and the memory for a batch.
-
-    Returns
-    -------
-    list
-        The surface of each tile, or the error that `fit` raises for it: it does not stop the others.
-
-    Raises
-    ------
-    TaskError
-        If the device is not available, or the degree is above `BATCH_DEGREE`.
-    """
-    from flexroad.tasks.errors import TaskError
-
-    results: list[TileProblem | TaskError] = []
-    for data, clusters, frame in tiles:
-        try:
-            results.append(tile_problem(data, clusters, options, frame))
-        except TaskError as error:
-            results.append(error)
-    problems = [result for result in results if not isinstance(result, TaskError)]
-    surfaces = iter(solve(problems, options, engine))
-    return [result if isinstance(result, TaskError) else next(surfaces) for result in results]
-
-
-def tile_problem(
-    data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None = None
-) -> TileProblem:
-    """Return all that `solve` needs of a tile; the arguments and errors are those of `fit`."""
-    from flexroad.tasks.spline.problem import TileProblem
-
-    problem, held = _tile_problem(data, clusters, options, frame)
-    return TileProblem(
-        data.core, problem.heights, problem.weight, problem.stiffness, problem.first, held, problem.datum
-    ).with_ground(_beside(data, clusters, options, frame))
-
-
-def solve(tiles: Sequence[TileProblem], options: Options, engine: Engine) -> list[NurbsSurface]:
-    """Return the surfaces of many tiles, those of one shape fitted together, in torch.
-
-    Raises
-    ------
-    TaskError
-        If the device is not available, or the degree is above `BATCH_DEGREE`.
-    """
-    from flexroad.tasks.errors import TaskError
-    from flexroad.tasks.spline.batch import minimise
-
-    if options.degree > BATCH_DEGREE:
-        raise TaskError(f"batches need fit.degree {BATCH_DEGREE} or less, not {options.degree}")
-    problems = [tile.on(_space(tile.grid, options)) for tile in tiles]
-    heights = minimise(problems, options.huber_m, options.iterations, options.stop_tolerance, engine)
-    return [
-        _surface(tile.grid, problem.space, _with_held(tile.held, z + tile.datum), tile.ground)
-        for tile, problem, z in zip(tiles, problems, heights, strict=True)
-    ]
-
-
-def _space(core: Grid, options: Options) -> Space:
-    """Return the splines over the core of a tile."""
+    fitted, core = with_road_heights(data, clusters), data.core
+    rows, cols = data.grid.window(core)
     lattice = _lattice((core.width, core.height), core.cell, options)
     n, m = lattice.intervals
-    return lattice.part(core.shape, (core.height, 0), (0, n), (0, m))[0]
-
-
-def _tile_problem(
-    data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None
-) -> tuple[Problem, Floats]:
-    """Return the loss over the tile's core, and the heights of the control points that are held, else NaN."""
-    from flexroad.tasks.roads.road_height import with_road_heights
-    from flexroad.tasks.spline.space import check_cells
-
-    data = with_road_heights(data, clusters)
-    core = data.grid.window(data.core)
-    lattice = _lattice((data.core.width, data.core.height), data.core.cell, options)
-    (n, m), start = lattice.intervals, (core[0].stop, core[1].start)
     shape = m + options.degree, n + options.degree
-    check_cells(_ground(data, clusters)[core], (shape[1], shape[0]))
+    check_cells(_ground(fitted, clusters)[rows, cols], (shape[1], shape[0]))
     held = frame.control(shape) if frame else np.full(shape, np.nan)
-    return _problem(data, clusters, lattice, start, (0, n), (0, m), held, options), held
-
-
-def _beside(data: TileData, clusters: RoadClusters, options: Options, frame: Frame | None) -> Beside | None:
-    from flexroad.tasks.spline.stepped import ground_beside
-
-    return ground_beside(data, clusters, frame) if options.steps else None
-
-
-def _surface(core: Grid, space: Space, A: Floats, beside: Beside | None) -> NurbsSurface:
-    from flexroad.tasks.spline.space import surface_on
-    from flexroad.tasks.spline.stepped import with_steps
-
+    problem = _problem(fitted, clusters, lattice, (rows.stop, cols.start), (0, n), (0, m), held, options)
+    z = _with_held(held, _minimum_of(problem, options) + problem.datum)
     # Heights are relative to sea level: with a datum for each tile, sums would differ in the last digits.
-    surface = surface_on(space, core, core.exact_bounds, A, np.ones_like(A), datum=0.0)
+    surface = surface_on(problem.space, core, core.exact_bounds, z, np.ones_like(z), datum=0.0)
+    beside = ground_beside(data, clusters, frame) if options.steps else None
     return with_steps(beside, surface, core) if beside else surface
 
 
@@ -350,10 +252,9 @@ def _control_heights(
 def _problem(
     data: TileData, clusters: RoadClusters, lattice: Lattice, start: tuple[int, int], u: Range, v: Range,
     held: Floats, options: Options,
-) -> Problem:  # fmt: skip
+) -> _Problem:  # fmt: skip
     """Return the loss over the cells in a part of the lattice."""
     from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-    from flexroad.tasks.spline.problem import Problem
     from flexroad.tasks.spline.space import start_heights
 
     space, window = lattice.part(data.grid.shape, start, u, v)
@@ -366,7 +267,7 @@ def _problem(
     no_ground = np.isnan(ground).all()
     first, datum = (held, 0.0) if no_ground else start_heights(dsm, dtm, road, space)
     is_held = np.isfinite(held)
-    return Problem(
+    return _Problem(
         space,
         heights=ground - datum,
         weight=np.where(road, 1.0, options.lambda_terrain),
@@ -377,7 +278,7 @@ def _problem(
     )
 
 
-def _minimum_of(problem: Problem, options: Options) -> Floats:
+def _minimum_of(problem: _Problem, options: Options) -> Floats:
     p = problem
     return _minimum(p.space, p.heights, p.weight, p.stiffness, p.first, p.held, options)
 

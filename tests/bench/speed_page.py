@@ -108,7 +108,6 @@ def state(rows: list[bench_tile.Row], sent: dict[str, Any]) -> str:
     lines += [
         f"| **one core** | {total_ms:.1f} | **{hours(total_ms):.0f} h** |",
         f"| **a node of {CORES} cores**: one core, divided | | **{hours(total_ms) / CORES:.1f} h** |",
-        "| **one GPU** | not measured | open |",
     ]
     return "\n".join([*lines, ""])
 

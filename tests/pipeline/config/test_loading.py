@@ -83,6 +83,11 @@ def test_override_with_other_filter_uses_its_defaults(tmp_path):
         ),
         ({"ecsrc": {"variant": "off"}}, "x: ecsrc.variant: unknown key; it is called method"),
         ({"ecsrc": "grounded"}, "x: ecsrc: there is no method 'grounded'; it is called planar"),
+        ({"cluster": {"batch": 4}}, "x: cluster.batch: unknown key; valid are account, "),
+        (
+            {"fit": {"method": "smoothing_spline", "engine": "torch"}},
+            "x: fit.engine: input should be 'numba', not 'torch'",
+        ),
         ({"fit": {"solver": "irls"}}, "x: fit.solver: unknown key; the solver is a method of its own"),
         (
             {"segment": {"method": "vector", "hygiene": {}}},

@@ -13,7 +13,6 @@ from flexroad.pipeline.store import codec
 from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
-from flexroad.tasks.spline.batch import Engine
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -123,16 +122,6 @@ def test_meshes_meet_with_steps_away_from_the_road(method):
     np.testing.assert_allclose(np.interp([5600020, 5600040], y, z), 100 + STEP_M, rtol=0, atol=0.05)
     near = np.abs(y - 5600030) < 6
     np.testing.assert_allclose(z[near], fitted("across the edge", 0).smooth(EDGE, y[near]), rtol=0, atol=2e-4)
-
-
-def test_batch_has_the_same_steps_on_the_border():
-    tile = TILES[0]
-    data, _, clusters = part("across the edge", tile.buffered(20), tile)
-    frame = frame_of("across the edge", tile)
-    problem, _ = codec.decode(codec.encode(smoothing_spline.tile_problem(data, clusters, OPTIONS, frame), {}))
-    (batched,) = smoothing_spline.solve([problem], OPTIONS, Engine())
-    assert batched.west_east.any()
-    assert np.array_equal(batched.west_east, fitted("across the edge", 0).west_east)
 
 
 def test_edge_is_stored_without_loss():

@@ -11,8 +11,6 @@ from flexroad.tasks import sample
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.spline.batch import Engine
-from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
@@ -127,15 +125,6 @@ def test_hidden_road_has_no_steps():
     plain, stepped = (heights(fitted(data, clusters, steps)) for steps in (False, True))
     assert np.array_equal(stepped[crown], plain[crown])
     assert not np.array_equal(stepped, plain)
-
-
-def test_batch_has_the_steps_of_single_fits():
-    data, clusters, _ = tile(0.12)
-    options = smoothing_spline.Options()
-    (batched,) = smoothing_spline.fit_batch([(data, clusters, None)], options, Engine())
-    assert isinstance(batched, SteppedSurface)
-    assert batched.steps.any()
-    np.testing.assert_allclose(heights(batched), heights(fitted(data, clusters)), rtol=0, atol=1e-3)
 
 
 def test_stepped_surface_is_stored_without_loss():
