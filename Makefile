@@ -131,7 +131,7 @@ IMAGE ?= flexroad
 EXTRAS ?= s3
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-container: ## Build a container image: make container [BUILDER=docker] [IMAGE=flexroad] [EXTRAS=s3,train]
+container: ## Build a container image: make container [BUILDER=docker] [IMAGE=flexroad] [EXTRAS=s3,dinov2]
 	$(BUILDER) build --build-arg EXTRAS=$(EXTRAS) --build-arg TORCH_INDEX=$(TORCH_INDEX) --tag $(IMAGE) --file Containerfile .
 
 clean: ## Remove the environments, caches and runs

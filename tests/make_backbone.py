@@ -3,8 +3,10 @@
 from pathlib import Path
 
 
-def save_backbone(folder: Path, registers: int = 0, seed: int = 0, hidden_size: int = 48) -> Path:
-    """Save a model of three layers; with ``registers`` above 0 it is a model with register tokens."""
+def save_backbone(
+    folder: Path, registers: int = 0, seed: int = 0, hidden_size: int = 48, layers: int = 3
+) -> Path:
+    """Save a model; with ``registers`` above 0 it is a model with register tokens."""
     import torch
     from transformers.models.dinov2.configuration_dinov2 import Dinov2Config
     from transformers.models.dinov2.modeling_dinov2 import Dinov2Model
@@ -18,7 +20,7 @@ def save_backbone(folder: Path, registers: int = 0, seed: int = 0, hidden_size: 
     torch.manual_seed(seed)
     size = {
         "hidden_size": hidden_size,
-        "num_hidden_layers": 3,
+        "num_hidden_layers": layers,
         "num_attention_heads": 2,
         "mlp_ratio": 2,
         "image_size": 56,

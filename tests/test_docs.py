@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import call
+from tests.make_backbone import save_backbone
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -21,6 +22,7 @@ def console_lines(page: Path) -> list[str]:
 @pytest.mark.slow
 def test_docs_cli_commands_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    save_backbone(tmp_path / "dinov2-small", layers=4)
     (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")
     lines = console_lines(ROOT / "docs" / "cli.md")
     assert len(lines) > 12

@@ -1,4 +1,4 @@
-"""``flexroad train``: train the model of a segmenter on labelled tiles."""
+"""``flexroad train``: train the head of `segment: dinov2` on labelled tiles."""
 
 from __future__ import annotations
 
@@ -15,13 +15,6 @@ from flexroad.pipeline.cli.stdio import echo
 
 def train(
     catalog: shared.CatalogFile,
-    method: Annotated[
-        Literal["pixels", "dinov2"],
-        typer.Option(
-            help="pixels: decision trees on heights and, if available, photo; dinov2: on the photo.",
-            rich_help_panel=shared.METHOD,
-        ),
-    ],
     labels: Annotated[
         Literal["mask", "vector"],
         typer.Option(
@@ -88,13 +81,13 @@ def train(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Option of the training (rounds=100) or the configuration (load.halo_m=0); repeatable.",
+            help="Option of the training (epochs=100) or the configuration (load.halo_m=0); repeatable.",
             rich_help_panel=shared.METHOD,
         ),
     ] = None,
     allow: shared.Allow = None,
 ) -> None:
-    """Train a segmenter on labelled tiles and validate it on others.
+    """Train the linear head of `segment: dinov2` on labelled tiles and validate it on others.
 
     The files are MODEL, its report MODEL.html, and MODEL.json.
     """
@@ -111,7 +104,7 @@ def train(
     # The options of a training have no stage before a dot.
     changes = [text for text in settings or () if "." in text.partition("=")[0]]
     own = [text for text in settings or () if text not in changes]
-    options = TrainOptions(method, labels, validation, gap_m, ignore_m, seed, _settings(own))
+    options = TrainOptions(labels, validation, gap_m, ignore_m, seed, _settings(own))
     tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config, changes)
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +124,7 @@ def train(
     if warning := verdict(outcome):
         echo(f"warning: {warning}", err=True)
     else:
-        echo(f"next: in a configuration, segment: {{method: {method}, model: {shlex.quote(str(model))}}}")
+        echo(f"next: in a configuration, segment: {{method: dinov2, model: {shlex.quote(str(model))}}}")
 
 
 def _settings(assignments: list[str]) -> dict[str, Any]:
@@ -143,7 +136,7 @@ def _settings(assignments: list[str]) -> dict[str, Any]:
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not equals:
-            raise ConfigError(f"--set {shown(assignment)}: give KEY=VALUE, like --set rounds=100")
+            raise ConfigError(f"--set {shown(assignment)}: give KEY=VALUE, like --set epochs=100")
         parsed[name] = document.parse(
             value.encode(errors="surrogateescape"), f"--set {printable(name)}"
         ).value

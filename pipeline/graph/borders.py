@@ -85,10 +85,9 @@ class BorderStages:
     @property
     def reach_m(self) -> float:
         """Distance from a corner or edge up to which ground is read (m), at most `REACH_M`."""
-        context_m: float = getattr(stage_module(self.segment), "CONTEXT_M", 0.0)
         fit: Any = stage_module(self.fit)
         acting_m: float = fit.acting_m(self.fit)
-        return min(max(AROUND_M, self.load.halo_m, acting_m) + context_m, REACH_M)
+        return min(max(AROUND_M, self.load.halo_m, acting_m), REACH_M)
 
     def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of a corner, or of an edge between its two ends.

@@ -188,14 +188,14 @@ def error_map(
 
 
 def segmentation_map(
-    ground: Floats | NDArray[np.uint8], truth: Bools, segmented: Bools, grid: Grid, title: str = ""
+    photo: NDArray[np.uint8], truth: Bools, segmented: Bools, grid: Grid, title: str = ""
 ) -> bytes:
-    """Draw the outlines of labelled and segmented road over an orthophoto or a shaded relief.
+    """Draw the outlines of labelled and segmented road over an orthophoto.
 
     Parameters
     ----------
-    ground : ndarray
-        An orthophoto of the grid (red, green, blue), ``(3, h, w)``; or heights (m), ``(H, W)``.
+    photo : ndarray
+        An orthophoto of the grid (red, green, blue), ``(3, h, w)``.
     truth, segmented : Bools
         Road by the labels and by the segmenter, ``(H, W)``.
     grid : Grid
@@ -208,12 +208,7 @@ def segmentation_map(
     bytes
         A PNG, 480 pixels wide.
     """
-    if ground.ndim == 3:
-        rgb = np.moveaxis(ground, 0, -1) / 255
-    else:
-        grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*grid.shape, 3))
-        rgb = _shaded(grey, np.asarray(ground, np.float64), grid.cell)
-    figure, axes = _map(rgb, grid, title)
+    figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid, title)
     # The first line is wider, so that it is visible below the second where both agree.
     parts = (("labels", truth, TRUE, 2.4), ("segmented", segmented, DROPPED, 0.9))
     for _, mask, colour, width in parts:

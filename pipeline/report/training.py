@@ -46,7 +46,7 @@ def write_model(outcome: Outcome, path: Path) -> tuple[Path, ...]:
     outcome : Outcome
         The result of the training.
     path : Path
-        Path of the model; without a suffix, the method's suffix is added.
+        Path of the model; without a suffix, ``.safetensors`` is added.
 
     Raises
     ------
@@ -126,13 +126,12 @@ def _lines(outcome: Outcome) -> list[str]:
     warning = verdict(outcome)
     return [
         *([f"Warning: {warning}."] if warning else []),
-        f"Method {options.method}, labels: {options.labels}. Trained on {count(len(split.train), 'tile')}, "
+        f"Labels: {options.labels}. Trained on {count(len(split.train), 'tile')}, "
         f"validated on {len(split.validate)} in one separate block. Not used for training: cells nearer to "
         f"the block than {options.gap_m:g} m, and cells nearer to an edge of the labels than "
         f"{options.ignore_m:g} m.",
-        "Expect lower quality on land that looks different. dinov2 chooses its stopping point and its "
-        "threshold on the validation tiles, so its figures are slightly optimistic; pixels chooses them on "
-        "parts of the training tiles.",
+        "Expect lower quality on land that looks different. The stopping point and the threshold are chosen "
+        "on the validation tiles, so the figures are slightly optimistic.",
     ]
 
 
@@ -156,12 +155,12 @@ def _curves(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
         yield "Precision and recall by threshold", curves(line, ("recall", "precision"), limits, mark)
     history = outcome.trained.history
     if len(history) > 1:
-        rounds = np.arange(1.0, len(history) + 1)
+        epochs = np.arange(1.0, len(history) + 1)
         losses = {
-            "training": (rounds, np.array([entry.train_loss for entry in history])),
-            "validation": (rounds, np.array([entry.validation_loss for entry in history])),
+            "training": (epochs, np.array([entry.train_loss for entry in history])),
+            "validation": (epochs, np.array([entry.validation_loss for entry in history])),
         }
-        yield "Loss by round", curves(losses, ("round", "loss"))
+        yield "Loss by epoch", curves(losses, ("epoch", "loss"))
 
 
 def _pictures(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
@@ -178,7 +177,7 @@ def _pictures(outcome: Outcome) -> Iterator[tuple[str, bytes]]:
 
 def _picture(outcome: Outcome, evaluation: Evaluation) -> bytes:
     preview = outcome.preview(evaluation)
-    return segmentation_map(preview.ground, preview.truth, preview.predicted, preview.grid)
+    return segmentation_map(preview.photo, preview.truth, preview.predicted, preview.grid)
 
 
 def _share(quality: Quality) -> float:

@@ -263,8 +263,7 @@ def check_models(config: Config) -> None:
                 values = options.model_dump()
                 remedy = "restore it, or name another one"
                 if path == values.get("model"):
-                    arguments = f"--method {values['method']} --labels mask -o {path}"
-                    remedy = f"make it with `flexroad train CATALOG {arguments}`"
+                    remedy = f"make it with `flexroad train CATALOG --labels mask -o {path}`"
                 raise ConfigError(f"{config.name}: {stage}: {path} does not exist; {remedy}")
 
 

@@ -1,4 +1,4 @@
-"""Train a segmenter on some of a catalog's tiles and validate it on others, which lie apart.
+"""Train the head of `segment: dinov2` on some tiles of a catalog and validate it on others, which lie apart.
 
 Validation runs the segmenter as a run does, with the trained model but without cleanup: the metrics are those
 of the model alone.
@@ -6,7 +6,6 @@ of the model alone.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,21 +19,21 @@ from pydantic import ValidationError
 from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, printable, shown
-from flexroad.pipeline.config.methods import methods
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.training.spatial_split import Block, Split, inside, split, split_tile
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
-from flexroad.tasks.options import Options
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
-from flexroad.tasks.segment.training_types import Round, Sample, Trained
-from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
+from flexroad.tasks.segment.dinov2 import segment as segmenter
+from flexroad.tasks.segment.dinov2 import train as head
+from flexroad.tasks.segment.training_types import Epoch, Sample, Trained
+from flexroad.tasks.types import Bools, RoadMask, TileData
 
 Labels = Literal["mask", "vector"]
 Log = Callable[[str], None]
@@ -44,7 +43,6 @@ Log = Callable[[str], None]
 class TrainOptions:
     """Options of ``flexroad train``."""
 
-    method: str
     labels: Labels
     validation: float = 0.3
     """Fraction of the tiles used for validation."""
@@ -54,7 +52,7 @@ class TrainOptions:
     """Training cells are farther than this from an edge of the labels (m), which are never exact."""
     seed: int = 0
     settings: Mapping[str, Any] | None = None
-    """Options of the method's training, by name; None for the defaults."""
+    """Options of the head's training, by name; None for the defaults."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +74,8 @@ class Preview:
     """Rasters for a map of one tile."""
 
     grid: Grid
-    ground: Floats | NDArray[np.uint8]
-    """The photo, ``(3, h, w)``, or the DSM if the tile has no photo, ``(H, W)``, m."""
+    photo: NDArray[np.uint8]
+    """The orthophoto, ``(3, h, w)``."""
     truth: Bools
     """Road according to the labels, ``(H, W)``."""
     predicted: Bools
@@ -156,8 +154,11 @@ class Outcome:
         data, truth = self.tiles.read(evaluation.piece.tile)
         window = data.grid.window(data.core)
         mask = np.unpackbits(evaluation.mask, count=data.core.width * data.core.height).astype(bool)
-        ground = data.dsm[window] if data.dop is None else read_photo(data.dop, data.core).colour
-        return Preview(data.core, ground, truth[window], mask.reshape(data.core.shape))
+        # Tiles without a photo are left out from the start.
+        assert data.dop is not None
+        return Preview(
+            data.core, read_photo(data.dop, data.core).colour, truth[window], mask.reshape(data.core.shape)
+        )
 
     @property
     def quality(self) -> Quality:
@@ -193,13 +194,13 @@ class Samples(Sequence[Sample]):
 
 
 def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> Outcome:
-    """Train a method on a catalog and validate the model.
+    """Train a head on a catalog and validate it.
 
     Parameters
     ----------
     catalog : Catalog
     config : Config
-        Options of its first exported variant: those of `load`, and those of `segment` if of the same method.
+        Options of its first exported variant: those of `load`, and those of `segment` if it is dinov2.
     options : TrainOptions
     log : callable
         Called with each line of progress.
@@ -207,41 +208,37 @@ def train(catalog: Catalog, config: Config, options: TrainOptions, log: Log) -> 
     Raises
     ------
     ConfigError
-        If the method or one of its settings is unknown, or the labels cannot be used.
+        If one of the settings is unknown, or the labels cannot be used.
     TaskError
         If training fails.
     """
-    method = _method(options)
-    settings = _settings(method, options)
+    settings = _settings(options)
     tiles = LabelledTiles(options, _chain(config)["load"], _vector_options(config))
     notes: list[str] = []
     sides = _split(list(_labelled(catalog, tiles, notes)), options)
     log(f"{count(len(sides.train), 'tile')} for training, {len(sides.validate)} for validation")
-    samples = [Samples(tiles, sides, part) for part in ("train", "validate")]
+    samples, validation = (Samples(tiles, sides, part) for part in ("train", "validate"))
 
-    def progress(done: int, of: int, last: Round) -> None:
-        log(f"round {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
+    def progress(done: int, of: int, last: Epoch) -> None:
+        log(f"epoch {done} of {of}: loss {last.train_loss:.4f}, validation {last.validation_loss:.4f}")
 
-    trained: Trained = method.train(*samples, settings, progress)
-    segment = methods("segment")[options.method]
+    trained = head.train(samples, validation, settings, progress)
     with ScratchFolder() as folder:
         model = Path(folder, f"model{trained.suffix}")
         model.write_bytes(trained.model)
-        applied = segment_options(config, options.method, model)
+        applied = segment_options(config, model)
         judged = tuple(
-            _evaluate(block, tiles, lambda data: segment.segment(data, applied)) for block in sides.validate
+            _evaluate(block, tiles, lambda data: segmenter.segment(data, applied)) for block in sides.validate
         )
     notes += [f"{each.piece.tile.id}: {each.note}" for each in judged if each.note]
     return Outcome(options, tiles, trained, sides, judged, tuple(notes))
 
 
-def segment_options(config: Config, method: str, model: Path) -> Options:
+def segment_options(config: Config, model: Path) -> segmenter.Options:
     """Return the options of `segment` for validation: as configured, but without cleanup."""
     configured = _chain(config)["segment"]
-    module = methods("segment")[method]
-    given = configured.model_dump() if isinstance(configured, module.Options) else {"method": method}
-    options: Options = module.Options(**given | {"model": model, "cleanup": NOTHING})
-    return options
+    given = configured.model_dump() if isinstance(configured, segmenter.Options) else {}
+    return segmenter.Options(**given | {"model": model, "cleanup": NOTHING})
 
 
 def _evaluate(block: Block, tiles: LabelledTiles, segment: Callable[[TileData], RoadMask]) -> Evaluation:
@@ -266,7 +263,7 @@ def _labelled(catalog: Catalog, tiles: LabelledTiles, notes: list[str]) -> Itera
     """Yield the tiles with labels, a single tile in two parts; add a note for each that cannot be read."""
     single = len(catalog.usable) == 1
     for tile in catalog.tiles:
-        if tiles.options.method == "dinov2" and tile.layer("dop") is None:
+        if tile.layer("dop") is None:
             continue
         bounds = tile.grid.bounds
         try:
@@ -298,10 +295,9 @@ def _check_labels(pieces: Sequence[Block], options: TrainOptions) -> None:
     if not pieces:
         missing = {
             "vector": "vectors of roads: give --roads to `flexroad catalog rasters`",
-            "mask": "mask of roads: give --reference-road or --road-mask to `flexroad catalog rasters`",
+            "mask": "a mask of roads: give --reference-road or --road-mask to `flexroad catalog rasters`",
         }[options.labels]
-        photo = " and an orthophoto (--dop)" if options.method == "dinov2" else ""
-        raise ConfigError(f"no readable tile has a {missing}{photo}".replace("a vectors", "vectors"))
+        raise ConfigError(f"no readable tile has {missing} and an orthophoto (--dop)")
     road, ground = (sum(counts) for counts in zip(*((p.road, p.ground) for p in pieces), strict=True))
     if not road or not ground:
         raise ConfigError(
@@ -310,28 +306,16 @@ def _check_labels(pieces: Sequence[Block], options: TrainOptions) -> None:
         )
 
 
-def _method(options: TrainOptions) -> Any:
-    folder = Path(importlib.import_module("flexroad.tasks.segment").__path__[0])
-    available = sorted(path.parent.name for path in folder.glob("*/train.py"))
-    if options.method not in available:
-        raise ConfigError(f"--method {options.method}: there are {', '.join(available)}")
-    return importlib.import_module(f"flexroad.tasks.segment.{options.method}.train")
-
-
-def _settings(method: Any, options: TrainOptions) -> Options:
-    values = dict(options.settings or {})
-    if "seed" in method.Options.model_fields:
-        values.setdefault("seed", options.seed)
+def _settings(options: TrainOptions) -> head.Options:
     try:
-        settings: Options = method.Options(**values)
+        return head.Options(**{"seed": options.seed, **(options.settings or {})})
     except ValidationError as error:
         fault = error.errors()[0]
         name = printable(".".join(str(part) for part in fault["loc"]))
         raise ConfigError(
             f"--set {name}: {fault['msg'].lower()}, not {shown(fault['input'])}; "
-            f"{options.method} has {', '.join(method.Options.model_fields)}"
+            f"the training has {', '.join(head.Options.model_fields)}"
         ) from error
-    return settings
 
 
 def _vector_options(config: Config) -> rasterise.Options:

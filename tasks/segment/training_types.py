@@ -1,4 +1,4 @@
-"""Types shared by the training command and the trainable segmentation methods."""
+"""Types shared by the training command and the trainable segmentation method."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Round:
-    """Losses after one boosting round or one epoch."""
+class Epoch:
+    """Losses after one epoch."""
 
     train_loss: float
     validation_loss: float
-    """NaN if not measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +35,13 @@ class Trained:
     model: bytes
     """Content of the model file."""
     suffix: str
-    """Suffix of the model file: ``.skops``, ``.safetensors``."""
-    history: tuple[Round, ...]
-    """One entry per round or epoch, in order."""
+    """Suffix of the model file: ``.safetensors``."""
+    history: tuple[Epoch, ...]
+    """One entry per epoch, in order."""
 
 
 class Progress(Protocol):
-    """Callback, called at the end of every round or epoch."""
+    """Callback, called at the end of every epoch."""
 
-    def __call__(self, done: int, of: int, last: Round) -> None:
-        """Report round ``done`` (from 1) of at most ``of``."""
+    def __call__(self, done: int, of: int, last: Epoch) -> None:
+        """Report epoch ``done`` (from 1) of at most ``of``."""

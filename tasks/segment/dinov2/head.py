@@ -21,7 +21,7 @@ from flexroad.tasks.segment.dinov2.windows import Predict
 
 KEY = "flexroad"
 """Key of `About` in the file's metadata."""
-REMEDY = "train one: `flexroad train CATALOG --method dinov2 --labels mask -o MODEL.safetensors`"
+REMEDY = "train one: `flexroad train CATALOG --labels mask -o MODEL.safetensors`"
 
 MOST_BYTES = 2**28
 """Largest file (bytes); a head for one class and 40 layers of the largest DINOv2 has 240 KiB."""

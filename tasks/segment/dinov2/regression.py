@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.tasks.options import Options
-from flexroad.tasks.segment.training_types import Progress, Round
+from flexroad.tasks.segment.training_types import Epoch, Progress
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
@@ -138,16 +138,16 @@ class Regression:
 
 def regress(
     train: Windows, validate: Windows, settings: Settings, progress: Progress | None = None
-) -> tuple[Line, tuple[Round, ...]]:
+) -> tuple[Line, tuple[Epoch, ...]]:
     """Train; return the map with the lowest loss on ``validate``, and the losses of all epochs."""
     regression = Regression(train, settings)
     rng = np.random.default_rng(settings.seed)
-    history: list[Round] = []
+    history: list[Epoch] = []
     best = regression.line()
     lowest, since = np.inf, 0
     while len(history) < settings.epochs and since < settings.patience:
         loss = regression.train_epoch(train, rng.permutation(len(train.labels)), settings.batch)
-        history.append(Round(loss, regression.mean_loss(validate, settings.batch)))
+        history.append(Epoch(loss, regression.mean_loss(validate, settings.batch)))
         since += 1
         if history[-1].validation_loss < lowest:
             best, lowest, since = regression.line(), history[-1].validation_loss, 0

@@ -37,7 +37,7 @@ class Options(options.Options):
     """Model, windows and cleanup. A value of null means the value that the head was trained with."""
 
     method: Literal["dinov2"] = "dinov2"
-    model: Path = Field(description="file of the head, made by `flexroad train CATALOG --method dinov2`")
+    model: Path = Field(description="file of the head, made by `flexroad train CATALOG`")
     backbone: str | None = Field(
         None, description="hub name or folder of the backbone's weights; null: the head's"
     )

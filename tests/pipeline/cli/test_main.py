@@ -277,11 +277,11 @@ def test_catalog_show_lists_layers_and_count(made_survey):
 
 
 def test_train_setting_that_cannot_be_read_gives_one_line(flexroad):
-    command = ["train", "none.json", "--method", "pixels", "--labels", "mask", "-o", "x.skops", "--set"]
+    command = ["train", "none.json", "--labels", "mask", "-o", "x.safetensors", "--set"]
     for setting, message in {
         f"rounds={'9' * 5000}": "--set rounds: not readable as YAML: line 1, column 1: a number of more than",
         "rounds=[": "--set rounds: not readable as YAML",
-        "rounds": "--set 'rounds': give KEY=VALUE, like --set rounds=100",
+        "rounds": "--set 'rounds': give KEY=VALUE, like --set epochs=100",
     }.items():
         (line,) = flexroad(*command, setting).expected(2).errors
         assert message in line

@@ -86,7 +86,7 @@ def test_catalog_of_files_outside_next_line_allows_them_for_all_commands(rasters
     assert f"names {places['squares']}" in flexroad(*run, *without).expected(2).err
     assert "1 tile: 1 done" in flexroad(*arguments, "--executor", "serial").expected(0).out
     assert "1 tile of" in flexroad("catalog", "check", rasters / "c.parquet", *allow).out
-    training = ("train", rasters / "c.parquet", "--method", "pixels", "--labels", "mask", "-o", "model")
+    training = ("train", rasters / "c.parquet", "--labels", "mask", "-o", "model")
     assert "--allow" in flexroad(*training, *without).expected(2).err
     assert "--allow" not in flexroad(*training, *allow).err
 

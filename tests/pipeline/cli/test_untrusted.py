@@ -30,7 +30,7 @@ def tampered(survey):
 @pytest.mark.parametrize("name", ["/vsicurl/{url}/a.tif", "{url}/a.tif", "/vsicurl?url={url}/a.tif"])
 def test_catalog_with_address_is_refused_by_all_commands(flexroad, tampered, web, tmp_path, name):
     catalog = tampered(name.format(url=web.url))
-    options = ("--method", "pixels", "--labels", "mask", "-o", tmp_path / "model")
+    options = ("--labels", "mask", "-o", tmp_path / "model")
     for words in (
         ("catalog", "check", catalog, "--allow", "/"),
         ("train", catalog, *options, "--allow", "/"),
@@ -46,7 +46,7 @@ def test_catalog_with_file_outside_needs_allow_for_all_commands(flexroad, tamper
     outside.parent.mkdir()
     shutil.copy(next((survey.parent / "dsm").glob("*.tif")), outside)
     catalog, option = tampered(str(outside)), ("--allow", str(outside.parent))
-    options = ("--method", "pixels", "--labels", "mask", "-o", tmp_path / "model")
+    options = ("--labels", "mask", "-o", tmp_path / "model")
     for words in (("catalog", "check", catalog), ("train", catalog, *options)):
         said = flexroad(*words).expected(2)
         assert f"dsm names {outside}, outside" in said.err

@@ -20,11 +20,10 @@ from flexroad.pipeline.training.train import LabelledTiles, Samples, TrainOption
 from flexroad.tasks import load
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.mask_cleanup import NOTHING
-from flexroad.tasks.segment.pixels import segment
+from flexroad.tasks.segment.dinov2 import segment
 from tests.command_line import call
+from tests.make_backbone import save_backbone
 from tests.pipeline.cli.test_main import flexroad
-
-QUICK = ("--set", "rounds=15", "--set", "cells=2000")
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +32,22 @@ def land(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(land, tmp_path_factory):
-    model = tmp_path_factory.mktemp("model") / "roads.skops"
-    flexroad("train", land, "--method", "pixels", "--labels", "mask", "-o", model, "--gap-m", 20, *QUICK)
-    return model, json.loads(model.with_name("roads.skops.json").read_text())
+def settings(tmp_path_factory):
+    """Options of a quick training on a backbone with random weights."""
+    backbone = save_backbone(tmp_path_factory.mktemp("backbone") / "tiny", hidden_size=96)
+    quick = {"layers": 3, "gsd_m": 0.2, "window_px": 112, "epochs": 40, "learning_rate": 0.03}
+    return {"backbone": str(backbone), **quick}
+
+
+def words(settings, **changes):
+    return [word for name, value in {**settings, **changes}.items() for word in ("--set", f"{name}={value}")]
+
+
+@pytest.fixture(scope="module")
+def trained(land, settings, tmp_path_factory):
+    model = tmp_path_factory.mktemp("model") / "roads.safetensors"
+    flexroad("train", land, "--labels", "mask", "-o", model, "--gap-m", 20, *words(settings))
+    return model, json.loads(model.with_name("roads.safetensors.json").read_text())
 
 
 def with_layers(catalog, **layers):
@@ -74,13 +85,13 @@ def test_train_report_equals_segmenter_on_validation_tiles(land, trained):
     assert {*report["asked"]["judged by"], *report["asked"]["learnt from"]} == {
         t.id for t in Catalog.read(land).tiles
     }
-    # At most the requested rounds; cross-validation on the training tiles sets the number.
+    # At most the requested epochs; the loss on the validation tiles sets the number.
     losses = [entry["train_loss"] for entry in report["history"]]
-    assert 1 < len(losses) <= 15
+    assert 1 < len(losses) <= 40
     assert losses[-1] < losses[0]
 
 
-def test_train_with_poor_result_says_so_and_does_not_recommend_it(land, tmp_path):
+def test_train_with_poor_result_says_so_and_does_not_recommend_it(land, settings, tmp_path):
     survey = shutil.copytree(land.parent, tmp_path / "land")
     blobs = np.random.default_rng(0)
     for path in (survey / "reference_road").glob("*.tif"):
@@ -88,33 +99,33 @@ def test_train_with_poor_result_says_so_and_does_not_recommend_it(land, tmp_path
             # Labels that nothing in the rasters tells: squares of 8 m at random places.
             squares = np.kron(blobs.random((10, 10)) < 0.15, np.ones((8, 8)))
             file.write(squares.astype(file.dtypes[0]), 1)
-    model = tmp_path / "poor.skops"
-    words = ("--method", "pixels", "--labels", "mask", "--gap-m", 20, "--set", "cells=2000")
-    said = call("train", survey / land.name, *words, "-o", model, "--set", "rounds=1").expected(0)
-    report = json.loads(model.with_name("poor.skops.json").read_text())
+    model = tmp_path / "poor.safetensors"
+    options = ("--labels", "mask", "--gap-m", 20, *words(settings, epochs=1))
+    said = call("train", survey / land.name, *options, "-o", model).expected(0)
+    report = json.loads(model.with_name("poor.safetensors.json").read_text())
     iou = report["all"]["iou"]
     assert iou < 0.4
     assert f"warning: an IoU of {iou:.2f} is poor (below 0.5)" in said.err
     assert "next:" not in said.out
     assert "segment: {" not in said.out
-    page = model.with_name("poor.skops.html").read_text()
+    page = model.with_name("poor.safetensors.html").read_text()
     assert f"Warning: an IoU of {iou:.2f} is poor" in page
     assert len(report["history"]) == 1
-    assert "Loss by round" not in page
+    assert "Loss by epoch" not in page
 
 
-def test_train_with_good_result_says_how_to_use_it(land, tmp_path):
-    model = tmp_path / "good.skops"
-    words = ("--method", "pixels", "--labels", "mask", "--gap-m", 20, *QUICK)
-    said = call("train", land, *words, "-o", model).expected(0)
-    assert f"next: in a configuration, segment: {{method: pixels, model: {model}}}" in said.out
+def test_train_with_good_result_says_how_to_use_it(land, settings, tmp_path):
+    model = tmp_path / "good.safetensors"
+    options = ("--labels", "mask", "--gap-m", 20, *words(settings))
+    said = call("train", land, *options, "-o", model).expected(0)
+    assert f"next: in a configuration, segment: {{method: dinov2, model: {model}}}" in said.out
     assert "warning" not in said.err
-    assert "Loss by round" in model.with_name("good.skops.html").read_text()
+    assert "Loss by epoch" in model.with_name("good.safetensors.html").read_text()
 
 
 def test_train_page_is_self_contained_and_shows_tiles(trained):
     model, report = trained
-    page = model.with_name("roads.skops.html").read_text()
+    page = model.with_name("roads.safetensors.html").read_text()
     assert 'src="data:image/png' in page
     assert "http" not in page
     assert all(tile in page for tile in report["asked"]["judged by"])
@@ -122,17 +133,15 @@ def test_train_page_is_self_contained_and_shows_tiles(trained):
 
 def test_run_with_trained_model_completes(land, trained, quick_config, tmp_path):
     model, _ = trained
-    quick = yaml.safe_load(quick_config.read_text()) | {"segment": {"method": "pixels", "model": str(model)}}
+    quick = yaml.safe_load(quick_config.read_text()) | {"segment": {"method": "dinov2", "model": str(model)}}
     config = tmp_path / "segment.yaml"
     config.write_text(yaml.safe_dump(quick))
-    words = ("--config", config, "--catalog", land, "--out", tmp_path / "run", "--executor", "serial")
-    assert "4 done" in flexroad("run", *words)
+    options = ("--config", config, "--catalog", land, "--out", tmp_path / "run", "--executor", "serial")
+    assert "4 done" in flexroad("run", *options)
 
 
 def test_training_samples_keep_off_edges_and_validation_tiles(land):
-    tiles = LabelledTiles(
-        TrainOptions("pixels", "mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS
-    )
+    tiles = LabelledTiles(TrainOptions("mask", ignore_m=2.0), load.Options(halo_m=10.0), rasterise.DEFAULTS)
     catalog = Catalog.read(land)
     blocks = [block for tile in catalog.tiles for block in tiles.blocks(tile, [tile.grid.bounds])]
     sides = split(blocks, 0.3, 30.0, 0)
@@ -146,13 +155,11 @@ def test_training_samples_keep_off_edges_and_validation_tiles(land):
         assert distance[sample.labelled].min() > 2.0
 
 
-def test_train_single_tile_is_split_in_two(land):
+def test_train_single_tile_is_split_in_two(land, settings):
     catalog = Catalog.read(land)
     single = Catalog(catalog.tiles[:1])
-    settings = {"rounds": 5, "cells": 1000}
-    outcome = train(
-        single, load_config("paper"), TrainOptions("pixels", "mask", gap_m=10, settings=settings), print
-    )
+    options = TrainOptions("mask", gap_m=10, settings={**settings, "epochs": 2})
+    outcome = train(single, load_config("paper"), options, print)
     assert outcome.split.train[0].tile == outcome.split.validate[0].tile
     assert outcome.split.train[0].bounds[2] == outcome.split.validate[0].bounds[0]
 
@@ -169,7 +176,7 @@ def test_labelled_reads_vector_labels(land, tmp_path):
     )
     bare = replace(tile, layers=tuple(layer for layer in tile.layers if layer.name != "roads"))
     drawn = replace(bare, layers=(*bare.layers, Layer("roads", (str(path),))), allowed=None)
-    tiles = LabelledTiles(TrainOptions("pixels", "vector"), load.Options(), rasterise.DEFAULTS)
+    tiles = LabelledTiles(TrainOptions("vector"), load.Options(), rasterise.DEFAULTS)
     _, road = tiles.labelled(drawn)
     assert road[-30:-20].all()
     assert road.sum() == 10 * tile.grid.width
@@ -181,7 +188,7 @@ def check_refused(catalog, match, **options):
         train(
             catalog,
             load_config("paper"),
-            TrainOptions(**{"method": "pixels", "labels": "mask"} | options),
+            TrainOptions(**{"labels": "mask"} | options),
             print,
         )
 
@@ -192,20 +199,21 @@ def test_train_unusable_labels_or_settings_raise(land):
         with_layers(catalog, road_mask=None, reference_road=None), "--reference-road or --road-mask"
     )
     check_refused(with_layers(catalog, roads=None), "--roads", labels="vector")
-    check_refused(with_layers(catalog, dop=None), "orthophoto", method="dinov2")
+    check_refused(with_layers(catalog, dop=None), "orthophoto")
     check_refused(with_layers(catalog, reference_road="dsm"), "are road")
     check_refused(catalog, "lower --gap-m", gap_m=1000)
-    check_refused(catalog, "there are dinov2, pixels", method="magic")
-    check_refused(catalog, "--set leafs.*leaves", settings={"leafs": 3})
+    check_refused(catalog, "--set epoch:.*epochs", settings={"epoch": 3})
 
 
 def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
     quick = yaml.safe_load(quick_config.read_text()) | {
-        "segment": {"method": "pixels", "model": "gone.skops"}
+        "segment": {"method": "dinov2", "model": "gone.safetensors"}
     }
     config = tmp_path / "segment.yaml"
     config.write_text(yaml.safe_dump(quick))
-    with pytest.raises(ConfigError, match=r"gone.skops does not exist; make it with `flexroad train CATALOG"):
+    with pytest.raises(
+        ConfigError, match=r"gone.safetensors does not exist; make it with `flexroad train CATALOG"
+    ):
         check_models(load_config(config))
     with pytest.raises(ConfigError, match="does not exist"):
         Run.create(tmp_path / "run", load_config(config), Catalog.read(land))
@@ -214,5 +222,5 @@ def test_run_missing_model_raises_before_start(land, tmp_path, quick_config):
 
 def test_train_help_lists_options():
     text = flexroad("train", "--help")
-    for word in ("--method", "--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
+    for word in ("--labels", "--validation", "--gap-m", "--ignore-m", "--set", "--seed"):
         assert word in text

@@ -310,7 +310,7 @@ def test_segment_broken_head_names_file_and_remedy(backbones, heads, sample, tmp
     save_file({"weight": np.zeros((1, 4), np.float32)}, no_head, {"format": "pt"})
     weights = next(backbones[0].glob("*.safetensors"))
     for path in (tmp_path / "none.safetensors", tmp_path, broken, text, no_head, weights):
-        with pytest.raises(TaskError, match=f"{path}.*flexroad train CATALOG --method dinov2") as caught:
+        with pytest.raises(TaskError, match=f"{path}.*flexroad train CATALOG --labels") as caught:
             segmented(sample.data, path)
         assert "\n" not in str(caught.value)
         assert caught.value.file == str(path)

@@ -1,1 +1,0 @@
-"""Segment roads by gradient-boosted trees over per-pixel features."""
