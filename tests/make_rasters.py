@@ -52,3 +52,16 @@ def write_xyz(path: Path, values, west: float, north: float, *, northward: bool 
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def damage(path: Path, row: int, col: int) -> tuple[slice, slice]:
+    """Overwrite the block that has a cell; return its rows and columns in the file."""
+    with rasterio.open(path) as raster:
+        tall, wide = raster.block_shapes[0]
+        i, j = row // tall, col // wide
+        start = int(raster.get_tag_item(f"BLOCK_OFFSET_{j}_{i}", "TIFF", bidx=1))
+        size = int(raster.get_tag_item(f"BLOCK_SIZE_{j}_{i}", "TIFF", bidx=1))
+    data = bytearray(path.read_bytes())
+    data[start : start + size] = np.random.default_rng(1).bytes(size)
+    path.write_bytes(data)
+    return slice(i * tall, (i + 1) * tall), slice(j * wide, (j + 1) * wide)

@@ -55,13 +55,13 @@ class Mosaic:
     """The parts read, in the order of the files."""
     notes: tuple[str, ...]
     left_out: tuple[tuple[SourceFile, Unusable], ...]
-    """Files that cannot be used."""
+    """Files that cannot be used, or in part."""
 
     def reached(self, core: Grid) -> Bools:
-        """Return the cells of a tile within the bounds of a file that was read, ``(h, w)``."""
+        """Return the cells of a tile within the bounds of a file that was read there, ``(h, w)``."""
         cells = np.zeros(core.shape, np.bool_)
         for patch in self.patches:
-            cells |= patch.lattice.reached(core)
+            cells |= patch.reached(core)
         return cells
 
     def main_file(self, core: Grid) -> SourceFile:
@@ -134,7 +134,7 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     resampling = Resampling.bilinear if heights else Resampling.nearest
     files = _files(tile, layer)
     warped: list[RasterWindow] = []
-    patches: list[RasterWindow] = []
+    read: list[tuple[SourceFile, RasterWindow]] = []
     left_out: list[tuple[SourceFile, Unusable]] = []
     absurd_cells = 0
     for file in files:
@@ -150,7 +150,7 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
             continue
         if patch is None:
             continue
-        patches.append(patch)
+        read.append((file, patch))
         if patch.lattice.crs:
             warped.append(patch)
             continue
@@ -160,11 +160,14 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     # After the files in the tile's CRS, which lose nothing.
     for patch in joined(warped):
         fill_from(patch, grid, values, resampling)
+    patches = [patch for _, patch in read]
     notes = _notes(layer, patches, grid)
     notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
+    in_part = [(file, patch.fault) for file, patch in read if patch.fault]
+    notes += [f"a part of a file that the tile does not need was left out: {error}" for _, error in in_part]
     if absurd_cells:
         notes.append(absurd_note(layer.name, absurd_cells))
-    return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), tuple(left_out))
+    return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), (*left_out, *in_part))
 
 
 def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:

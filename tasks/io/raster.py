@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +15,6 @@ from rasterio.enums import Resampling
 from rasterio.io import MemoryFile
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import reproject
-from rasterio.windows import Window
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
@@ -26,9 +26,10 @@ from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError, Unusable
+from flexroad.tasks.io.raster_cells import all_cells, readable_cells
 from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.io.raster_header import header, place
-from flexroad.tasks.types import Floats
+from flexroad.tasks.types import Bools, Floats
 
 T = TypeVar("T")
 
@@ -39,6 +40,10 @@ for no value."""
 
 class Unreadable(Unusable):
     """A file that is missing or broken, so that its position is unknown."""
+
+
+class DamagedCells(Unreadable):
+    """A file that can be opened, but some of its cells cannot be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +66,23 @@ class RasterWindow:
     """Whether the file does not declare the unit."""
     step: int = 1
     """Number of cells of the file along an axis that were read as one."""
+    unreadable: Bools | None = None
+    """Cells that cannot be read, ``(rows, cols)``, because the file is damaged; None if all can."""
+    fault: Unusable | None = None
+    """Why they cannot; None if all can."""
 
     @property
     def file_lattice(self) -> RasterGrid:
         """The lattice of the file's own cells in the window."""
         grid, n = self.lattice, self.step
         return replace(grid, dx=grid.dx / n, dy=grid.dy / n, width=grid.width * n, height=grid.height * n)
+
+    def reached(self, grid: Grid) -> Bools:
+        """Return the cells of a grid that lie within the window and could be read, ``(H, W)``."""
+        reached = self.lattice.reached(grid)
+        if self.unreadable is not None:
+            reached[reached] = ~self.unreadable[self.lattice.cells_at(grid, reached)]
+        return reached
 
 
 def read_window(
@@ -84,7 +100,8 @@ def read_window(
     """Read the part of a file that covers a grid.
 
     Of a file with many cells in one cell of the grid, several are read as one, through the file's overviews
-    where it has them, so that the memory does not depend on the resolution of the file.
+    where it has them, so that the memory does not depend on the resolution of the file. Of a damaged file
+    the cells that cannot be read are left out (`RasterWindow.unreadable`).
 
     Parameters
     ----------
@@ -122,7 +139,7 @@ def read_window(
         If it is rotated, has no heights or no usable position, or is in another CRS than the grid.
     """
 
-    def read(src: Any) -> RasterWindow | None:
+    def read(src: Any, damaged: bool = False) -> RasterWindow | None:
         fault = heights_fault(src) if heights else None
         if fault:
             raise Unusable(f"{name} {fault}", str(path))
@@ -132,11 +149,19 @@ def read_window(
             return None
         step = lattice.step_for(grid)
         slices = lattice.whole_steps(step, *slices)
-        values, unit = _values(src, lattice, step, slices, resampling), src.units[0] or ""
+        reader = readable_cells if damaged else all_cells
+        values, unreadable = reader(src, lattice, step, slices, resampling)
         shown, file_crs = lattice.cut(*slices).coarser(step), header(src).crs or crs
-        return RasterWindow(name, str(path), values, shown, unit, file_crs, step=step)
+        unit = src.units[0] or ""
+        return RasterWindow(name, str(path), values, shown, unit, file_crs, step=step, unreadable=unreadable)
 
-    return read_raster(path, name, read, allowed, kept_raster, missing)
+    try:
+        return read_raster(path, name, read, allowed, kept_raster, missing)
+    except DamagedCells as error:
+        window = read_raster(path, name, partial(read, damaged=True), allowed, kept_raster, missing)
+        if window is None or window.unreadable is None or window.unreadable.all():
+            raise
+        return replace(window, fault=error)
 
 
 def read_raster(
@@ -185,14 +210,17 @@ def _attempt(
     by: Callable[[Location, AllowedFolders | None], AbstractContextManager[Any]],
     missing: frozenset[str] | None,
 ) -> T:
+    src = None
     try:
         with by(path, allowed) as src:
             return read(src)
     except ERRORS as error:
-        raise _fault(path, name, error, missing) from error
+        raise _fault(path, name, error, missing, src is not None) from error
 
 
-def _fault(path: Location, name: str, error: Exception, missing: frozenset[str] | None) -> TaskError:
+def _fault(
+    path: Location, name: str, error: Exception, missing: frozenset[str] | None, opened: bool
+) -> TaskError:
     """Return the error of a file that could not be opened or read; see `read_raster`."""
     absent = missing is not None and str(path) in missing
     if isinstance(error, FileNotFoundError) or _is_gone(path):
@@ -202,13 +230,14 @@ def _fault(path: Location, name: str, error: Exception, missing: frozenset[str] 
     why = reason(error.__cause__ or error)
     if isinstance(path, Path):
         if unread := _unread(path):
-            kind = Unreadable if absent else TaskError
-            return kind(f"{name} cannot be read: {unread}; mend that and run again", str(path))
+            text = f"{name} cannot be read: {unread}; mend that and run again"
+            return Unreadable(text, str(path)) if absent else TaskError(text, str(path))
     elif not isinstance(error, Refused):
         return TaskError(f"{name} cannot be read: {why}; run again, or repair it", str(path))
     if isinstance(error, Refused):
         return Unreadable(f"{name} {error}", str(path))
-    return Unreadable(f"{name} cannot be read: {why}; fetch it again", str(path))
+    kind = DamagedCells if opened else Unreadable
+    return kind(f"{name} cannot be read: {why}; fetch it again", str(path))
 
 
 def _is_gone(path: Location) -> bool:
@@ -368,39 +397,3 @@ def misalignment(lattice: RasterGrid, grid: Grid) -> str:
         return f"its cells are {cells}, the tile's {grid.cell:.6g} m"
     east, north = lattice.offset(grid)
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
-
-
-def _values(
-    src: Any, lattice: RasterGrid, step: int, slices: tuple[slice, slice], resampling: Resampling
-) -> Floats:
-    """Return the cells of a window, ``step`` x ``step`` of them as one; rows from the north."""
-    tall, wide = ([part for part in _whole_and_rest(part, step) if part] for part in slices)
-    if len(tall) == len(wide) == 1:
-        return _part(src, lattice, step, tall[0], wide[0], resampling)
-    return np.block([[_part(src, lattice, step, rows, cols, resampling) for cols in wide] for rows in tall])
-
-
-def _whole_and_rest(part: slice, step: int) -> tuple[slice | None, slice | None]:
-    """Return the whole steps of a slice, and the last step if it has fewer cells, at the end of the file."""
-    end = part.stop - (part.stop - part.start) % step
-    whole, rest = slice(part.start, end), slice(end, part.stop)
-    return (whole if whole.stop > whole.start else None), (rest if rest.stop > rest.start else None)
-
-
-def _part(
-    src: Any, lattice: RasterGrid, step: int, rows: slice, cols: slice, resampling: Resampling
-) -> Floats:
-    top = lattice.height - rows.stop if lattice.northward else rows.start
-    tall, wide = rows.stop - rows.start, cols.stop - cols.start
-    how: dict[str, Any] = {"window": Window(cols.start, top, wide, tall)}
-    if step > 1:
-        how |= {"out_shape": (-(-tall // step), -(-wide // step)), "resampling": resampling}
-    values: Floats = src.read(1, **how).astype(np.float64)
-    if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
-        values = values * src.scales[0] + src.offsets[0]
-    has_nan, all_valid = header(src).nan_is_nodata, header(src).all_valid
-    # Cells whose nodata value is NaN are NaN already.
-    if not all_valid and not (has_nan and step == 1):
-        how |= {"resampling": Resampling.mode} if step > 1 else {}
-        values[src.read_masks(1, **how) == 0] = np.nan
-    return values[::-1] if lattice.northward else values

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from affine import Affine
+from numpy.typing import NDArray
 
 from flexroad.catalog.crs import bounds_in, scales, transformer
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.tasks.types import Bools
+from flexroad.tasks.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,23 @@ class RasterGrid:
     def reached(self, grid: Grid) -> Bools:
         """Return the cells of a grid whose centres lie within the bounds, ``(H, W)``."""
         west, south, east, north = self.bounds
+        x, y = self._centres(grid)
+        inside: Bools = (south < y) & (y < north) & (west < x) & (x < east)
+        return inside
+
+    def cells_at(self, grid: Grid, chosen: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return rows, from the north, and columns of the cells under chosen centres of a grid, ``(n,)``."""
+        x, y = (values[chosen] for values in np.broadcast_arrays(*self._centres(grid)))
+        row, col = np.floor((self.north - y) / self.dy), np.floor((x - self.west) / self.dx)
+        return row.astype(np.intp), col.astype(np.intp)
+
+    def _centres(self, grid: Grid) -> tuple[Floats, Floats]:
+        """Return the centres of a grid's cells on this lattice, ``(H, W)``, or ``(1, W)`` and ``(H, 1)``."""
         x, y = grid.eastings[None, :], grid.northings[:, None]
         if self.crs:
             x, y = np.broadcast_arrays(x, y)
             x, y = transformer(grid.crs, self.crs).transform(x, y)
-        inside: Bools = (south < y) & (y < north) & (west < x) & (x < east)
-        return inside
+        return x, y
 
     def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
         """Return the slices grown to steps that are counted from the file's corner.

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+from rasterio.merge import merge
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.headers import kept_rasters, open_raster
@@ -26,7 +27,9 @@ from flexroad.pipeline.graph import sources
 from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.export import npz
 from flexroad.tasks.io import vectors
+from tests.make_rasters import damage, write
 from tests.permissions import permissions_enforced
 from tests.whole_run import products, rows
 
@@ -312,6 +315,28 @@ def test_damaged_pixels_fail_only_their_tile(survey, tmp_path):
     assert [failure.tile_id for failure in failures] == [path.stem]
     assert (summary.done, summary.failed) == (3, 1)
     assert failures[0].file == str(path)
+
+
+def test_damaged_block_of_a_sheet_fails_only_the_tile_it_lies_on(survey, scratch, tmp_path):
+    files = sorted((survey / "dsm").glob("*.tif"))
+    heights, transform = merge(files)
+    sheet = survey / "sheet.tif"
+    form = {"tiled": True, "blockxsize": 16, "blockysize": 16, "compress": "deflate"}
+    write(sheet, heights[0], transform=transform, crs="EPSG:25832", **form)
+    catalog = catalog_of(survey, "sheet.json", dsm="sheet.tif")
+    # Of the north-western tile, 8 m from its neighbours.
+    damage(sheet, 20, 20)
+    summary, failures = night(tmp_path / "run", catalog)
+    assert (summary.done, summary.failed) == (3, 1)
+    assert [failure.tile_id for failure in failures] == ["500000_5600040"]
+    for tile in Catalog.read(catalog).tiles:
+        if tile.id == "500000_5600040":
+            continue
+        name = f"tiles/{tile.id}/{tile.id}_flexroad_surface.npz"
+        surface, whole = (npz.decode(out / name) for out in (tmp_path / "run", scratch))
+        x, y = np.meshgrid(tile.grid.eastings, tile.grid.northings)
+        # The surface sees the hole from afar, but is one.
+        assert np.abs(surface.height(x, y) - whole.height(x, y)).max() < 0.05
 
 
 def test_file_that_cannot_be_hashed_counts_as_missing(survey):
