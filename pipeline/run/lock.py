@@ -4,6 +4,10 @@
 process table shows whether it is alive, independent of any clock. An owner on another machine renews the
 file's time every 30 s; the age of the file is measured with the storage's clock. Before such a lock is taken
 over, it is observed for a while, so that a clock that jumped cannot make a living owner lose it.
+
+Machines made of one image may have the same name and machine id, but never the same boot id. An owner with
+another boot id is a process before the last restart of this machine, or one on such a machine; it counts as
+the latter if it has renewed its lock since this machine was started.
 """
 
 from __future__ import annotations
@@ -238,11 +242,15 @@ class _Lock:
 
     def _dead(self, holder: Owner | None, current: LockStat) -> str | None:
         """Return why the owner counts as dead, None if it may be alive."""
-        if holder is not None and (holder.host, holder.machine) == (self.me.host, self.me.machine):
-            return exit_reason(holder)
+        watch_s = 1.5 * self.heartbeat.interval_s
+        # A machine that has just been started cannot tell: an owner renews its lock only at intervals.
+        before_start = current.age_s > max(watch_s, _uptime_s())
+        if holder is not None and (holder.boot == self.me.boot or before_start):
+            reason = exit_reason(holder)
+            if reason or self._is_here(holder):
+                return reason
         if abs(current.age_s) <= self.heartbeat.stale_s:
             return None
-        watch_s = 1.5 * self.heartbeat.interval_s
         self.notify(f"watching the lock of {_name(holder)} for {watch_s:.0f} s, to see whether it is renewed")
         time.sleep(watch_s)
         later = self.file.read()
@@ -250,10 +258,15 @@ class _Lock:
             return None
         return f"no sign of life for {watch_s if current.age_s < 0 else current.age_s:.0f} s"
 
+    def _is_here(self, holder: Owner) -> bool:
+        """Return whether the owner is a process of this machine since its last start."""
+        here = self.me.host, self.me.machine, self.me.boot
+        return (holder.host, holder.machine, holder.boot) == here
+
     def _refusal(self, holder: Owner | None, current: LockStat) -> str:
         """Return the error message for a lock that another process holds."""
         text = f"{self.run} is in use by {_name(holder)}{f' since {holder.since}' if holder else ''}"
-        if holder is not None and (holder.host, holder.machine) == (self.me.host, self.me.machine):
+        if holder is not None and self._is_here(holder):
             return f"{text}; wait for it, or end it with `kill {holder.pid}`"
         # A process on another machine can be judged only by the age of its lock.
         return (
@@ -279,6 +292,11 @@ def _read(path: str) -> str:
         return Path(path).read_text().strip()
     except OSError:
         return ""
+
+
+def _uptime_s() -> float:
+    """Return the time since the start of this machine (s), infinity if it is unknown."""
+    return float((_read("/proc/uptime") or "inf").split()[0])
 
 
 def _namespace() -> str:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run import lock
 from flexroad.pipeline.run.lock import Heartbeat, Owner, describe_owner, owner, run_lock, started
 from tests.faulty_files import intercepted
 from tests.power_loss import Recording, states
@@ -83,7 +84,6 @@ def test_lock_of_killed_process_is_taken_over_at_once(process, tmp_path):
     ("change", "reason"),
     [
         ({"start": 1}, "its number was given to another"),
-        ({"boot": "before"}, "was restarted since"),
         ({"pid": 2**22 + 1}, "that process is gone"),
     ],
 )
@@ -95,6 +95,30 @@ def test_owner_on_this_machine_is_checked_by_process_table(change, reason, tmp_p
     write_lock(tmp_path, Owner.me(), age_s=86400)
     with pytest.raises(ConfigError, match="is in use by pid"):
         take_lock(tmp_path)
+
+
+def test_owner_before_the_last_start_of_this_machine_is_dead_at_once(tmp_path):
+    heartbeat = Heartbeat(interval_s=30, stale_s=1e9)
+    write_lock(tmp_path, replace(Owner.me(), boot="before"), age_s=lock._uptime_s() + 100)
+    (message,) = take_lock(tmp_path, heartbeat)
+    assert "was restarted since" in message
+
+
+@pytest.mark.parametrize("uptime_s", [86400.0, 5.0], ids=["long ago", "just now"])
+def test_owner_with_other_boot_that_renewed_its_lock_is_other_machine(uptime_s, tmp_path, monkeypatch):
+    """As of another machine made of the same image; this one was started long ago, or just now."""
+    monkeypatch.setattr(lock, "_uptime_s", lambda: uptime_s)
+    write_lock(tmp_path, replace(Owner.me(), boot="other", pid=2**22 + 1), age_s=20)
+    with pytest.raises(ConfigError, match="last sign of life 20 s ago; if it is dead, the same command"):
+        take_lock(tmp_path, Heartbeat())
+
+
+def test_owner_with_other_boot_is_taken_over_when_stale(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "_uptime_s", lambda: 86400.0)
+    write_lock(tmp_path, replace(Owner.me(), boot="other"), age_s=400)
+    watching, taken_over = take_lock(tmp_path)
+    assert watching.startswith("watching the lock of")
+    assert "no sign of life for 400 s" in taken_over
 
 
 def test_owner_in_other_pid_namespace_is_other_machine(tmp_path):
