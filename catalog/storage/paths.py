@@ -303,6 +303,15 @@ def flush_names(*folders: Location) -> None:
             flush(folder)
 
 
+def refresh(*folders: Location) -> None:
+    """Have the names in folders looked up again: a share may remember for a minute that one was missing."""
+    for folder in folders:
+        if isinstance(folder, Path):
+            # To open a folder asks the server.
+            with contextlib.suppress(OSError), os.scandir(folder):
+                pass
+
+
 def remove(where: Location) -> None:
     """Remove a file; do nothing if it does not exist."""
     if isinstance(where, Path):

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Generic
 
 from flexroad.catalog.text import count
-from flexroad.pipeline.execute.executor import Executor, J, R
+from flexroad.pipeline.execute.executor import Executor, J, Probe, R
 
 START_S = 12.0
 """CPU time per core of the start of workers (s): processes, imports, compiled code. Measured: runs of 48
@@ -141,7 +141,7 @@ class AdaptiveExecutor:
         function: Callable[[J], R],
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
-        probe: Callable[[], None] | None = None,
+        probe: Probe | None = None,
     ) -> Generator[R, None, None]:
         """Yield results: first of the jobs done here, in their order, then of those done by workers."""
         if not isinstance(jobs, Jobs):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.clusters import ClusterTarget, open_cluster
-from flexroad.pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.executor import J, Probe, R
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -60,7 +60,7 @@ class DaskExecutor:
         function: Callable[[J], R],
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
-        probe: Callable[[], None] | None = None,
+        probe: Probe | None = None,
     ) -> Generator[R, None, None]:
         """Yield results as tiles finish."""
         queue = iter(jobs)
@@ -74,6 +74,7 @@ class DaskExecutor:
             _quiet(),
             open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as target,
             self._connected(target) as client,
+            probe or contextlib.nullcontext(),
         ):
             check = _check_workers(client, target, probe)
             session = Session(
@@ -85,6 +86,7 @@ class DaskExecutor:
                 lost,
                 self.cluster,
                 self.say,
+                probe,
             )
             yield from session.results()
 
@@ -116,13 +118,13 @@ def _any_worker(client: Client, end: float) -> bool:
     return False
 
 
-def _check_workers(client: Client, target: ClusterTarget, probe: Callable[[], None] | None) -> str:
-    """Compare versions, register the plugins and run the probe; return the name of the `WorkerCheck`.
+def _check_workers(client: Client, target: ClusterTarget, probe: Probe | None) -> str:
+    """Compare the versions that pickling needs, register the plugins; return the name of the `WorkerCheck`.
 
     Raises
     ------
     ConfigError
-        If a worker has other versions, cannot load flexroad or fails the probe.
+        If a process has other versions of these, or cannot load flexroad.
     ClusterLost
         If the scheduler no longer answers.
     """
@@ -146,10 +148,6 @@ def _check_workers(client: Client, target: ClusterTarget, probe: Callable[[], No
             f"{target.name} cannot load flexroad ({reason}); install it for the workers, and let the "
             "scheduler accept plugins (distributed.scheduler.pickle)"
         ) from error
-    # A worker that dies now is ignored: the one that replaces it is checked before its first tile.
-    for fault in client.run(workers.find_fault, name, on_error="ignore").values():
-        if fault:
-            raise ConfigError(fault)
     return name
 
 
@@ -175,8 +173,9 @@ def _compare(client: Client, here: dict[str, str]) -> None:
     """
     from flexroad.pipeline.execute.workers import PICKLING
 
-    reported = client.get_versions(packages=[name for name in here if name != "python"])
-    _compare_process("the scheduler", reported["scheduler"], {name: here[name] for name in PICKLING})
+    here = {name: here[name] for name in PICKLING}
+    reported = client.get_versions(packages=list(PICKLING[1:]))
+    _compare_process("the scheduler", reported["scheduler"], here)
     for address, worker in reported["workers"].items():
         _compare_process(f"worker {address}", worker, here)
 

@@ -11,26 +11,32 @@ from typing import Any
 from distributed import SchedulerPlugin
 
 
-def task_function() -> Callable[[bytes, str], tuple[str, Any]]:
+def task_function() -> Callable[[bytes, str, bool], tuple[str, str, str, Any, Any]]:
     """Return the function of every task: it unpickles a call and runs it if the worker passed its check.
 
-    Its arguments are the pickled call and the name of the `WorkerCheck`; it returns an error message, empty
-    if there is none, and the result. A scheduler unpickles the tasks that it receives; a call that is
-    already pickled stays bytes there.
+    Its arguments are the pickled call, the name of the `WorkerCheck` and whether the client has accepted the
+    worker. It returns address and host of the worker, what `WorkerCheck.admit` returns, and the result, None
+    if the call did not run. A scheduler unpickles the tasks that it receives; a call that is already pickled
+    stays bytes there.
     """
 
-    def run_task(packed: bytes, check: str) -> tuple[str, Any]:
+    def run_task(packed: bytes, check: str, accepted: bool) -> tuple[str, str, str, Any, Any]:
+        import socket
+
         from distributed import get_worker
         from distributed.protocol.pickle import loads
 
         worker = get_worker()
-        if check not in worker.plugins:
-            return f"worker {worker.address} cannot load flexroad; install it there", None
-        fault: str = worker.plugins[check].fault
-        if fault:
-            return fault, None
+        address, host = worker.address, socket.gethostname()
+        admit = getattr(worker.plugins.get(check), "admit", None)
+        if admit is None:
+            # An older version may have another `WorkerCheck`.
+            return address, host, "it cannot load this version of flexroad; install it there", None, None
+        fault, proof = admit(packed, accepted)
+        if fault or proof is not None:
+            return address, host, fault, proof, None
         work, function, job = loads(packed)
-        return "", work(function, job)
+        return address, host, "", None, work(function, job)
 
     return run_task
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
 
-from flexroad.pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.executor import J, Probe, R
 
 
 class SerialExecutor:
@@ -15,8 +15,8 @@ class SerialExecutor:
         function: Callable[[J], R],
         jobs: Iterable[J],
         lost: Callable[[J, str], R],
-        probe: Callable[[], None] | None = None,
+        probe: Probe | None = None,
     ) -> Generator[R, None, None]:
-        """Yield results in the order of the jobs; ``probe`` is not called, the caller has done so here."""
+        """Yield results in the order of the jobs; ``probe`` is not needed: there is no worker."""
         for job in jobs:
             yield function(job)

@@ -5,6 +5,9 @@ of them are quarantined: they run last, one at a time on a worker. A job that ex
 of its worker then is lost. If its worker dies again for an unknown reason, that may have come from a job on
 another worker of the same machine, which took its memory: such a job runs once more with no other job at the
 same time, and is lost if its worker dies a third time.
+
+A worker that fails its check is left out: one line says why, and its jobs go to other workers. If no worker
+passes, or workers die for memory before any job was done, the session ends.
 """
 
 from __future__ import annotations
@@ -14,10 +17,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
-from typing import Generic
+from typing import Any, Generic
 
 from dask.utils import format_bytes, key_split
 from distributed import Client, Future
@@ -26,9 +29,9 @@ from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerErro
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
-from flexroad.pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.executor import J, Probe, R
 from flexroad.pipeline.execute.scheduler import task_function
-from flexroad.pipeline.execute.workers import work
+from flexroad.pipeline.execute.workers import reason_of, work
 
 FORGET_KEYS_EVERY = 1000
 """Number of jobs after which Dask's cache of key names is cleared: it has 0.4 KB for each job."""
@@ -36,6 +39,9 @@ TICK_S = 1.0
 """Interval between checks of the scheduler and the workers (s)."""
 LONGEST_STEP_S = 5 * TICK_S
 """Longest time between two checks that counts as waiting (s): a clock jumps when a machine was suspended."""
+DEADLY = 20
+"""Number of workers that die for memory before any job is done, at which the session ends, or twice the
+number of threads if that is more. Fewer may be a few large tiles that happen to come first."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +49,14 @@ class InFlight(Generic[J]):
     """A job that was submitted."""
 
     job: J
-    reserved_worker: str = ""
-    """Address of the worker that runs only this job; empty if the job is not quarantined."""
+    workers: tuple[str, ...] = ()
+    """Addresses of the workers that may run it; empty if any may."""
+    reserved: bool = False
+    """Whether it was quarantined: it has one worker, which runs nothing else."""
     alone: bool = False
     """Whether no other job runs at the same time."""
+    accepted: bool = False
+    """Whether the proof of its only worker was accepted."""
     submitted: float = field(default_factory=time.monotonic)
 
 
@@ -71,6 +81,8 @@ class Session(Generic[J, R]):
         How long to wait for a worker when there is none, and longest time of a job.
     say : callable
         Prints one line for the user.
+    probe : Probe, optional
+        The probe of the `WorkerCheck`.
     """
 
     def __init__(
@@ -83,6 +95,7 @@ class Session(Generic[J, R]):
         lost: Callable[[J, str], R],
         cluster: Cluster,
         say: Callable[[str], None],
+        probe: Probe | None = None,
     ) -> None:
         self.client = client
         self.name = name
@@ -97,6 +110,19 @@ class Session(Generic[J, R]):
         self.patience_s = cluster.patience_s
         self.limit_s = cluster.tile_timeout_s
         self.say = say
+        self.probe = probe
+        self.returned: deque[J] = deque()
+        """Jobs that a worker could not take."""
+        self.accepted: dict[str, Any] = {}
+        """Accepted proofs by worker address."""
+        self.left_out: dict[str, str] = {}
+        """Why a worker gets no jobs, by its address."""
+        self.told: set[tuple[str, str]] = set()
+        """Host and reason of the workers left out: one line for all workers of a host."""
+        self.done = 0
+        """Number of results."""
+        self.died: set[str] = set()
+        """Addresses of workers that died before there was a result."""
         self.in_flight: dict[Future, InFlight[J]] = {}
         self.completed: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self.numbers = count(1)
@@ -115,30 +141,35 @@ class Session(Generic[J, R]):
         ClusterLost
             If the connection to the scheduler broke, or there was no worker for ``patience_s``.
         ConfigError
-            If a worker fails its check.
+            If no worker passes its check for ``patience_s``, or all die for memory before a job is done.
         """
         while True:
             self._check_cluster()
             self._submit_jobs()
-            if not (self.in_flight or self.quarantined or self.suspects):
+            if not (self.in_flight or self.returned or self.quarantined or self.suspects):
                 return
             for future in self._take_completed():
                 yield from self._outcome(future, self.in_flight.pop(future))
                 future.release()
 
     def _submit_jobs(self) -> None:
-        reserved = {flight.reserved_worker for flight in self.in_flight.values() if flight.reserved_worker}
+        reserved = {flight.workers[0] for flight in self.in_flight.values() if flight.reserved}
         if not reserved:
+            # Any worker may take a job, so that those that join later get some, unless one is left out.
+            allowed = tuple(self.workers) if self.left_out else ()
+            while self.returned and self.workers:
+                self._submit(InFlight(self.returned.popleft(), allowed))
             # Twice the number of threads keeps all workers busy at constant memory.
-            room = max(2, 2 * sum(self.workers.values())) - len(self.in_flight)
+            room = max(2, 2 * sum(self.workers.values())) - len(self.in_flight) - len(self.returned)
             for job in islice(self.jobs, max(0, room)):
-                self._submit(InFlight(job))
+                self._submit(InFlight(job, allowed))
         if len(self.in_flight) == len(reserved):
             for address in [address for address in self.workers if address not in reserved]:
                 if self.quarantined:
-                    self._submit(InFlight(self.quarantined.popleft(), address))
+                    self._submit(InFlight(self.quarantined.popleft(), (address,), reserved=True))
         if self.suspects and self.workers and not self.in_flight:
-            self._submit(InFlight(self.suspects.popleft(), next(iter(self.workers)), alone=True))
+            worker = (next(iter(self.workers)),)
+            self._submit(InFlight(self.suspects.popleft(), worker, reserved=True, alone=True))
 
     def _submit(self, flight: InFlight[J]) -> None:
         name = getattr(flight.job, "key", None) or self.function.__name__.strip("_")
@@ -150,9 +181,10 @@ class Session(Generic[J, R]):
             self.run_task,
             dumps((partial(work, limit_s=self.limit_s), self.function, flight.job)),
             self.check,
+            flight.accepted,
             key=f"{name}-{self.check}-{number}",
             pure=False,
-            workers=[flight.reserved_worker] if flight.reserved_worker else None,
+            workers=flight.workers or None,
         )
         self.in_flight[future] = flight
         future.add_done_callback(self.completed.put)
@@ -175,19 +207,22 @@ class Session(Generic[J, R]):
             # A request would only time out.
             raise self._cluster_lost()
         try:
-            self.workers = self.client.nthreads()
+            present = self.client.nthreads()
         except OSError as error:
             raise self._cluster_lost() from error
+        # The address of a worker that has ended may be that of another one later.
+        self.accepted = {address: proof for address, proof in self.accepted.items() if address in present}
+        self.left_out = {address: fault for address, fault in self.left_out.items() if address in present}
+        self.workers = {address: n for address, n in present.items() if address not in self.left_out}
         now = time.monotonic()
         # A machine that was stopped for an hour did not wait for an hour.
         since_last_check = min(now - self.checked_at, LONGEST_STEP_S)
         self.checked_at = now
         self._wait_for_workers(since_last_check)
         for future, flight in list(self.in_flight.items()):
-            worker = flight.reserved_worker
-            if worker and worker not in self.workers and not future.done():
-                # The reserved worker died before the job started.
-                self._again(self.in_flight.pop(future))
+            if flight.workers and self.workers.keys().isdisjoint(flight.workers) and not future.done():
+                # The only workers that may run it died before the job started.
+                self._return(self.in_flight.pop(future))
                 future.release()
 
     def _wait_for_workers(self, since_last_check: float) -> None:
@@ -199,7 +234,14 @@ class Session(Generic[J, R]):
         else:
             self.without_worker_s += since_last_check
             if self.without_worker_s > self.patience_s:
-                raise ClusterLost(f"no worker was left for {self.patience_s:g} s")
+                raise self._no_worker()
+
+    def _no_worker(self) -> ClusterLost | ConfigError:
+        text = f"no worker was left for {self.patience_s:g} s"
+        for fault in self.left_out.values():
+            # Workers are there: without any result, the run could not start.
+            return (ClusterLost if self.done else ConfigError)(f"{text}; {fault}")
+        return ClusterLost(text)
 
     def _outcome(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         error = future.exception() if future.status == "error" else None
@@ -207,10 +249,7 @@ class Session(Generic[J, R]):
             yield from self._worker_died(flight, error)
         elif isinstance(error, NoWorkerError | NoValidWorkerError):
             # A scheduler may be configured to fail tasks without workers; here ``patience_s`` decides.
-            if flight.reserved_worker:
-                self._again(flight)
-            else:
-                self._submit(flight)
+            self._return(flight)
         elif future.status == "error":
             future.result()
         elif future.status == "finished":
@@ -220,16 +259,42 @@ class Session(Generic[J, R]):
 
     def _fetch(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
-            fault, result = future.result()
+            address, host, fault, proof, result = future.result()
         except KilledWorker as error:
             # The worker died after the job, before its result was transferred.
             yield from self._worker_died(flight, error)
         except (CancelledError, OSError):
             self._cancelled(flight)
         else:
+            if proof is not None:
+                fault = self._fault(address, proof)
             if fault:
-                raise ConfigError(fault)
-            yield result
+                self._leave_out(address, host, fault)
+                self._return(flight)
+            elif proof is not None:
+                # Only the worker itself learns in this way that it is accepted.
+                self._submit(replace(flight, workers=(address,), accepted=True, submitted=time.monotonic()))
+            else:
+                self.done += 1
+                yield result
+
+    def _fault(self, address: str, proof: Any) -> str:
+        """Accept the proof of a worker; return why it cannot do the jobs, empty if it can."""
+        if self.probe and self.accepted.get(address) != proof:
+            try:
+                self.probe.accept(proof)
+            except OSError as error:
+                return reason_of(error)
+            self.accepted[address] = proof
+        return ""
+
+    def _leave_out(self, address: str, host: str, fault: str) -> None:
+        line = f"worker {address} on {host} is left out: {fault}"
+        self.left_out[address] = line
+        self.workers.pop(address, None)
+        if (host, fault) not in self.told:
+            self.told.add((host, fault))
+            self.say(line)
 
     def _cancelled(self, flight: InFlight[J]) -> None:
         """Quarantine a job without a result; raise an error if the scheduler is not connected any more."""
@@ -239,11 +304,21 @@ class Session(Generic[J, R]):
         self._again(flight)
 
     def _again(self, flight: InFlight[J]) -> None:
-        """Queue a job again that nothing is known against: no worker died while it ran."""
+        """Queue a job again whose worker may have died while it ran."""
         (self.suspects if flight.alone else self.quarantined).append(flight.job)
 
+    def _return(self, flight: InFlight[J]) -> None:
+        """Queue a job again that did not start."""
+        if flight.reserved:
+            self._again(flight)
+        else:
+            self.returned.append(flight.job)
+
     def _worker_died(self, flight: InFlight[J], error: KilledWorker) -> Iterator[R]:
-        if not flight.reserved_worker:
+        if not self.done:
+            self.died.add(error.last_worker.address)
+            self._check_deaths(error)
+        if not flight.reserved:
             self.quarantined.append(flight.job)
         elif (reason := self._own_fault(flight, error)) or flight.alone:
             unknown = "the worker process died 3 times here; too little memory is the usual cause"
@@ -264,11 +339,27 @@ class Session(Generic[J, R]):
                 "files, or raise cluster.tile_timeout_s"
             )
         worker = error.last_worker
-        for _, event in self.client.get_events("worker-restart-memory") or ():
-            if event["worker"] == worker.address:
-                used, limit = format_bytes(event["rss"]), format_bytes(worker.memory_limit)
-                return (
-                    f"the worker process died {times} times here, at last for memory: it used {used} and "
-                    f"may use {limit}; give each worker more (cluster: memory, fewer --workers)"
-                )
+        if worker.address in (used := self._used_memory()):
+            return (
+                f"the worker process died {times} times here, at last for memory: it used "
+                f"{format_bytes(used[worker.address])} and may use {format_bytes(worker.memory_limit)}; "
+                "give each worker more (cluster: memory, fewer --workers)"
+            )
         return ""
+
+    def _used_memory(self) -> dict[str, int]:
+        """Return the memory (bytes) of the workers that died for memory, by address."""
+        events = self.client.get_events("worker-restart-memory") or ()
+        return {event["worker"]: event["rss"] for _, event in events}
+
+    def _check_deaths(self, error: KilledWorker) -> None:
+        """Raise an error if no job was done and so many workers died for memory that none will be."""
+        if len(self.died) < max(DEADLY, 2 * sum(self.workers.values())):
+            return
+        if self.died <= self._used_memory().keys():
+            limit = format_bytes(error.last_worker.memory_limit)
+            raise ConfigError(
+                f"{len(self.died)} worker processes died one after another because their tiles need more "
+                f"memory than they may use ({limit}), and no tile was done; give each worker more "
+                "(cluster.memory, fewer --workers), or make the catalog with smaller tiles (--tile-size)"
+            )

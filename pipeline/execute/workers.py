@@ -2,88 +2,112 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import faulthandler
+import hashlib
 import importlib.metadata
 import os
 import platform
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from threading import Lock, local
 from typing import Any
 
 from distributed import WorkerPlugin
+from distributed.protocol.pickle import dumps, loads
 
+import flexroad
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.execute.executor import J, R
+from flexroad.pipeline.execute.executor import J, Probe, R
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
 """Packages whose versions must be equal for processes to exchange objects; also on the scheduler."""
 RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torch")
 """Packages whose versions must be equal for tiles to have equal results."""
+CODE = "the code of flexroad"
+"""Name of the checksum of the installed program among the versions."""
+SAME = "install the same there, best with the same constraints.txt"
+"""Remedy for other versions."""
 
 _thread = local()
 """Per thread: ``pinned`` is set once its libraries are limited to one thread."""
 
 
 class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
-    """Limits a worker to one thread; before its first tile, compares versions and runs a probe.
+    """Limits a worker to one thread; before its first job, compares versions and takes the client's probe.
 
     Parameters
     ----------
     versions : mapping
         Versions of the client, from `versions`.
-    probe : callable, optional
-        Raises OSError if the process cannot do the work.
+    probe : Probe, optional
+        Check of what the jobs need.
     ignore_sigint : bool
         Ignore Ctrl-C in the worker. A terminal sends it to all processes of the command, and workers would
         only print tracebacks.
     """
 
     def __init__(
-        self,
-        versions: Mapping[str, str],
-        probe: Callable[[], None] | None = None,
-        ignore_sigint: bool = False,
+        self, versions: Mapping[str, str], probe: Probe | None = None, ignore_sigint: bool = False
     ) -> None:
         self.versions = dict(versions)
-        self.probe = probe
+        # Pickled, so that a worker with another program says so before it looks for the class of the probe.
+        self.probe = dumps(probe)
         self.ignore_sigint = ignore_sigint
 
     def setup(self, worker: Any) -> None:
         """Prepare the worker; called for workers that join later, too."""
-        self.address: str = worker.address
         self._lock = Lock()
-        self._fault: str | None = None
+        self._accepted = False
+        self._answer: tuple[str, Any] | None = None
         if self.ignore_sigint:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         pin_threads()
 
-    @property
-    def fault(self) -> str:
-        """Error message if the worker cannot do the work, else empty; computed once."""
-        with self._lock:
-            if self._fault is None:
-                self._fault = self._find_fault()
-            return self._fault
+    def admit(self, packed: bytes, accepted: bool) -> tuple[str, Any]:
+        """Check the worker, once, with its first job.
 
-    def _find_fault(self) -> str:
+        Parameters
+        ----------
+        packed : bytes
+            The pickled call of `work`.
+        accepted : bool
+            Whether the client has accepted the proof of this worker.
+
+        Returns
+        -------
+        fault : str
+            Why the worker cannot do the jobs, empty if it can.
+        proof : object
+            What the client has to accept before the worker does a job, None if it may do jobs.
+        """
+        with self._lock:
+            self._accepted = self._accepted or accepted
+            if self._accepted:
+                return "", None
+            if self._answer is None:
+                self._answer = self._check(packed)
+            return self._answer
+
+    def _check(self, packed: bytes) -> tuple[str, Any]:
         different = difference(versions(), self.versions)
         if different:
-            return version_error(f"worker {self.address}", different)
+            return f"{different}; {SAME}", None
+        probe: Probe | None = loads(self.probe)
+        _, _, job = loads(packed)
         try:
-            if self.probe:
-                self.probe()
+            return "", probe.answer(job) if probe else None
         except OSError as error:
-            file = f"{error.filename}: " if error.filename else ""
-            return (
-                f"worker {self.address} cannot use the store: {file}{error.strerror or error}; "
-                "mount it there under the same path and make it writable for the worker"
-            )
-        return ""
+            return reason_of(error), None
+
+
+def reason_of(error: OSError) -> str:
+    """Return file and reason of an error in one line."""
+    file = f"{error.filename}: " if error.filename else ""
+    return f"{file}{error.strerror or error}"
 
 
 def work(function: Callable[[J], R], job: J, limit_s: float) -> R:
@@ -111,12 +135,6 @@ def _time_limit(limit_s: float) -> Iterator[None]:
             faulthandler.cancel_dump_traceback_later()
 
 
-async def find_fault(check: str, dask_worker: Any) -> str:
-    """Return an error message if the worker cannot do the work, else an empty string."""
-    plugin: WorkerCheck = dask_worker.plugins[check]
-    return await asyncio.to_thread(lambda: plugin.fault)
-
-
 def pin_threads() -> None:
     """Limit the libraries that this thread calls to one core: the other cores compute other tiles."""
     # The environment sets libraries that are loaded later; loaded ones are set by their own functions.
@@ -131,14 +149,35 @@ def pin_threads() -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and the packages in `PICKLING` and `RESULTS`; "missing" if absent."""
-    installed = {"python": platform.python_version()}
+    """Return versions of Python and of the packages in `PICKLING` and `RESULTS`, and `checksum_of_code`.
+
+    That of a package that is not installed is "missing".
+    """
+    installed = {"python": platform.python_version(), CODE: checksum_of_code()}
     for package in (*PICKLING[1:], *RESULTS):
         try:
             installed[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             installed[package] = "missing"
     return installed
+
+
+@cache
+def checksum_of_code() -> str:
+    """Return 12 hexadecimal digits of the SHA-256 of names and contents of flexroad's Python files.
+
+    It is the same for a wheel and for the checkout that the wheel was made of.
+    """
+    root = Path(flexroad.__file__).parent
+    # The folders of a checkout are links.
+    folders = os.walk(root, followlinks=True)
+    files = sorted(Path(folder, name) for folder, _, names in folders for name in names)
+    digest = hashlib.sha256()
+    for file in files:
+        if file.suffix == ".py":
+            data = file.read_bytes()
+            digest.update(f"{file.relative_to(root).as_posix()} {len(data)}\n".encode() + data)
+    return digest.hexdigest()[:12]
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str:
@@ -152,7 +191,7 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str:
 
 def version_error(process: str, different: str) -> str:
     """Return the error message about a process with other versions."""
-    return f"{process}: {different}; install the same there, best with the same constraints.txt"
+    return f"{process}: {different}; {SAME}"
 
 
 def _comparable(name: str, version: str) -> str:

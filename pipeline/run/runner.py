@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import exists, flush_names, parse_location, stat
+from flexroad.catalog.storage.paths import absolute, exists, flush_names, parse_location, stat
 from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, Jobs
@@ -21,14 +21,28 @@ from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.event_log import EventLog
 from flexroad.pipeline.run.previous import keep_previous
 from flexroad.pipeline.run.record import Run, check_inputs
-from flexroad.pipeline.run.status import open_database, recorded_summary, tile_states, tile_statuses
+from flexroad.pipeline.run.status import (
+    Folders,
+    has_marker,
+    open_database,
+    recorded_summary,
+    tile_states,
+    tile_statuses,
+)
 from flexroad.pipeline.run.summary import Summary, summarise, write_summary
-from flexroad.pipeline.store.artefacts import check_writable
 from flexroad.pipeline.store.database import RunDatabase, TileState
-from flexroad.pipeline.store.records import Failure
+from flexroad.pipeline.store.records import DONE, Failure, TileRecord
 from flexroad.pipeline.store.tables import write_tables
 from flexroad.pipeline.worker.profiling import utc_now
-from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row, process_tile, record_failure
+from flexroad.pipeline.worker.shared_files import SharedFiles
+from flexroad.pipeline.worker.tile import (
+    TileJob,
+    TileResult,
+    failed_row,
+    process_tile,
+    record_failure,
+    without_results,
+)
 
 
 @dataclass(frozen=True)
@@ -177,11 +191,12 @@ def _results(
             yield job
 
     tracked = replace(jobs, source=submitted())
-    results = executor.map(process_tile, tracked, _lost, partial(check_writable, run.store))
+    probe = SharedFiles((str(absolute(run.path)), str(absolute(run.store))))
+    results = executor.map(process_tile, tracked, _lost, probe)
     try:
         for result in results:
             in_progress.remove(result.tile_id)
-            yield result
+            yield _with_marker(run, result)
     finally:
         # After an interruption: stop all workers first, then read the markers they have written.
         results.close()
@@ -189,6 +204,25 @@ def _results(
         for status in tile_statuses(run, database, unknown):
             if status.last_record and status.from_marker:
                 database.record(status.last_record)
+
+
+def _with_marker(run: Run, result: TileResult) -> TileResult:
+    """Return the result of a tile; failed if it is said to be done but its marker is not there."""
+    reason = ""
+    try:
+        if result.status != "done" or has_marker(run, result.entry):
+            return result
+    except OSError as error:
+        reason = f" ({error.strerror or error})"
+    text = f"missing{reason}: the folder was deleted, or {result.host} writes to another disk"
+    return replace(result, entry=_vanished(run, result.entry, text), status="failed")
+
+
+def _vanished(run: Run, record: TileRecord, text: str) -> TileRecord:
+    """Return the record of a tile that was done but whose marker is missing."""
+    file = str(run.folder(record.tile_id).path / DONE)
+    message = f"its results are {text}; run the same command again"
+    return without_results(record, Failure(record.tile_id, "export", "ResultsMissing", message, file))
 
 
 def _close(
@@ -232,6 +266,8 @@ def _final_summary(run: Run, database: RunDatabase, start: str, planned: bool, i
     """Return the summary at the end of a run, of which ``start`` is the time."""
     if planned:
         _repair(run, database, start)
+        if not interrupted:
+            _check_markers(run, database)
     elif interrupted and database.listed(tile.id for tile in run.catalog.tiles) is None:
         # The run is to end soon: checking the tiles would take as long as the start that was interrupted.
         return summarise(len(run.catalog.tiles), Counter(), ())
@@ -249,6 +285,17 @@ def _repair(run: Run, database: RunDatabase, start: str) -> None:
         states.append((status.graph.tile.id, state))
     database.flush()
     database.set_states(states)
+
+
+def _check_markers(run: Run, database: RunDatabase) -> None:
+    """Record the done tiles whose marker was removed while the run worked as failed."""
+    folders = Folders(run.path)
+    states = zip(run.catalog.tiles, database.states(), strict=True)
+    done = (tile.id for tile, state in states if state in ("done", "cached"))
+    for tile_id in [tile_id for tile_id in done if DONE not in folders(tile_id)]:
+        record = database.get(tile_id)
+        if record:
+            database.record(_vanished(run, record, "missing: its folder was deleted while the run worked"))
 
 
 def _lost(job: TileJob, reason: str) -> TileResult:

@@ -18,7 +18,7 @@ from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.listed_files import ListedFiles
-from flexroad.catalog.storage.paths import FileStat, Location, entries, listing, read
+from flexroad.catalog.storage.paths import FileStat, Location, entries, listing, read, refresh
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
@@ -36,6 +36,7 @@ from flexroad.pipeline.store.records import (
     from_failed,
     from_item,
 )
+from flexroad.pipeline.worker.tile import marker_stat
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError)
 Track = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -149,6 +150,27 @@ def _matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileS
     if record is None or record.fingerprint != graph.fingerprint:
         return False
     return all(name in files and files[name].size == size for name, size in record.sizes.items())
+
+
+def has_marker(run: Run, record: TileRecord) -> bool:
+    """Return whether the folder of a tile has the marker of this record.
+
+    Raises
+    ------
+    OSError
+        If the storage does not answer.
+    """
+    folder = run.folder(record.tile_id)
+    for _ in range(2):
+        marker = marker_stat(folder, record.state)
+        if marker is not None and marker == record.marker:
+            return True
+        # Not every storage keeps the time that the worker was told.
+        found = _from_marker(folder.path, marker) if marker else None
+        if found and (found.fingerprint, found.finished) == (record.fingerprint, record.finished):
+            return True
+        refresh(folder.path.parent, folder.path)
+    return False
 
 
 def open_database(run: Run, write: bool = False) -> RunDatabase:

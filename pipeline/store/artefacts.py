@@ -60,6 +60,11 @@ class ArtefactStore:
         return self.root / stage / fingerprint[:2] / f"{fingerprint}.npz"
 
 
+def probe_name() -> str:
+    """Return a new name of a file that only tries a folder; such files are removed by ``flexroad clean``."""
+    return f"{PROBE}{uuid.uuid4().hex}"
+
+
 def check_writable(folder: Location) -> None:
     """Check that files can be written in ``folder``.
 
@@ -68,6 +73,6 @@ def check_writable(folder: Location) -> None:
     OSError
         If not; with the reason and the path.
     """
-    probe = folder / f"{PROBE}{uuid.uuid4().hex}"
+    probe = folder / probe_name()
     paths.write(probe, b"")
     paths.remove(probe)

@@ -168,11 +168,18 @@ def marker_stat(folder: TileProducts, state: State) -> MarkerStat | None:
 
 def failed_row(graph: TileGraph, variant: str, error: str) -> MetricsRow:
     """Return the row of a failed variant: all metrics None, with the error."""
-    return (
-        _head(graph, variant, "failed")
-        | dict.fromkeys((*Metrics.__annotations__, *QUALITY))
-        | {"seconds": None, "error": error, "flags": ""}
-    )
+    return _failed(_head(graph, variant, "failed"), error)
+
+
+def _failed(head: MetricsRow, error: str) -> MetricsRow:
+    nothing = dict.fromkeys((*Metrics.__annotations__, *QUALITY, "seconds"))
+    return {**head, **nothing, "status": "failed", "error": error, "flags": ""}
+
+
+def without_results(record: TileRecord, failure: Failure) -> TileRecord:
+    """Return the record of a done tile whose results are gone; no marker has it."""
+    rows = tuple(_failed(row, failure.line) for row in record.rows)
+    return replace(record, state="failed", rows=rows, failures=(failure,), sources=[], sizes={}, marker=None)
 
 
 def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:

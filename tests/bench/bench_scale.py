@@ -32,11 +32,13 @@ from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import rasters
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.database import NAME as DATABASE
-from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row
+from flexroad.pipeline.worker.tile import TileJob, TileResult
 from flexroad.tasks.synthetic import SceneOptions, make_scene
+from tests.made_result import done
 
 TILES = 1000
 """Default number of tiles; docs/operations.md uses 10,000."""
@@ -115,13 +117,8 @@ def write(path: Path, patch: NDArray[Any], cells: int) -> None:
 
 def sleep_tile(job: TileJob) -> TileResult:
     """Take as long as a real tile, and return as much data."""
-    from flexroad.pipeline.store.records import TileRecord
-
     time.sleep(SLEEP_S)
-    rows = tuple(failed_row(job.graph, v, "") | {"status": "done"} for v in job.graph.variants)
-    return TileResult(
-        TileRecord(job.graph.tile.id, "done", job.graph.fingerprint, rows, sources=job.graph.sources), "done"
-    )
+    return done(job)
 
 
 @dataclass
@@ -140,7 +137,7 @@ class Asleep:
         function: Callable[..., Any],
         jobs: Iterable[Any],
         lost: Callable[..., Any],
-        probe: Callable[[], None] | None = None,
+        probe: Probe | None = None,
     ) -> Iterator[Any]:
         for result in DaskExecutor(self.workers).map(sleep_tile, jobs, lost, probe):
             self.times.append(time.perf_counter())

@@ -27,13 +27,13 @@ from flexroad.catalog.sources import rasters
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import DaskExecutor
+from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.store.records import TileRecord
-from flexroad.pipeline.worker.tile import TileJob, TileResult, failed_row
 from tests.bench.bench_scale import CONFIG, LAYERS, TILE_M, busy, survey
 from tests.bench.measure_stages import one_variant
 from tests.bench.timing import resident_mb
+from tests.made_result import done
 
 TILES, SCALED = 2000, 8
 """Default numbers of simulated tiles, and of computed tiles on one worker."""
@@ -59,13 +59,6 @@ def main() -> None:
         options.json.write_text(json.dumps(figures))
 
 
-def return_tile(job: TileJob) -> TileResult:
-    """Return as much data as a real tile, at once."""
-    rows = tuple(failed_row(job.graph, v, "") | {"status": "done"} for v in job.graph.variants)
-    record = TileRecord(job.graph.tile.id, "done", job.graph.fingerprint, rows, sources=job.graph.sources)
-    return TileResult(record, "done")
-
-
 @dataclass
 class Simulated:
     """A Dask executor whose workers return at once; records CPU time and memory at ten times."""
@@ -78,9 +71,9 @@ class Simulated:
         function: Callable[..., Any],
         jobs: Iterable[Any],
         lost: Callable[..., Any],
-        probe: Callable[[], None] | None = None,
+        probe: Probe | None = None,
     ) -> Iterator[Any]:
-        for number, result in enumerate(DaskExecutor(WORKERS).map(return_tile, jobs, lost, probe), 1):
+        for number, result in enumerate(DaskExecutor(WORKERS).map(done, jobs, lost, probe), 1):
             yield result
             if number % max(1, self.total // 10) == 0:
                 self.sample(number)

@@ -15,8 +15,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store import database
-from flexroad.pipeline.store.records import TileRecord
-from flexroad.pipeline.worker.tile import TileResult, failed_row
+from tests.made_result import done
 
 TILES = 1200
 BYTES_A_TILE = 60
@@ -32,7 +31,7 @@ class Sent:
     def map(self, function, jobs, lost, probe=None):
         for number, job in enumerate(jobs):
             sent = pickle.loads(pickle.dumps(job))
-            yield pickle.loads(pickle.dumps(done(sent.graph)))
+            yield pickle.loads(pickle.dumps(done(sent)))
             if number in (TILES // 3, TILES - 10):
                 gc.collect()
                 self.traced.append(traced_bytes())
@@ -42,12 +41,6 @@ def traced_bytes() -> int:
     """Return the memory of this process, without tracemalloc's own."""
     snapshot = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(False, tracemalloc.__file__)])
     return sum(trace.size for trace in snapshot.traces)
-
-
-def done(graph) -> TileResult:
-    rows = tuple(failed_row(graph, variant, "") | {"status": "done"} for variant in graph.variants)
-    record = TileRecord(graph.tile.id, "done", graph.fingerprint, rows, sources=graph.sources)
-    return TileResult(record, "done")
 
 
 @pytest.mark.slow

@@ -1,0 +1,119 @@
+"""Proof that a worker has the same files as the client: its run, its store and the sources of a tile."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from types import TracebackType
+
+from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.paths import FileStat, parse_location
+from flexroad.pipeline.store.artefacts import probe_name
+from flexroad.pipeline.worker.tile import TileJob
+
+MOUNT = "mount it there under the same path"
+"""Remedy for a worker that has other files."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What a worker has found and written."""
+
+    name: str
+    """Name of the file that it has written into each folder."""
+    different: dict[str, FileStat | None]
+    """Size and version, as the worker has them, of the source files that differ from those in the tile's
+    graph."""
+
+
+@dataclass(frozen=True)
+class SharedFiles:
+    """The folders that client and workers share (a `flexroad.pipeline.execute.executor.Probe`).
+
+    The client writes a file with a random name into each folder, and removes it at the end. A worker looks
+    for it, and writes one of its own, which the client looks for and removes.
+    """
+
+    folders: tuple[str, ...]
+    """The run and its store."""
+    name: str = field(default_factory=probe_name)
+    """Name of the client's files."""
+
+    def __enter__(self) -> SharedFiles:
+        """Write the client's files."""
+        for folder in self.folders:
+            paths.write(parse_location(folder) / self.name, b"")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._remove(self.name)
+
+    def answer(self, job: TileJob) -> Proof:
+        """Return the proof of this process, a worker, whose first job is ``job``.
+
+        Raises
+        ------
+        OSError
+            If a folder is not that of the client, or cannot be written.
+        """
+        own = probe_name()
+        try:
+            for folder in self.folders:
+                self._meet(folder, own)
+            return Proof(own, _different(job))
+        except OSError:
+            self._remove(own)
+            raise
+
+    def accept(self, proof: Proof) -> None:
+        """Check, in the client, that the files of a worker have arrived, and that it has the same sources.
+
+        Raises
+        ------
+        OSError
+            If not.
+        """
+        missing = [folder for folder in self.folders if not _exists(folder, proof.name)]
+        self._remove(proof.name)
+        if missing:
+            raise OSError(f"what it writes to {missing[0]} does not arrive here; {MOUNT}")
+        for file, there in proof.different.items():
+            # A file may have changed since the graph was made: then it differs here, too.
+            if paths.stat(parse_location(file)) != there:
+                what = "does not exist" if there is None else "has another size or time"
+                raise OSError(f"{file} {what} there; {MOUNT}")
+
+    def _meet(self, folder: str, own: str) -> None:
+        try:
+            paths.read(parse_location(folder) / self.name)
+            paths.write(parse_location(folder) / own, b"")
+        except FileNotFoundError as error:
+            raise OSError(f"{folder} is not the same folder there as here; {MOUNT}") from error
+        except OSError as error:
+            raise OSError(
+                f"{folder}: {error.strerror or error}; make it readable and writable for the worker"
+            ) from error
+
+    def _remove(self, name: str) -> None:
+        for folder in self.folders:
+            with contextlib.suppress(OSError):
+                paths.remove(parse_location(folder) / name)
+
+
+def _exists(folder: str, name: str) -> bool:
+    return paths.stat(parse_location(folder) / name) is not None
+
+
+def _different(job: TileJob) -> dict[str, FileStat | None]:
+    """Return size and version of those source files that this process has otherwise: one of each folder."""
+    known = {file: stat for file, stat in job.graph.file_stats.items() if stat is not None}
+    here = {file: paths.stat(parse_location(file)) for file in _one_of_each_folder(known)}
+    return {file: stat for file, stat in here.items() if stat != known[file]}
+
+
+def _one_of_each_folder(files: Iterable[str]) -> Iterable[str]:
+    return {str(PurePath(file).parent): file for file in files}.values()
