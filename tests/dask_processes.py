@@ -28,10 +28,10 @@ class Processes:
         self.address = until(lambda: file.exists() and json.loads(file.read_text() or "{}")).get("address")
         return process
 
-    def worker(self, *options: str, **env: str) -> subprocess.Popen:
-        """Start a worker process with these options and environment variables."""
+    def worker(self, *options: str, before: tuple[str, ...] = (), **env: str) -> subprocess.Popen:
+        """Start a worker process with these options and environment variables, by the command ``before``."""
         options = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder), *options)
-        return self._start("worker", self.address, *options, **env)
+        return self._start("worker", self.address, *options, before=before, **env)
 
     def end(self) -> None:
         """Kill all processes."""
@@ -40,8 +40,8 @@ class Processes:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
-    def _start(self, *words, **env: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "dask", *map(str, words)]
+    def _start(self, *words, before: tuple[str, ...] = (), **env: str) -> subprocess.Popen:
+        command = [*before, sys.executable, "-m", "dask", *map(str, words)]
         with (self.folder / "output.txt").open("a") as output:
             process = subprocess.Popen(
                 command, env={**os.environ, **env}, stdout=output, stderr=output, start_new_session=True

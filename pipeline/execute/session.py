@@ -20,7 +20,7 @@ from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
-from typing import Any, Generic
+from typing import Generic
 
 from dask.utils import format_bytes, key_split
 from distributed import Client, Future
@@ -29,9 +29,10 @@ from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerErro
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute.admission import Admission
 from flexroad.pipeline.execute.executor import J, Probe, R
 from flexroad.pipeline.execute.scheduler import task_function
-from flexroad.pipeline.execute.workers import reason_of, work
+from flexroad.pipeline.execute.workers import work
 
 FORGET_KEYS_EVERY = 1000
 """Number of jobs after which Dask's cache of key names is cleared: it has 0.4 KB for each job."""
@@ -110,15 +111,9 @@ class Session(Generic[J, R]):
         self.patience_s = cluster.patience_s
         self.limit_s = cluster.tile_timeout_s
         self.say = say
-        self.probe = probe
+        self.admission = Admission(probe, say)
         self.returned: deque[J] = deque()
         """Jobs that a worker could not take."""
-        self.accepted: dict[str, Any] = {}
-        """Accepted proofs by worker address."""
-        self.left_out: dict[str, str] = {}
-        """Why a worker gets no jobs, by its address."""
-        self.told: set[tuple[str, str]] = set()
-        """Host and reason of the workers left out: one line for all workers of a host."""
         self.done = 0
         """Number of results."""
         self.died: set[str] = set()
@@ -156,7 +151,7 @@ class Session(Generic[J, R]):
         reserved = {flight.workers[0] for flight in self.in_flight.values() if flight.reserved}
         if not reserved:
             # Any worker may take a job, so that those that join later get some, unless one is left out.
-            allowed = tuple(self.workers) if self.left_out else ()
+            allowed = tuple(self.workers) if self.admission.left_out else ()
             while self.returned and self.workers:
                 self._submit(InFlight(self.returned.popleft(), allowed))
             # Twice the number of threads keeps all workers busy at constant memory.
@@ -207,13 +202,9 @@ class Session(Generic[J, R]):
             # A request would only time out.
             raise self._cluster_lost()
         try:
-            present = self.client.nthreads()
+            self.workers = self.admission.able(self.client.nthreads())
         except OSError as error:
             raise self._cluster_lost() from error
-        # The address of a worker that has ended may be that of another one later.
-        self.accepted = {address: proof for address, proof in self.accepted.items() if address in present}
-        self.left_out = {address: fault for address, fault in self.left_out.items() if address in present}
-        self.workers = {address: n for address, n in present.items() if address not in self.left_out}
         now = time.monotonic()
         # A machine that was stopped for an hour did not wait for an hour.
         since_last_check = min(now - self.checked_at, LONGEST_STEP_S)
@@ -238,7 +229,7 @@ class Session(Generic[J, R]):
 
     def _no_worker(self) -> ClusterLost | ConfigError:
         text = f"no worker was left for {self.patience_s:g} s"
-        for fault in self.left_out.values():
+        for fault in self.admission.left_out.values():
             # Workers are there: without any result, the run could not start.
             return (ClusterLost if self.done else ConfigError)(f"{text}; {fault}")
         return ClusterLost(text)
@@ -266,10 +257,8 @@ class Session(Generic[J, R]):
         except (CancelledError, OSError):
             self._cancelled(flight)
         else:
-            if proof is not None:
-                fault = self._fault(address, proof)
-            if fault:
-                self._leave_out(address, host, fault)
+            if not self.admission.accepts(address, host, fault, proof):
+                self.workers.pop(address, None)
                 self._return(flight)
             elif proof is not None:
                 # Only the worker itself learns in this way that it is accepted.
@@ -277,24 +266,6 @@ class Session(Generic[J, R]):
             else:
                 self.done += 1
                 yield result
-
-    def _fault(self, address: str, proof: Any) -> str:
-        """Accept the proof of a worker; return why it cannot do the jobs, empty if it can."""
-        if self.probe and self.accepted.get(address) != proof:
-            try:
-                self.probe.accept(proof)
-            except OSError as error:
-                return reason_of(error)
-            self.accepted[address] = proof
-        return ""
-
-    def _leave_out(self, address: str, host: str, fault: str) -> None:
-        line = f"worker {address} on {host} is left out: {fault}"
-        self.left_out[address] = line
-        self.workers.pop(address, None)
-        if (host, fault) not in self.told:
-            self.told.add((host, fault))
-            self.say(line)
 
     def _cancelled(self, flight: InFlight[J]) -> None:
         """Quarantine a job without a result; raise an error if the scheduler is not connected any more."""

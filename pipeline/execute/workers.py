@@ -29,6 +29,8 @@ RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torc
 """Packages whose versions must be equal for tiles to have equal results."""
 CODE = "the code of flexroad"
 """Name of the checksum of the installed program among the versions."""
+INSTALLED = Path(flexroad.__file__).parent
+"""Folder of the package."""
 SAME = "install the same there, best with the same constraints.txt"
 """Remedy for other versions."""
 
@@ -163,12 +165,11 @@ def versions() -> dict[str, str]:
 
 
 @cache
-def checksum_of_code() -> str:
+def checksum_of_code(root: Path = INSTALLED) -> str:
     """Return 12 hexadecimal digits of the SHA-256 of names and contents of flexroad's Python files.
 
     It is the same for a wheel and for the checkout that the wheel was made of.
     """
-    root = Path(flexroad.__file__).parent
     # The folders of a checkout are links.
     folders = os.walk(root, followlinks=True)
     files = sorted(Path(folder, name) for folder, _, names in folders for name in names)

@@ -2,19 +2,23 @@
 
 import ctypes
 import os
+import shutil
 import sys
 import time
 from itertools import islice
+from pathlib import Path
 
 import cloudpickle
 import psutil
 import pytest
 
+import flexroad
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster, slurm_options
+from flexroad.pipeline.execute.workers import checksum_of_code
 from tests.dask_processes import Processes, until, wait_for
 
 pytestmark = pytest.mark.slow
@@ -137,7 +141,7 @@ def other_numpy(tmp_path) -> dict[str, str]:
 def map_error(processes, jobs=(1, 2, 3), **options) -> str:
     """Return the one-line message of the ConfigError that `DaskExecutor.map` raises."""
     with pytest.raises(ConfigError) as caught:
-        list(DaskExecutor(scheduler=processes.address).map(double, jobs, lost, **options))
+        list(DaskExecutor(scheduler=processes.address, cluster=IMPATIENT).map(double, jobs, lost, **options))
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -146,39 +150,72 @@ def test_map_without_workers_or_with_other_versions_raises(processes, other_nump
     monkeypatch.setattr("flexroad.pipeline.execute.clusters.GRACE_S", 0)
     processes.scheduler()
     assert f"{processes.address} has no workers; start some" in map_error(processes)
-    unlike = processes.worker(**other_numpy)
+    processes.worker(**other_numpy)
     wait_for(processes.address, 1)
     message = map_error(processes)
     assert "worker tcp://127.0.0.1" in message
     assert "numpy is 1.0 there and" in message
     assert "install the same there" in message
-    unlike.terminate()
-    unlike.wait(20)
 
-    # A worker that joins later is checked, too.
+
+def test_map_worker_with_other_versions_that_joins_later_is_left_out(processes, other_numpy):
+    processes.scheduler()
     processes.worker()
     wait_for(processes.address, 1)
+    lines = []
 
     def jobs():
         yield 1
         processes.worker(**other_numpy)
         wait_for(processes.address, 2)
-        while True:
-            yield 1
+        # A worker may be busy with its first job.
+        yield from islice(iter(lambda: 1 if not lines else None, None), 10_000)
+        yield from range(20)
 
-    assert "numpy is 1.0 there and" in map_error(processes, jobs())
+    results = list(DaskExecutor(scheduler=processes.address, say=lines.append).map(double, jobs(), lost))
+    assert sorted(results)[-20:] == [*range(0, 40, 2)]
+    (line,) = lines
+    assert line.startswith("worker tcp://127.0.0.1")
+    assert "is left out: numpy is 1.0 there and" in line
 
 
-def test_map_store_not_writable_by_workers_raises(running):
-    here = os.getpid()
+def test_map_worker_with_other_code_of_the_same_version_is_left_out(processes, tmp_path):
+    source = tmp_path / "other" / "flexroad"
+    shutil.copytree(Path(flexroad.__file__).parent, source, ignore=shutil.ignore_patterns("__pycache__"))
+    with (source / "tasks" / "errors.py").open("a") as file:
+        file.write("# changed\n")
+    processes.scheduler()
+    processes.worker(PYTHONPATH=str(source.parent))
+    wait_for(processes.address, 1)
+    message = map_error(processes)
+    assert (
+        f"the code of flexroad is {checksum_of_code(source)} there and {checksum_of_code()} here" in message
+    )
+    processes.worker()
+    wait_for(processes.address, 2)
+    lines = []
+    executor = DaskExecutor(scheduler=processes.address, say=lines.append)
+    assert sorted(executor.map(double, range(20), lost)) == [*range(0, 40, 2)]
+    assert len(lines) == 1
 
-    def probe():
-        if os.getpid() != here:
-            raise OSError(30, "Read-only file system", "/store")
 
-    message = map_error(running, probe=probe)
+class Unwritable:
+    """A probe that no process but this one passes."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def answer(self, job):
+        raise OSError(30, "Read-only file system", "/store")
+
+
+def test_map_workers_that_fail_the_probe_raise(running):
+    message = map_error(running, probe=Unwritable())
     assert "worker tcp://127.0.0.1" in message
-    assert "cannot use the store: /store: Read-only file system; mount it" in message
+    assert message.endswith("is left out: /store: Read-only file system")
 
 
 def test_map_scheduler_that_does_not_answer_raises(monkeypatch):

@@ -71,7 +71,7 @@ class Worker:
     """A worker that does jobs in this process."""
 
     address: str
-    answer: object = "proof"
+    answer: object = ""
     """What the probe gives: a proof, or an error that it raises."""
     versions: dict = field(default_factory=workers.versions)
     """Versions of the client that it compares with its own."""
@@ -79,6 +79,7 @@ class Worker:
     done: int = 0
 
     def __post_init__(self):
+        self.answer = self.answer or f"proof of {self.address}"
         check = WorkerCheck(self.versions, MadeProbe(self.answer))
         check.setup(self)
         self.plugins = {CHECK: check}
@@ -88,6 +89,7 @@ class Worker:
 class MadeProbe:
     answered: object
     refused: tuple[str, ...] = ()
+    taken: set = field(default_factory=set)
 
     def answer(self, job):
         if isinstance(self.answered, OSError):
@@ -95,6 +97,9 @@ class MadeProbe:
         return self.answered
 
     def accept(self, proof):
+        # A proof is taken once, as the files of a worker are removed.
+        assert proof not in self.taken
+        self.taken.add(proof)
         if proof in self.refused:
             raise OSError(f"{proof} is not accepted")
 
