@@ -4,7 +4,7 @@
 seeds; each one makes a block of 3 x 3 tiles of 250 m: urban for seed 1, suburban for 2, rural for 3, and so
 on. Each block is computed once more without data within `VOID_M` of one of its inner corners. If
 FLEXROAD_REAL_DATA is set, tiles of 150 m of the Barbican follow. Stages and options are those of
-configs/nightly.yaml. Each tile is fitted in three ways:
+configs/production.yaml. Each tile is fitted in three ways:
 
 - alone: with its halo, on control points of its own, without regard to the neighbours;
 - lattice: the same on the control points that all tiles have in common;
@@ -40,7 +40,7 @@ from flexroad.tasks.spline.space import clamped_space, points_at_spacing, start_
 from flexroad.tasks.synthetic import make_scene
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface, TileData
 
-CHAIN = load_config("nightly").chains["flexroad"]
+CHAIN = load_config("production").chains["flexroad"]
 STAGES = BorderStages.of(CHAIN)
 MARGIN_M = 100.0
 """Ground around the block (m): what its borders are computed from."""

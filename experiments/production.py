@@ -1,8 +1,8 @@
 """The production settings against the paper's: on the benchmark, in two real towns, on a real survey.
 
 ``PYTHONPATH=. python experiments/production.py 240`` gives the table of docs/fit.md; without a number 4 tiles
-of the benchmark are used. Stages and options are those of configs/paper.yaml and configs/nightly.yaml, tile
-by tile as in a run; only the benchmark's tiles, which have no neighbours, have no halo.
+of the benchmark are used. Stages and options are those of configs/paper.yaml and configs/production.yaml,
+tile by tile as in a run; only the benchmark's tiles, which have no neighbours, have no halo.
 
 If FLEXROAD_REAL_DATA is set, two more comparisons follow. Barbican and Gothenburg have their canopies added
 to the DSM and a degraded DTM (noise and scars); truth is the original DTM. The north of Autzen has roads
@@ -45,7 +45,7 @@ OVER_M = 2.0
 """A road cell counts as hidden if the DSM is this much above the true road (m)."""
 BLOCK_M = 50
 FOOT_M = 0.3048
-CHAINS = {name: load_config(name).chains["flexroad"] for name in ("paper", "nightly")}
+CHAINS = {name: load_config(name).chains["flexroad"] for name in ("paper", "production")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def benchmark(tiles: int, scratch: Path) -> None:
     mean = (sums["sum"] / sums["n"]).unstack()
     print("road L2 (m), mean over cells")
     print(
-        mean.assign(ratio=mean["nightly"] / mean["paper"], n=sums["n"].unstack()["paper"])
+        mean.assign(ratio=mean["production"] / mean["paper"], n=sums["n"].unstack()["paper"])
         .round(4)
         .to_string()
     )
@@ -214,7 +214,7 @@ def autzen(folder: Path, scratch: Path) -> None:
     paper, production = (np.concatenate(errors[name]) for name in CHAINS)
     print(
         f"\nAutzen north, distance to ground points on roads: paper {paper.mean():.4f} m, "
-        f"nightly {production.mean():.4f} m"
+        f"production {production.mean():.4f} m"
     )
     print(f"  {interval(paper, production)}")
 

@@ -30,6 +30,8 @@ RENAMED = {
     "smoothness": SPLINE,
 }
 """Option names of earlier versions and the hint for each."""
+EARLIER = {"nightly": "production"}
+"""Earlier names of shipped configurations."""
 SECTIONS = ("dataset", "export", "cluster", "variants")
 """Parts of a configuration that are no stages."""
 SUFFIXES = (".yaml", ".yml")
@@ -161,7 +163,8 @@ def _existing(name: str | Path) -> Path:
     if special:
         raise ConfigError(f"configuration '{given}' is not a regular file; name a YAML file")
     begun = [config for config in configs if config.startswith(str(name))]
-    near = begun or difflib.get_close_matches(Path(name).name, configs, n=1)
+    stem = EARLIER.get(Path(name).name, Path(name).name)
+    near = begun or difflib.get_close_matches(stem, configs, n=1)
     hint = f"; did you mean {near[0]}?" if near else f"; shipped are {', '.join(configs)}"
     raise ConfigError(f"no configuration '{given}': neither a file nor a shipped name{hint}")
 

@@ -63,7 +63,7 @@ def process(tile: Tile, chain: dict[str, Any], times: Times) -> None:
 
 
 def main() -> None:
-    chain = load_config("nightly").chains["flexroad"]
+    chain = load_config("production").chains["flexroad"]
     assert chain["load"].halo_m == HALO_M
     with tempfile.TemporaryDirectory() as scratch:
         tiles = Catalog.read(write_scenes(Path(scratch), TILES, seed=11)).tiles

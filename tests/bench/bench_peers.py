@@ -62,7 +62,7 @@ class Case:
 def main() -> None:
     one_thread()
     case = made_case()
-    options = load_config("nightly").chains["flexroad"]["fit"]
+    options = load_config("production").chains["flexroad"]["fit"]
     fit = stage_function("fit", options)
     ours = fit(case.data, case.clusters, options)
     seconds = cpu_s(lambda: fit(case.data, case.clusters, options))
@@ -80,7 +80,7 @@ def main() -> None:
 
 def made_case() -> Case:
     """Return a made tile of 250 m after production's filter."""
-    chain = load_config("nightly").chains["flexroad"]
+    chain = load_config("production").chains["flexroad"]
     with tempfile.TemporaryDirectory() as folder:
         tile = Catalog.read(write_scenes(Path(folder), 1, seed=SEED)).tiles[0]
         data = load.load(tile, chain["load"])

@@ -46,8 +46,8 @@ def start() -> None:
         commands = {
             "python -c 'import numpy'": ([sys.executable, "-c", "import numpy"], 1),
             "flexroad --help": ([*FLEXROAD, "--help"], 5),
-            "flexroad config show nightly": ([*FLEXROAD, "config", "show", "nightly"], 8),
-            "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "nightly", *catalog], 15),
+            "flexroad config show production": ([*FLEXROAD, "config", "show", "production"], 8),
+            "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "production", *catalog], 15),
             "rerun of one of ten tiles": (
                 [*FLEXROAD, "rerun", str(run), "--from", "load", "--tile", tile],
                 25,
@@ -80,7 +80,7 @@ def tiles() -> None:
             "60",
         ]
         subprocess.run([*FLEXROAD, *synthetic], check=True, capture_output=True)
-        common = [*FLEXROAD, "run", "--config", "nightly", "--catalog", str(survey / "catalog.parquet")]
+        common = [*FLEXROAD, "run", "--config", "production", "--catalog", str(survey / "catalog.parquet")]
         ways = {
             "one worker": ["--workers", "1"],
             "two workers": ["--workers", "2"],

@@ -5,7 +5,7 @@ configuration. Both process the same tiles, one after the other, so that a slowe
 lowest time of all rounds counts for each stage of each tile; the table has means over tiles. A tile is alone
 in its store: it computes its four corners and four edges itself. Heights and rows of both are compared.
 
-Usage: ``python tests/bench/compare.py OTHER_CHECKOUT [--rounds 5] [--tiles 4] [--configs nightly paper]``
+Usage: ``python tests/bench/compare.py OTHER_CHECKOUT [--rounds 5] [--tiles 4] [--configs production paper]``
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 
 HERE = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("measure_stages.py")
-CONFIGS = ("nightly", "paper")
+CONFIGS = ("production", "paper")
 SEED = 11
 ROW = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg", "triangles", "error_estimate_m")
 """Columns of a row that are compared."""

@@ -109,7 +109,7 @@ def test_import_loads_no_heavy_library():
 def test_reading_a_config_loads_no_numerical_library():
     heavy = "numba pandas xarray torch dask scipy.ndimage scipy.sparse scipy.spatial scipy.special".split()
     code = (
-        "import sys; from flexroad.pipeline.config.loading import load_config; load_config('nightly'); "
+        "import sys; from flexroad.pipeline.config.loading import load_config; load_config('production'); "
         f"print([m for m in {heavy} if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -163,7 +163,7 @@ def test_fit_without_road_equals_run_and_is_flagged(tmp_path, rasters):
     for layer in ("road_mask", "reference_road"):
         with rasterio.open(tmp_path / "survey" / layer / "499980_5599980.tif", "r+") as file:
             file.write(np.zeros((1, *file.shape), file.dtypes[0]))
-    run_tiles(Run.create(tmp_path / "run", load_config("nightly"), catalog), SerialExecutor())
+    run_tiles(Run.create(tmp_path / "run", load_config("production"), catalog), SerialExecutor())
     run = flexroad.open_run(tmp_path / "run")
     assert run.metrics["flags"].item() == "no-road"
     with pytest.warns(UserWarning, match="road_mask has no road cell .* the surface is that of the terrain"):
@@ -273,8 +273,8 @@ def test_fit_unusable_array_raises_one_line(scene, layer, change, message):
 
 
 def test_fit_unknown_configuration_or_variant_raises(scene):
-    with pytest.raises(flexroad.ConfigError, match="did you mean nightly"):
-        flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, config="nightli")
+    with pytest.raises(flexroad.ConfigError, match="did you mean production"):
+        flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, config="productio")
     with pytest.raises(flexroad.ConfigError, match="no variant 'plane'"):
         flexroad.fit(scene.dsm, scene.dtm, scene.road_mask, variant="plane")
 
@@ -346,7 +346,7 @@ def test_run_to_xarray_is_lazy_and_equals_heights(city):
 
 
 def test_run_to_xarray_without_geotiffs_raises(city, tmp_path):
-    (tmp_path / "light.yaml").write_text("extends: nightly\nexport: {formats: [npz]}\n")
+    (tmp_path / "light.yaml").write_text("extends: production\nexport: {formats: [npz]}\n")
     catalog = Catalog.read(city / "survey" / "catalog.parquet")
     run = Run.create(tmp_path / "run", load_config(tmp_path / "light.yaml"), catalog)
     with pytest.raises(flexroad.ConfigError, match="exports no GeoTIFF of flexroad"):

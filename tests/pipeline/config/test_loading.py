@@ -15,7 +15,7 @@ from flexroad.tasks.filter import planar
 
 
 def test_shipped_configurations_are_valid():
-    assert {"paper", "nightly"} <= set(shipped())
+    assert {"paper", "production"} <= set(shipped())
     for name in shipped():
         assert load_config(name).chains
 
@@ -122,6 +122,8 @@ def test_compose_export_without_variants_takes_the_main_one():
 def test_load_config_unusable_file_raises(tmp_path):
     with pytest.raises(ConfigError, match="did you mean paper"):
         load_config("papr")
+    with pytest.raises(ConfigError, match="no configuration 'nightly': .*did you mean production"):
+        load_config("nightly")
     bad = tmp_path / "bad.yaml"
     bad.write_text("fit: {degree: 3")
     with pytest.raises(ConfigError, match=r"bad.yaml: not readable as YAML"):
@@ -205,7 +207,7 @@ SEEDS = [
         "ecsrc": "off",
         "export": {"formats": ["glb"]},
     },
-    {"extends": "nightly", "variants": {"a": {"fit": "plane"}, "b": {"sample": {"road_m": 2}}}},
+    {"extends": "production", "variants": {"a": {"fit": "plane"}, "b": {"sample": {"road_m": 2}}}},
     {"dataset": {"layers": {"dsm": "{tile}.tif"}, "crs": "EPSG:25832"}, "cluster": "slurm", "fit": "nurbs"},
 ]
 

@@ -5,11 +5,14 @@ from flexroad.pipeline.errors import ConfigError
 
 
 def test_setting_replaces_an_option_and_names_the_configuration():
-    base, config = load_config("nightly"), load_config("nightly", ["fit.spacing_m=5", "ecsrc.verge_m=2"])
+    base, config = (
+        load_config("production"),
+        load_config("production", ["fit.spacing_m=5", "ecsrc.verge_m=2"]),
+    )
     assert config.chains["flexroad"]["fit"].spacing_m == 5
     assert config.chains["flexroad"]["fit"].huber_m == base.chains["flexroad"]["fit"].huber_m
     assert config.raw["fit"]["spacing_m"] == 5
-    assert config.name == "nightly --set fit.spacing_m=5 --set ecsrc.verge_m=2"
+    assert config.name == "production --set fit.spacing_m=5 --set ecsrc.verge_m=2"
     # A variant with a method of its own keeps it.
     assert load_config("paper", ["fit.degree=2"]).chains["plane"]["fit"].method == "plane"
 
@@ -54,7 +57,7 @@ def test_setting_below_a_single_word_keeps_the_method():
         ("fit.degree=" + "9" * 500, "--set fit.degree: not readable as YAML: line 1, column 1: a number of"),
         ("fit.degree", "--set 'fit.degree': give KEY=VALUE, like --set fit.spacing_m=5"),
         ("fit..degree=2", "--set 'fit..degree=2': give KEY=VALUE"),
-        ("extends=nightly", "paper --set extends=nightly: extends: unknown key; valid are"),
+        ("extends=production", "paper --set extends=production: extends: unknown key; valid are"),
     ],
 )
 def test_invalid_setting_raises_one_line_that_names_it(setting, message):

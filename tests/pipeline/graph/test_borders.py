@@ -19,7 +19,7 @@ from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.lattice import Lattice
 
-NIGHTLY = load_config("nightly")
+PRODUCTION = load_config("production")
 SIZE_M = 250
 
 
@@ -59,7 +59,7 @@ def borders(graph):
     return [node for node in graph.nodes.values() if node.stage == STAGE]
 
 
-def names(catalog, config=NIGHTLY):
+def names(catalog, config=PRODUCTION):
     """Return the fingerprints of tiles by id, and of corners and edges by kind and start."""
     tiles, parts = {}, defaultdict(set)
     for graph in map(Pattern.of(config).graph, catalog.tiles):
@@ -74,7 +74,7 @@ def test_neighbours_share_nodes_of_corners_and_edges(catalog_of, survey):
     _, parts = names(catalog_of(survey))
     assert len(parts) == 16 + 12 + 12
     assert all(len(fingerprints) == 1 for fingerprints in parts.values())
-    graph = tile_graph(catalog_of(survey).tiles[0], NIGHTLY)
+    graph = tile_graph(catalog_of(survey).tiles[0], PRODUCTION)
     fit = graph.nodes[graph.variants["flexroad"]["fit"]]
     assert [graph.nodes[name].border.border.kind for name in fit.frame] == [
         *["corner"] * 4, "east", "east", "north", "north",
@@ -147,7 +147,7 @@ def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
         ("load", {"road_height": "dsm"}, True),
         ("sample", {"road_m": 2}, False),
     ):
-        raw = {**NIGHTLY.raw, stage: {**NIGHTLY.raw[stage], **option}}
+        raw = {**PRODUCTION.raw, stage: {**PRODUCTION.raw[stage], **option}}
         _, other = names(catalog, compose(raw, "other"))
         assert (other != parts) == changes, stage
 
@@ -159,7 +159,7 @@ def test_paper_has_no_borders(survey):
 
 
 def test_border_reads_only_files_around_it(survey):
-    graph = tile_graph(by_prepared(survey).tiles[0], NIGHTLY)
+    graph = tile_graph(by_prepared(survey).tiles[0], PRODUCTION)
     corner = borders(graph)[3]
     assert corner.border.border.start == (500250, 5600250)
     read = {path.relative_to(survey).as_posix() for path in files_read(graph, corner)}
@@ -189,15 +189,15 @@ def square(west, south, size=250, cell=1.0, crs="EPSG:25832"):
 )
 def test_tiles_that_meet_on_different_lattices_are_refused(other):
     with pytest.raises(ConfigError, match=r"tiles t0 \(250 x 250 cells of 1 m from 0 0\) and t1 \(.*\) meet"):
-        check_tiles(NIGHTLY, placed(square(0, 0), other))
+        check_tiles(PRODUCTION, placed(square(0, 0), other))
     check_tiles(load_config("paper"), placed(square(0, 0), other))
 
 
 def test_tiles_on_one_lattice_or_apart_are_accepted():
-    check_tiles(NIGHTLY, placed(square(0, 0), square(250, 0), square(-500, 750)))
-    check_tiles(NIGHTLY, placed(square(0.5, 0.25), square(250.5, 250.25)))
-    check_tiles(NIGHTLY, placed(square(0, 0), square(1000, 0, 60)))
-    check_tiles(NIGHTLY, placed(square(0, 0), square(100, 0, crs="EPSG:25833")))
+    check_tiles(PRODUCTION, placed(square(0, 0), square(250, 0), square(-500, 750)))
+    check_tiles(PRODUCTION, placed(square(0.5, 0.25), square(250.5, 250.25)))
+    check_tiles(PRODUCTION, placed(square(0, 0), square(1000, 0, 60)))
+    check_tiles(PRODUCTION, placed(square(0, 0), square(100, 0, crs="EPSG:25833")))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_control_points_as_close_as_cells_are_accepted():
 def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
     by_prepared(survey).write(survey / "catalog.json")
     words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
-    out = flexroad("run", "--config", "nightly", "--set", "fit.spacing_m=10", *words).expected(0).out
+    out = flexroad("run", "--config", "production", "--set", "fit.spacing_m=10", *words).expected(0).out
     assert "  border   40 to do" in out.splitlines()
 
 
@@ -242,7 +242,7 @@ def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):
     )
     Catalog((tile, smaller)).write(tmp_path / "mixed.json")
     arguments = ("--catalog", tmp_path / "mixed.json", "--allow", tmp_path, "--out", tmp_path / "run")
-    (line,) = flexroad("run", "--config", "nightly", *arguments).expected(2).errors
+    (line,) = flexroad("run", "--config", "production", *arguments).expected(2).errors
     assert "set fit.method to nurbs, which fits each tile alone" in line
 
 

@@ -24,7 +24,7 @@ def without(tile, *names):
     [
         ("paper", ("road_mask",), "it has vector roads: use --config production_vector, or segment: vector"),
         ("production_vector", ("roads",), "it has a road mask: use --config production, or segment: mask"),
-        ("nightly", ("road_mask", "roads"), ADD_ROADS),
+        ("production", ("road_mask", "roads"), ADD_ROADS),
         ("production", ("dtm",), "add its files to the catalog (`flexroad catalog rasters --dtm`)"),
     ],
 )

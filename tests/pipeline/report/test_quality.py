@@ -62,7 +62,7 @@ def test_held_out_weighs_tiles_by_their_squares():
 
 
 def test_run_with_holdout_fits_twice_and_reports_its_squares(survey, tmp_path, executor):
-    options = {"extends": "nightly", "assess": {"holdout": 0.5}}
+    options = {"extends": "production", "assess": {"holdout": 0.5}}
     (tmp_path / "held.yaml").write_text(yaml.safe_dump(options))
     run = Run.create(tmp_path / "run", load_config(tmp_path / "held.yaml"), Catalog.read(survey))
     run_tiles(run, executor)

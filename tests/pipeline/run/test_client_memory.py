@@ -60,7 +60,9 @@ def traced_run(folder: Path, root: Path) -> list[int]:
     """Return the memory (bytes) after a third of a run's tiles and near its end."""
     # Records wait up to a second for their common writing; that is not growth.
     database.FLUSH_S = -1
-    run = Run.create(folder / "run", load_config("nightly"), Catalog.read(folder / "catalog.parquet", [root]))
+    run = Run.create(
+        folder / "run", load_config("production"), Catalog.read(folder / "catalog.parquet", [root])
+    )
     executor = Sent()
     tracemalloc.start()
     run_tiles(run, executor)

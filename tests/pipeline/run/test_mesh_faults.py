@@ -25,9 +25,9 @@ VARIANTS = {
     "filtered": {"sample": {"mask": "filtered"}},
     "uneven": {"sample": {"road_m": 0.7, "terrain_m": 3.3}},
     "halo": {"load": {"halo_m": 20}},
-    "nightly": SPLINE,
-    "nightly_uniform": {**SPLINE, "sample": "uniform"},
-    "nightly_uneven": {**SPLINE, "sample": {"road_m": 0.7, "terrain_m": 3.3}},
+    "production": SPLINE,
+    "production_uniform": {**SPLINE, "sample": "uniform"},
+    "production_uneven": {**SPLINE, "sample": {"road_m": 0.7, "terrain_m": 3.3}},
 }
 EVERY = {
     "fit": {"method": "nurbs", "control_points": [8, 8], "iterations": 2},

@@ -30,7 +30,7 @@ import sys
 from flexroad.pipeline.cli.main import app
 tile, out, *catalogs = sys.argv[1:]
 for catalog in catalogs:
-    words = ["run", "--config", "nightly", "--catalog", catalog, "--tile", tile]
+    words = ["run", "--config", "production", "--catalog", catalog, "--tile", tile]
     app([*words, "--out", f"{out}/{catalog.rpartition('/')[2]}/{tile}"], standalone_mode=False)
 """
 """Code of a process that computes one tile of several catalogs."""
@@ -152,7 +152,7 @@ def test_tiles_processed_together_have_the_same_bytes(alone, tmp_path):
     """Whether its neighbours are in the run, fail or come first changes no byte of a tile's surface."""
     path, folder = alone
     catalog = Catalog.read(path)
-    run = Run.create(tmp_path / "run", load_config("nightly"), catalog)
+    run = Run.create(tmp_path / "run", load_config("production"), catalog)
     middle = catalog.tiles[4]
     run_tiles(run, SerialExecutor(), only=lambda tile: tile != middle)
     # Tiles with odd numbers were made with other rounding errors.
@@ -184,7 +184,7 @@ def test_surface_of_part_of_unfinished_run(survey, tmp_path):
         [tile.id for tile in Catalog.read(survey / "catalog.parquet").tiles[:2]]
     )
     # A surface over tiles has no steps beside roads.
-    run = Run.create(tmp_path / "run", load_config("nightly", ["fit.steps=false"]), catalog)
+    run = Run.create(tmp_path / "run", load_config("production", ["fit.steps=false"]), catalog)
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
     view = flexroad.open_run(tmp_path / "run")
     grid = catalog.tiles[0].grid

@@ -76,7 +76,7 @@ def test_run_tiles_without_roads_are_done_flagged_and_cached(half, tmp_path, exe
 
 
 def test_products_of_tile_without_roads_open_and_follow_dtm(half, tmp_path):
-    run = Run.create(tmp_path / "run", load_config("nightly"), half)
+    run = Run.create(tmp_path / "run", load_config("production"), half)
     assert run_tiles(run, SerialExecutor()).exit_code == 0
     tile = half.tiles[BARE[0]]
     product = {end: run.folder(tile.id).path / f"{tile.id}_flexroad{end}" for end in ENDS}
@@ -143,7 +143,7 @@ def test_tiles_that_no_mask_reaches_are_done_and_meet_the_others(survey, tmp_pat
     patterns = {name: f"{name}/*.tif" for name in ("dsm", "dtm", "road_mask")}
     tiles = rasters.index(folder, patterns, tile_size_m=60).tiles
     assert [tile.layer("road_mask") is None for tile in tiles] == [number in BARE for number in range(4)]
-    run = Run.create(tmp_path / "run", load_config("nightly"), Catalog(tiles))
+    run = Run.create(tmp_path / "run", load_config("production"), Catalog(tiles))
     result = run_tiles(run, SerialExecutor())
     assert (result.done, result.without_roads, result.exit_code) == (4, 2, 0)
     assert list(edge_steps(run).check.result) == ["one surface: all differences are exactly 0"]
