@@ -15,7 +15,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.point_clouds import chunks
 from flexroad.catalog.storage.outputs import output_file
 
@@ -29,7 +29,7 @@ CELL_M = 1.0
 def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
     """Write the mean height of a cloud's bridge points per cell; return whether there are any.
 
-    An existing target that is not older than the cloud is kept.
+    An existing target that is not older than the cloud is kept, unless it is damaged.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
     CatalogError
         If the cloud cannot be read; names the file.
     """
-    if target.exists() and target.stat().st_mtime_ns >= cloud.stat().st_mtime_ns:
-        with open_raster(target) as raster:
-            return bool(np.isfinite(raster.read(1)).any())
+    kept = _kept(cloud, target)
+    if kept is not None:
+        return kept
     west, south, east, north = square
     width, height = math.ceil((east - west) / CELL_M), math.ceil((north - south) / CELL_M)
     total, count = np.zeros(width * height), np.zeros(width * height, np.int64)
@@ -63,6 +63,17 @@ def deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
         heights = (total / count).reshape(height, width)
     _write(target, heights, Affine(CELL_M, 0, west, 0, -CELL_M, north), crs)
     return bool(count.any())
+
+
+def _kept(cloud: Path, target: Path) -> bool | None:
+    """Return whether an existing target has bridges; None if it is older than the cloud, or damaged."""
+    try:
+        if target.stat().st_mtime_ns < cloud.stat().st_mtime_ns:
+            return None
+        with open_raster(target) as raster:
+            return bool(np.isfinite(raster.read(1)).any())
+    except ERRORS:
+        return None
 
 
 def _decks(cloud: Path) -> Iterator[tuple[Floats, Floats, Floats]]:

@@ -16,7 +16,8 @@ from typing import Any
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some
+from flexroad.catalog.headers.globbing import glob
+from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some, unlisted_lines
 from flexroad.catalog.text import shown
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
@@ -105,20 +106,21 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
     Raises
     ------
     CatalogError
-        If there is no DSM, two files are the same layer of a tile, or the CRS of a file is not in metres.
+        If there is no usable DSM in metres, or two files are the same layer of a tile.
     """
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
-    root, notes = root.resolve(), []
+    root, left_out = root.resolve(), list[str]()
     by_layer: dict[str, dict[str, _MatchedFile]] = {}
     for name in LAYERS:
         if name in layout.layers:
             by_layer[name], skipped = _files(root, name, layout)
-            notes += skipped
+            left_out += skipped
     if not by_layer["dsm"]:
         raise CatalogError(
-            f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {_hint(root, notes)}"
+            f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {_hint(root, left_out)}"
         )
+    left_out += _without_metres(by_layer["dsm"])
     tiles = tuple(
         _tile(
             root,
@@ -130,20 +132,41 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
         )
         for tile_id in sorted(by_layer["dsm"])
     )
-    return TilingResult(tiles, (*notes, *_lacking(tiles, layout), *assumed(tiles)))
+    return TilingResult(tiles, (*_lacking(tiles, layout), *assumed(tiles)), tuple(left_out))
+
+
+def _without_metres(dsm: dict[str, _MatchedFile]) -> list[str]:
+    """Remove the files that are not in metres; return a line on each.
+
+    Raises
+    ------
+    CatalogError
+        If no file is left.
+    """
+    errors = dict[str, CatalogError]()
+    for tile_id, match in dsm.items():
+        try:
+            require_metric(match.file)
+        except CatalogError as error:
+            errors[tile_id] = error
+    if len(errors) == len(dsm):
+        raise next(iter(errors.values()))
+    for tile_id in errors:
+        del dsm[tile_id]
+    return [f"skipped {error}" for error in errors.values()]
 
 
 def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFile], list[str]]:
-    """Return the files of a layer by tile id, and notes on skipped files."""
+    """Return the files of a layer by tile id, and lines on skipped files and folders."""
     template = layout.layers[layer]
     pattern = _pattern(template)
     try:
-        paths = sorted(path for path in root.glob(PLACEHOLDER.sub("*", template)) if path.is_file())
+        paths, unlisted = glob(root, PLACEHOLDER.sub("*", template))
     except (ValueError, NotImplementedError) as error:
         raise CatalogError(f"layout: {layer}: {template!r} is not a path below {root}: {error}") from error
     path_of = {path.relative_to(root).as_posix(): path for path in paths}
     parts = {name: match.groupdict() for name in path_of if (match := pattern.fullmatch(name))}
-    files, notes = opened(root, layer, [path_of[name] for name in parts], layout.crs)
+    files, skipped = opened(root, layer, [path_of[name] for name in parts], layout.crs)
     by_tile: dict[str, _MatchedFile] = {}
     for file in files:
         tile_id = parts[file.name]["tile"]
@@ -153,7 +176,7 @@ def _files(root: Path, layer: str, layout: Layout) -> tuple[dict[str, _MatchedFi
                 f"change the template {template!r} so that it matches only one of them"
             )
         by_tile[tile_id] = _MatchedFile(file, parts[file.name].get("stratum") or "")
-    return by_tile, notes
+    return by_tile, [*skipped, *unlisted_lines(root, layer, unlisted)]
 
 
 def _pattern(template: str) -> re.Pattern[str]:
@@ -179,7 +202,6 @@ def _tile(
     date: datetime | None,
 ) -> Tile:
     dsm = files["dsm"].file
-    require_metric(dsm)
     layers = tuple(
         Layer(
             name,
@@ -205,10 +227,10 @@ def _lacking(tiles: Sequence[Tile], layout: Layout) -> list[str]:
     return notes
 
 
-def _hint(root: Path, notes: Sequence[str]) -> str:
-    """Return the end of the error for a folder without a DSM: the first note, else which files exist."""
-    if notes:
-        return notes[0]
+def _hint(root: Path, left_out: Sequence[str]) -> str:
+    """Return the end of the error for a folder without a DSM: the first skipped file, or those that exist."""
+    if left_out:
+        return left_out[0]
     files = sorted(
         islice((path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()), 100)
     )

@@ -6,7 +6,8 @@ The files of a survey rarely match the tiles, so each tile lists every file with
 from __future__ import annotations
 
 import math
-from collections import Counter
+import statistics
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -21,12 +22,14 @@ from numpy.typing import NDArray
 from flexroad.catalog.cover import MIN_COVER, height_share
 from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, same, scales, short
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
-from flexroad.catalog.headers.rasters import RasterFile, require_metric, some, zoned
+from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, some, zoned
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")
+MAX_CELL_RATIO = 50
+"""DSM files whose cells are larger than most height files' by more than this factor are left out."""
 CELLS = (1.0, 2.0, 2.5, 5.0)
 """Sizes of the cells of tiles whose DSM is reprojected (m), and these times powers of ten."""
 
@@ -62,7 +65,13 @@ class TilingResult:
     tiles: tuple[Tile, ...]
     """In the order of their ids."""
     notes: tuple[str, ...]
-    """What was skipped, left out or assumed, one line each."""
+    """What was assumed, and the tiles that were left out, one line each."""
+    left_out: tuple[str, ...] = ()
+    """The files and folders that cannot be used, one line per reason: the tiles lack their cells."""
+
+    def after(self, notes: Sequence[str], left_out: Sequence[str]) -> TilingResult:
+        """Return the result with earlier notes and files left out before its own."""
+        return replace(self, notes=(*notes, *self.notes), left_out=(*left_out, *self.left_out))
 
 
 class _PlacedFile(NamedTuple):
@@ -122,7 +131,8 @@ def cut(
     Raises
     ------
     CatalogError
-        If the CRS is not in metres, the tile size does not fit the cells, or no tile is left.
+        If the CRS is not in metres, no file of a layer has a place, the tile size does not fit the cells, or
+        no tile is left.
     """
     dsm = layer_files["dsm"]
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]
@@ -130,11 +140,16 @@ def cut(
         grid_crs = in_plan(conversion.to_crs)
     else:
         require_metric(next(file for file in dsm if file.crs == grid_crs), "--reproject")
-    placed = {name: _place(layer_files[name], grid_crs) for name in LAYERS if name in layer_files}
+    placed, left_out = {}, list[str]()
+    for name in (name for name in LAYERS if name in layer_files):
+        placed[name], lines = _place(name, layer_files[name], grid_crs)
+        left_out += lines
+    placed["dsm"], lines = _alike(placed)
+    left_out += lines
     notes = [note for name, files in placed.items() for note in _other_crs(name, files, grid_crs, conversion)]
 
     grids = _cut(placed["dsm"], grid_crs, tile_size_m)
-    grids, left_out = _covered(root, grids, _near(grids, placed["dsm"]), min_cover, conversion.reproject)
+    grids, uncovered = _covered(root, grids, _near(grids, placed["dsm"]), min_cover, conversion.reproject)
     if not any(file.crs == grid_crs for file in dsm):
         notes.append(f"the tiles have cells of {next(iter(grids.values())).cell:g} m")
     near = {name: _near(grids, files) for name, files in placed.items()}
@@ -158,21 +173,57 @@ def cut(
         )
         survey_date = taken(near["dsm"][tile_id].in_core, date)
         tiles.append(Tile(tile_id, grid, layers, str(root), *survey_date, dataset=dataset, nearby=nearby))
-    return TilingResult(tuple(tiles), (*notes, *left_out, *assumed(tiles)))
+    return TilingResult(tuple(tiles), (*notes, *uncovered, *assumed(tiles)), tuple(left_out))
 
 
-def _place(files: Sequence[RasterFile], crs: str) -> list[_PlacedFile]:
-    """Return the files with their bounds in the tiles' CRS."""
+def _place(layer: str, files: Sequence[RasterFile], crs: str) -> tuple[list[_PlacedFile], list[str]]:
+    """Return the files with their bounds in the tiles' CRS, and lines on those without a position in it."""
     placed = [
         _PlacedFile(f, f.bounds if same(f.crs, crs) else bounds_in(crs, f.crs, f.bounds)) for f in files
     ]
-    for file, bounds in placed:
-        if not np.isfinite(bounds).all():
-            raise CatalogError(
-                f"{file.name} in {short(file.crs)} has no position in {short(crs)}, the CRS of the dsm; "
-                "leave it out of the pattern or correct its CRS with `gdal_edit.py -a_srs`"
-            )
-    return placed
+    kept, lost = list[_PlacedFile](), defaultdict[str, list[str]](list)
+    for entry in placed:
+        # NaN is not below either.
+        if np.abs(entry.bounds).max() <= FARTHEST:
+            kept.append(entry)
+        else:
+            lost[entry.file.crs].append(entry.file.name)
+    lines = [
+        skip(
+            some(names),
+            layer,
+            f"in {short(system)} it has no position in {short(crs)}, the CRS of the dsm; "
+            "correct its CRS with `gdal_edit.py -a_srs`",
+        )
+        for system, names in lost.items()
+    ]
+    if not kept:
+        raise CatalogError(f"no usable file of the layer {layer}; {lines[0]}")
+    return kept, lines
+
+
+def _alike(placed: Mapping[str, Sequence[_PlacedFile]]) -> tuple[list[_PlacedFile], list[str]]:
+    """Return the DSM files without those of huge cells, which would be cut into millions of tiles."""
+    usual = statistics.median_high(_cell_size(entry) for name in HEIGHTS for entry in placed.get(name, ()))
+    kept, lines = list[_PlacedFile](), list[str]()
+    for entry in placed["dsm"]:
+        if _cell_size(entry) <= MAX_CELL_RATIO * usual:
+            kept.append(entry)
+            continue
+        reason = (
+            f"it has cells of {_cell_size(entry):g} m, while most files of heights have {usual:g} m; "
+            "correct its georeference, or resample it with gdalwarp -tr"
+        )
+        lines.append(skip(entry.file.name, "dsm", reason))
+    if not kept:
+        raise CatalogError(f"no usable file of the layer dsm; {lines[0]}")
+    return kept, lines
+
+
+def _cell_size(placed: _PlacedFile) -> float:
+    """Return the larger side of a file's cells in the tiles' CRS (m)."""
+    west, south, east, north = placed.bounds
+    return max((east - west) / placed.file.width, (north - south) / placed.file.height)
 
 
 def _other_crs(layer: str, files: Sequence[_PlacedFile], crs: str, conversion: Conversion) -> Iterator[str]:

@@ -216,7 +216,7 @@ def _chunk(
 def _opened(path: Path) -> Any:
     import laspy
 
-    if not path.is_file():
+    if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
     largest = _attempt(path, lambda: las_header.check(path))
@@ -235,6 +235,8 @@ def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
         # For a damaged file, laspy raises exceptions of many types, and lazrs one that is no `Exception`.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
+        if isinstance(error, OSError) and error.strerror:
+            raise CatalogError(f"{path} cannot be read{when}: {error.strerror}") from error
         raise CatalogError(
             f"{path} cannot be read as a point cloud{when}: {one_line(error)}; download it again"
         ) from error

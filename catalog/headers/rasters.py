@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import warnings
 from collections import defaultdict
@@ -10,17 +9,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from glob import has_magic
 from itertools import islice
 from pathlib import Path
 
 import rasterio
+from affine import Affine
 from rasterio.errors import NotGeoreferencedWarning
 
 from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.globbing import glob, is_folder
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
+from flexroad.catalog.headers.raster_faults import AGAIN, georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.tile import HEIGHTS
@@ -96,30 +98,31 @@ def scan(
     -------
     files : list of RasterFile
         Ordered by name.
-    notes : list of str
-        Skipped files, one line per reason.
+    left_out : list of str
+        Skipped files and folders, one line per reason.
 
     Raises
     ------
     CatalogError
-        If no file matches or can be used, or a file has no CRS and ``crs`` is None.
+        If no file matches or can be used.
     """
-    files, notes = opened(root, layer, matching(root, layer, pattern), crs, allow)
+    paths, unlisted = matching(root, layer, pattern)
+    files, skipped = opened(root, layer, paths, crs, allow)
     if not files:
         folder, _ = _start(root, pattern)
-        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {folder}; {notes[0]}")
-    return files, notes
+        raise CatalogError(f"no usable file for {_option(layer)} {pattern!r} below {folder}; {skipped[0]}")
+    return files, [*skipped, *unlisted]
 
 
 def opened(
     root: Path, layer: str, paths: Iterable[Path], crs: str | None, allow: Sequence[str] = ()
 ) -> tuple[list[RasterFile], list[str]]:
-    """Open files of a layer, each once; return the usable ones, and notes on skipped files.
+    """Open files of a layer, each once; return the usable ones, and a line per reason on the others.
 
     Raises
     ------
     CatalogError
-        If a file has no CRS and ``crs`` is None.
+        If a file has no CRS and ``crs`` is not one.
     """
     files: list[RasterFile] = []
     allowed = AllowedFolders.of(root, allow)
@@ -130,7 +133,12 @@ def opened(
                 files.append(_open(root, path, crs, allowed, layer in HEIGHTS))
             except _Skip as reason:
                 skipped[str(reason)].append(_name(root, path))
-    return files, [f"skipped {some(names)} ({layer}): {reason}" for reason, names in skipped.items()]
+    return files, [skip(some(names), layer, reason) for reason, names in skipped.items()]
+
+
+def skip(names: str, layer: str, reason: str) -> str:
+    """Return the line on files or folders of a layer that a catalog leaves out."""
+    return f"skipped {names} ({layer}): {reason}"
 
 
 def some(names: Sequence[str]) -> str:
@@ -143,8 +151,10 @@ def _option(layer: str) -> str:
     return "--" + layer.replace("_", "-")
 
 
-def matching(root: Path, layer: str, pattern: str) -> list[Path]:
-    """Return the files that match a glob pattern, by name.
+def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[str]]:
+    """Return the files that match a glob pattern, by name, and lines on the folders that cannot be listed.
+
+    If the pattern's last part has a dot, it names files, and a folder that matches is in place of one.
 
     Parameters
     ----------
@@ -162,12 +172,24 @@ def matching(root: Path, layer: str, pattern: str) -> list[Path]:
     """
     folder, relative = _start(root, pattern)
     try:
-        paths = sorted(path for path in folder.glob(relative) if path.is_file())
+        found, unlisted = glob(folder, relative)
     except (ValueError, NotImplementedError) as error:
         raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {folder}: {error}") from error
+    names_files = "." in Path(relative).name
+    paths = [path for path in found if names_files or not is_folder(path)]
+    lines = unlisted_lines(root, layer, unlisted)
     if not paths:
-        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {_there(folder)}")
-    return paths
+        there = lines[0] if lines else _there(folder)
+        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {there}")
+    return paths, lines
+
+
+def unlisted_lines(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[str]:
+    """Return a line on each folder that cannot be listed."""
+    return [
+        skip(f"folder {_name(root, folder)}", layer, f"it cannot be read: {error.strerror}")
+        for folder, error in unlisted
+    ]
 
 
 def _start(root: Path, pattern: str) -> tuple[Path, str]:
@@ -179,7 +201,7 @@ def _start(root: Path, pattern: str) -> tuple[Path, str]:
     if whole.is_relative_to(root) and whole != root:
         return root, whole.relative_to(root).as_posix()
     parts = whole.parts
-    fixed = next((n for n, part in enumerate(parts) if glob.has_magic(part)), len(parts) - 1)
+    fixed = next((n for n, part in enumerate(parts) if has_magic(part)), len(parts) - 1)
     return Path(*parts[:fixed]), str(Path(*parts[fixed:]))
 
 
@@ -187,7 +209,7 @@ def _there(folder: Path) -> str:
     """Return which files are in a folder, for a message."""
     if not folder.is_dir():
         return "the folder does not exist"
-    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not is_folder(path))
     names = some(sorted(islice(files, 100)))
     return f"there are {names}" if names else "the folder is empty"
 
@@ -204,34 +226,54 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
             transform, width, height, bounds = src.transform, src.width, src.height, tuple(src.bounds)
             fault = georeference_fault(src) or (heights_fault(src) if heights else None)
             tags = {**src.tags(), **src.tags(ns="IMAGERY")}
-            unit = src.units[0] or (height_unit(wkt) or ("",))[0] if wkt else src.units[0]
+            unit = src.units[0]
+        modified = path.stat().st_mtime
     except Refused as error:
         raise _Skip(f"it {error}") from error
     except ERRORS as error:
-        raise _Skip("not a raster that GDAL can read") from error
+        why = getattr(error, "strerror", None)
+        raise _Skip(f"it cannot be read: {why}" if why else "not a raster that GDAL can read") from error
     if transform.is_identity:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")
     if fault:
         raise _Skip(f"it {fault}")
     if transform.b or transform.d:
         raise _Skip("a rotated raster; turn it north up with gdalwarp")
-    name = _name(root, path)
-    if not wkt and crs is None:
-        raise CatalogError(f"{name} has no CRS; give it with --crs, e.g. --crs EPSG:25832")
+    plan, crs_unit = _system(wkt, crs)
     west, south, east, north = bounds
     return RasterFile(
-        name=name,
-        crs=in_plan(wkt or str(crs)),
+        name=_name(root, path),
+        crs=plan,
         has_crs=bool(wkt),
         # GDAL swaps south and north of XYZ files that are sorted from south to north.
         bounds=(west, min(south, north), east, max(south, north)),
-        cell=round(min(abs(transform.a), abs(transform.e)), 6),
+        cell=_cell(transform),
         width=width,
         height=height,
         taken=date_of(tags),
-        modified=datetime.fromtimestamp(path.stat().st_mtime, UTC),
-        height_unit=unit or None,
+        modified=datetime.fromtimestamp(modified, UTC),
+        height_unit=unit or crs_unit,
     )
+
+
+def _system(wkt: str, crs: str | None) -> tuple[str, str | None]:
+    """Return the horizontal CRS and the unit of heights that a raster's WKT declares, ``crs`` without WKT."""
+    if not wkt:
+        if crs is None:
+            raise _Skip("it has no CRS; give it with --crs, e.g. --crs EPSG:25832")
+        return in_plan(crs), None
+    try:
+        declared = height_unit(wkt)
+        return in_plan(wkt), declared[0] if declared else None
+    except CatalogError as error:
+        raise _Skip(f"it has an {error}") from error
+
+
+def _cell(transform: Affine) -> float:
+    cell = float(round(min(abs(transform.a), abs(transform.e)), 6))
+    if not cell:
+        raise _Skip(f"it has cells of {transform.a:g} x {transform.e:g}; {AGAIN}")
+    return cell
 
 
 def date_of(tags: Mapping[str, str]) -> datetime | None:

@@ -39,8 +39,10 @@ class VectorFile:
     """The layer of the roads, if it was chosen."""
 
 
-def find(root: Path, given: str, crs: str | None, sublayer: str | None = None) -> list[VectorFile]:
-    """Open vector files.
+def find(
+    root: Path, given: str, crs: str | None, sublayer: str | None = None
+) -> tuple[list[VectorFile], list[str]]:
+    """Open vector files; return the usable ones, and a line on each other one.
 
     Parameters
     ----------
@@ -56,11 +58,20 @@ def find(root: Path, given: str, crs: str | None, sublayer: str | None = None) -
     Raises
     ------
     CatalogError
-        If there is no such file, a file is not a vector file or has no CRS, or the layer is not in it, or it
-        has several and ``sublayer`` is None.
+        If there is no such file or none can be used: it is not a vector file or has no CRS, the layer is not
+        in it, or it has several and ``sublayer`` is None.
     """
-    paths = [Path(given)] if Path(given).is_file() else matching(root.resolve(), "roads", given)
-    return [opened(path, crs, sublayer) for path in paths]
+    root = root.resolve()
+    paths, lines = ([Path(given)], []) if Path(given).is_file() else matching(root, "roads", given)
+    files, errors = list[VectorFile](), list[CatalogError]()
+    for path in paths:
+        try:
+            files.append(opened(path, crs, sublayer))
+        except CatalogError as error:
+            errors.append(error)
+    if not files:
+        raise errors[0]
+    return files, [*(f"skipped {error}" for error in errors), *lines]
 
 
 def layers(path: Path) -> dict[str, str]:
@@ -104,6 +115,8 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:
+        if why := getattr(error, "strerror", None):
+            raise CatalogError(f"--roads {path} cannot be read: {why}") from error
         raise CatalogError(f"--roads {path} is not a vector file: {reason(error)}") from error
     if found and not names:
         raise CatalogError(f"--roads {path} has no layer {sublayer!r}; it has {listed(found)}")
@@ -127,28 +140,41 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
     return VectorFile(path.resolve(), has_crs, None if no_bounds else extents, sublayer)
 
 
-def with_roads(tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None) -> tuple[Tile, ...]:
+def with_roads(
+    tiles: Sequence[Tile], files: Sequence[VectorFile], crs: str | None
+) -> tuple[tuple[Tile, ...], list[str]]:
     """Return the tiles with a layer ``roads`` of the files within `REACH_M` of each tile.
+
+    Returns
+    -------
+    tiles : tuple of Tile
+    left_out : list of str
+        A line on each file that reaches no tile.
 
     Raises
     ------
     CatalogError
-        If a file reaches no tile.
+        If no file reaches a tile.
     """
     if not files:
-        return tuple(tiles)
+        return tuple(tiles), []
     systems = {tile.grid.crs for tile in tiles}
     extents = {target: np.array([_extent(file, target) for file in files]) for target in systems}
     near = np.array([_near(tile, extents[tile.grid.crs]) for tile in tiles])
-    for number, file in enumerate(files):
-        if not near[:, number].any():
-            raise CatalogError(f"--roads {file.path} reaches no tile; check its CRS and its extent")
+    far = [
+        f"--roads {file.path} reaches no tile; check its CRS and its extent"
+        for number, file in enumerate(files)
+        if not near[:, number].any()
+    ]
+    if len(far) == len(files):
+        raise CatalogError(far[0])
     # A CRS is that of the whole layer, so that all tiles describe the layer in the same way.
     bare = None if all(file.has_crs for file in files) else crs
-    return tuple(
+    with_layer = tuple(
         _with_layer(tile, list(compress(files, chosen)), extents[tile.grid.crs][chosen], bare)
         for tile, chosen in zip(tiles, near, strict=True)
     )
+    return with_layer, [f"skipped {line}" for line in far]
 
 
 def _extent(file: VectorFile, target: str) -> Bounds:

@@ -19,7 +19,8 @@ from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.rasters import RasterFile, opened, scan, some
+from flexroad.catalog.headers.globbing import glob
+from flexroad.catalog.headers.rasters import RasterFile, opened, scan, skip, some, unlisted_lines
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.mask_values import mask_notes
 from flexroad.catalog.tile import Tile
@@ -106,29 +107,30 @@ def index(
     Raises
     ------
     CatalogError
-        If there is no surface model, no file matches the pattern of the mask or the roads, or no tile is
-        left.
+        If there is no usable surface model, no usable file matches the pattern of the mask or the roads, or
+        no tile is left.
     """
     root = root.resolve()
-    downloads = _downloads(root)
+    downloads, left_out = _downloads(root)
     layer_files: dict[str, list[RasterFile]] = {}
-    bridges, notes = _bridges(root, downloads, derived)
+    bridges, notes, skipped = _bridges(root, downloads, derived)
+    left_out += skipped
     if bridges:
         layer_files["bridges"] = bridges
     for layer in LAYER_OF.values():
         named = [download for download in downloads if download.layer == layer]
         files, skipped = opened(root, layer, [download.path for download in named], CRS)
         files, misplaced = _placed(root, files, named)
-        notes += [*skipped, *misplaced]
+        left_out += [*skipped, *misplaced]
         if files:
             layer_files[layer] = files
     if "dsm" not in layer_files:
         raise CatalogError(
-            f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {_hint(root, notes)}"
+            f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {_hint(root, left_out)}"
         )
     if road_mask is not None:
         layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
-        notes += skipped
+        left_out += skipped
         notes += mask_notes(root, "road_mask", [file.name for file in layer_files["road_mask"]], road_values)
     indexed = cut(
         root,
@@ -141,28 +143,33 @@ def index(
         dataset=DATASET,
         conversion=Conversion(reproject),
     )
-    vectors = find(root, roads, CRS, roads_layer) if roads is not None else []
-    return replace(
-        indexed,
-        tiles=with_roads(indexed.tiles, vectors, CRS),
-        notes=(*notes, *indexed.notes, *_without_terrain(indexed.tiles)),
-    )
+    indexed = indexed.after(notes, left_out)
+    if roads is not None:
+        vectors, skipped = find(root, roads, CRS, roads_layer)
+        tiles, far = with_roads(indexed.tiles, vectors, CRS)
+        indexed = replace(indexed, tiles=tiles, left_out=(*indexed.left_out, *skipped, *far))
+    return replace(indexed, notes=(*indexed.notes, *_without_terrain(indexed.tiles)))
 
 
-def _downloads(root: Path) -> list[Download]:
-    """Return the downloads below a folder, newest first, because the first file with a value is used."""
+def _downloads(root: Path) -> tuple[list[Download], list[str]]:
+    """Return the downloads below a folder, newest first, and lines on folders that cannot be listed.
+
+    The newest are first because the first file with a value is used.
+    """
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
-    parsed = (parse(path) for path in sorted(root.rglob("*")) if path.is_file())
-    return sorted((download for download in parsed if download), key=lambda download: -download.year)
+    found, unlisted = glob(root, "**/*")
+    downloads = [download for download in map(parse, found) if download]
+    lines = unlisted_lines(root, "downloads", unlisted)
+    return sorted(downloads, key=lambda download: -download.year), lines
 
 
 def _placed(
     root: Path, files: Sequence[RasterFile], named: Sequence[Download]
 ) -> tuple[list[RasterFile], list[str]]:
-    """Return the files whose position matches their name, dated by it, and notes on the others."""
+    """Return the files whose position matches their name, dated by it, and lines on the others."""
     by_name = {download.path.relative_to(root).as_posix(): download for download in named}
-    kept, notes = [], []
+    kept, lines = [], []
     for file in files:
         download = by_name[file.name]
         west, south, east, north = download.square
@@ -170,11 +177,9 @@ def _placed(
         if file.crs == CRS and west < x < east and south < y < north:
             kept.append(_dated(file, download.year))
         else:
-            notes.append(
-                f"skipped {file.name} ({download.layer}): its centre {x:.0f} {y:.0f} in {short(file.crs)} "
-                f"does not match its name; download it again"
-            )
-    return kept, notes
+            reason = f"its centre {x:.0f} {y:.0f} in {short(file.crs)} does not match its name"
+            lines.append(skip(file.name, str(download.layer), f"{reason}; download it again"))
+    return kept, lines
 
 
 def _dated(file: RasterFile, year: int) -> RasterFile:
@@ -186,24 +191,25 @@ def _dated(file: RasterFile, year: int) -> RasterFile:
 
 def _bridges(
     root: Path, downloads: Sequence[Download], derived: Path | None
-) -> tuple[list[RasterFile], list[str]]:
-    """Return rasters of the bridge decks in the point clouds, newest first, and notes."""
+) -> tuple[list[RasterFile], list[str], list[str]]:
+    """Return rasters of the bridge decks in the point clouds, newest first, notes, and lines on others."""
     clouds = [download for download in downloads if download.layer is None]
     names = [download.path.relative_to(root).as_posix() for download in clouds]
     if not clouds:
-        return [], []
+        return [], [], []
     if derived is None:
-        return [], [f"point clouds were not read, so the reference lacks the bridges in {some(names)}"]
-    targets, notes = [], []
+        note = f"point clouds were not read, so the reference lacks the bridges in {some(names)}"
+        return [], [note], []
+    targets, lines = [], []
     for cloud in clouds:
         target = derived.resolve() / f"{cloud.path.stem}_bridges.tif"
         try:
             if deck_raster(cloud.path, target, cloud.square, CRS):
                 targets.append(target)
         except CatalogError as error:
-            notes.append(f"skipped {error}")
+            lines.append(f"skipped {error}")
     files, skipped = opened(root, "bridges", targets, CRS)
-    return files, [*notes, *skipped]
+    return files, [], [*lines, *skipped]
 
 
 def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
@@ -213,9 +219,9 @@ def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
     return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model as well"]
 
 
-def _hint(root: Path, notes: Sequence[str]) -> str:
-    """Return the end of the error for a folder without a DSM: the first note, else which files exist."""
-    if notes:
-        return notes[0]
+def _hint(root: Path, left_out: Sequence[str]) -> str:
+    """Return the end of the error for a folder without a DSM: the first skipped file, or those that exist."""
+    if left_out:
+        return left_out[0]
     files = sorted(path.name for path in root.rglob("*") if path.is_file())
     return f"there are {some(files)}" if files else "the folder is empty"

@@ -59,8 +59,8 @@ def index(
     Raises
     ------
     CatalogError
-        If no usable file matches a pattern, the CRS is missing or not in metres, no tile is left, or a file
-        of roads reaches no tile.
+        If no usable file matches a pattern, the CRS is not in metres, no tile is left, or no file of roads
+        reaches a tile.
     """
     root = root.resolve()
     _check(root, patterns)
@@ -69,7 +69,8 @@ def index(
         for name in LAYERS
         if name in patterns and name != "roads"
     }
-    notes = [note for _, skipped in scanned.values() for note in skipped]
+    left_out = [line for _, lines in scanned.values() for line in lines]
+    notes = []
     for name in (mask for mask in MASKS if mask in scanned):
         notes += mask_notes(root, name, [file.name for file in scanned[name][0]], road_values)
     indexed = cut(
@@ -82,8 +83,12 @@ def index(
         min_cover=min_cover,
         conversion=conversion,
     )
-    roads = find(root, patterns["roads"], crs, roads_layer) if "roads" in patterns else []
-    return replace(indexed, tiles=with_roads(indexed.tiles, roads, crs), notes=(*notes, *indexed.notes))
+    indexed = indexed.after(notes, left_out)
+    if "roads" not in patterns:
+        return indexed
+    roads, skipped = find(root, patterns["roads"], crs, roads_layer)
+    tiles, far = with_roads(indexed.tiles, roads, crs)
+    return replace(indexed, tiles=tiles, left_out=(*indexed.left_out, *skipped, *far))
 
 
 def _check(root: Path, patterns: Mapping[str, str]) -> None:

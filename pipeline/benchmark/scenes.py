@@ -148,7 +148,7 @@ def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> 
     if not lines:
         return tuple(tiles)
     _write_lines(path, list(lines.values()), jobs[0].grid.crs)
-    return with_roads(tiles, [opened(path, None)], None)
+    return with_roads(tiles, [opened(path, None)], None)[0]
 
 
 def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:

@@ -73,6 +73,14 @@ MinCover = Annotated[
         rich_help_panel=options.TILES,
     ),
 ]
+Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict",
+        help="Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
+        rich_help_panel=options.OUTPUTS,
+    ),
+]
 Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
 
 
@@ -111,6 +119,7 @@ def catalog_rasters(
     allow: options.Allow = None,
     tile_size: TileSize = 250,
     min_cover: MinCover = MIN_COVER,
+    strict: Strict = False,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
     from flexroad.catalog.sources import rasters
@@ -138,7 +147,7 @@ def catalog_rasters(
         roads_layer=roads_layer,
         conversion=Conversion(reproject, to_crs, height_unit),
     )
-    _write_catalog(result, output)
+    _write_catalog(result, output, strict)
 
 
 @catalogs.command("nrw", cls=Command)
@@ -157,6 +166,7 @@ def catalog_nrw(
     date: Date = None,
     allow: options.Allow = None,
     reproject: Reproject = False,
+    strict: Strict = False,
 ) -> None:
     """Cut downloads of Geobasis NRW into tiles.
 
@@ -177,7 +187,7 @@ def catalog_nrw(
         roads_layer=roads_layer,
         reproject=reproject,
     )
-    _write_catalog(result, output)
+    _write_catalog(result, output, strict)
 
 
 @catalogs.command("gerod", cls=Command)
@@ -186,12 +196,13 @@ def catalog_gerod(
     output: Output,
     layout: Layout = "gerod",
     date: Date = None,
+    strict: Strict = False,
 ) -> None:
     """List the tiles of the GeRoD dataset."""
     from flexroad.catalog.sources import gerod
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output, layout)
+    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output, strict, layout)
 
 
 @catalogs.command("dsc3d", cls=Command)
@@ -200,23 +211,32 @@ def catalog_dsc3d(
     output: Output,
     layout: Layout = "dsc3d",
     date: Date = None,
+    strict: Strict = False,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
     from flexroad.catalog.sources import dsc3d
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output, layout)
+    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output, strict, layout)
 
 
-def _write_catalog(result: TilingResult, output: Path, config: str | None = None) -> None:
-    from flexroad.catalog import Catalog
+def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str | None = None) -> None:
+    from flexroad.catalog import Catalog, CatalogError
 
     for note in result.notes:
         echo(f"note: {note}", err=True)
+    for line in result.left_out:
+        echo(f"warning: {line}", err=True)
+    if strict and result.left_out:
+        raise CatalogError(f"{output} is not written, as files cannot be used and --strict is given")
     catalog = Catalog(result.tiles)
     catalog.write(output)
     echo(f"{count(len(catalog.tiles), 'tile')} in {output}")
+    if result.left_out:
+        echo("warning: the catalog lacks what was skipped; repair it, then repeat the command", err=True)
     echo(after_catalog(output, config))
+    if result.left_out:
+        raise typer.Exit(1)
 
 
 @catalogs.command("synthetic", cls=Command)

@@ -214,14 +214,14 @@ class RasterWriter:
         survey = zoned(date or assumed or datetime.now(UTC))
         tiles, notes = self._tiles(names, tile_size_m, survey, dataset, min_cover)
         tiles = tuple(replace(tile, datetime_assumed=date is None) for tile in tiles)
-        tiles = with_roads(tiles, self._roads, None)
+        tiles, far = with_roads(tiles, self._roads, None)
         self._replace(names)
         Catalog(tiles).write(self.out / CATALOG)
         undated = (
             f"the date of the survey is not known: {survey:%Y-%m-%d}, when its files were written, is used "
             "instead (--date sets it)"
         )
-        notes = (*self._notes, *notes, *([undated] if date is None else []))
+        notes = (*self._notes, *notes, *far, *([undated] if date is None else []))
         return PreparedDataset(self.out / CATALOG, len(tiles), notes)
 
     def _replace(self, names: list[str]) -> None:

@@ -117,7 +117,7 @@ def test_index_date_tag_in_year_of_name_is_used(tmp_path):
     assert index(tmp_path, date=datetime(2019, 5, 1)).tiles[0].datetime == datetime(2019, 5, 1, tzinfo=UTC)
 
 
-def test_index_unusable_files_are_noted(tmp_path):
+def test_index_unusable_files_are_left_out(tmp_path):
     write(tmp_path / "dom1_32_356_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     write(tmp_path / "dom1_32_400_5699_1_nw_2020.tif", heights(250, 250), WEST, NORTH)
     (tmp_path / "dgm1_32_356_5699_1_nw_2020.tif").write_bytes(b"cut short")
@@ -125,10 +125,12 @@ def test_index_unusable_files_are_noted(tmp_path):
     result = index(tmp_path)
     assert result.notes == (
         "point clouds were not read, so the reference lacks the bridges in 3dm_32_356_5699_1_nw.laz",
+        "no dgm1 file under 356000_5699750: these tiles will fail; download the terrain model as well",
+    )
+    assert result.left_out == (
         "skipped dom1_32_400_5699_1_nw_2020.tif (dsm): its centre 356125 5699875 in EPSG:25832 "
         "does not match its name; download it again",
         "skipped dgm1_32_356_5699_1_nw_2020.tif (dtm): not a raster that GDAL can read",
-        "no dgm1 file under 356000_5699750: these tiles will fail; download the terrain model as well",
     )
     assert result.tiles[0].layer("dsm").files == ("dom1_32_356_5699_1_nw_2020.tif",)
 
@@ -196,8 +198,8 @@ def test_index_cloud_without_bridges_or_broken_keeps_tile(tmp_path):
     bad = tmp_path / "3dm_32_356_5699_1_nw_2021.laz"
     bad.write_bytes(b"points")
     result = index(tmp_path, derived=tmp_path / "derived")
-    (note,) = result.notes
-    assert note.startswith(f"skipped {bad} cannot be read as a point cloud: ")
+    (line,) = result.left_out
+    assert line.startswith(f"skipped {bad} cannot be read as a point cloud: ")
     (tile,) = result.tiles
     assert tile.layer("bridges") is None
     assert load(tile, Options()).reference is None

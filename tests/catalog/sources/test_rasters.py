@@ -238,7 +238,7 @@ def test_file_without_crs_needs_option(tmp_path):
     write(tmp_path / "dsm.tif", FLAT)
     write(tmp_path / "dtm.asc", FLAT, driver="AAIGrid", crs=None)
     layers = {"dsm": "dsm.tif", "dtm": "dtm.asc"}
-    with pytest.raises(CatalogError, match=r"dtm.asc has no CRS; give it with --crs"):
+    with pytest.raises(CatalogError, match=r"skipped dtm.asc \(dtm\): it has no CRS; give it with --crs"):
         index(tmp_path, layers)
     (tile,) = index(tmp_path, layers, crs=UTM).tiles
     assert [layer.crs for layer in tile.layers] == [None, UTM]
@@ -285,7 +285,7 @@ def test_layer_in_other_crs_is_noted_for_its_tiles(tmp_path):
     )
 
 
-def test_index_broken_file_is_skipped_with_note(tmp_path):
+def test_index_broken_file_is_left_out_with_line(tmp_path):
     write(tmp_path / "dsm" / "good.tif", FLAT)
     (tmp_path / "dsm" / "broken.tif").write_bytes(b"no raster at all")
     turned = Affine.translation(295500, 5629500) @ Affine.rotation(10) @ Affine.scale(1, -1)
@@ -299,11 +299,11 @@ def test_index_broken_file_is_skipped_with_note(tmp_path):
     )
     result = index(tmp_path, {"dsm": "dsm/*.[tp][in][fg]"})
     assert files(result) == [("dsm/good.tif",)]
-    assert [note for note in result.notes if note.startswith("skipped")] == [
+    assert result.left_out == (
         "skipped dsm/bare.png (dsm): no georeference; give it a world file or `gdal_translate -a_ullr`",
         "skipped dsm/broken.tif (dsm): not a raster that GDAL can read",
         "skipped dsm/turned.tif (dsm): a rotated raster; turn it north up with gdalwarp",
-    ]
+    )
     with pytest.raises(CatalogError, match="no usable file .* skipped dsm/broken.tif"):
         index(tmp_path, {"dsm": "dsm/broken.tif"})
 
