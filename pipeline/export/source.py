@@ -132,7 +132,7 @@ class FinishedTile:
         name = self.state.nodes[stage]
         if stage not in self._results:
             stored = self.place.artefacts.find(stage, name)
-            self._results[stage] = self._computed(name) if stored is None else stored[0]
+            self._results[stage] = self._computed(name) if stored is None else stored.value
         return self._results[stage]
 
     def _computed(self, name: str) -> Any:

@@ -135,7 +135,7 @@ class Ground:
         """Return what a tile had when it was last finished, None if the store no longer has it."""
         store, nodes = ArtefactStore(self.run.store), self.run.folder(tile_id).nodes(self.variant)
         fit, segment = (store.find(stage, nodes.get(stage, "")) for stage in ("fit", "segment"))
-        return (fit[0], segment[0]) if fit and segment else None
+        return (fit.value, segment.value) if fit and segment else None
 
     def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
         evaluate = Evaluator(graph, ArtefactStore(self.run.store))

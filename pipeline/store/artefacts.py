@@ -14,7 +14,7 @@ from __future__ import annotations
 import uuid
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,11 +34,11 @@ class ArtefactStore:
 
     root: Location
 
-    def get(self, node: Node) -> tuple[Any, dict[str, float]] | None:
-        """Return a result and the seconds of each stage up to it, None if it is missing or damaged."""
+    def get(self, node: Node) -> codec.Stored | None:
+        """Return a result with the seconds and notes up to it, None if it is missing or damaged."""
         return self.find(node.stage, node.fingerprint)
 
-    def find(self, stage: str, fingerprint: str) -> tuple[Any, dict[str, float]] | None:
+    def find(self, stage: str, fingerprint: str) -> codec.Stored | None:
         """Return what `get` returns, for a node of which only stage and fingerprint are known."""
         try:
             return codec.decode(paths.read(self._path(stage, fingerprint)))
@@ -46,9 +46,9 @@ class ArtefactStore:
             # A damaged artefact counts as missing: it is computed and written again.
             return None
 
-    def put(self, node: Node, value: Any, seconds: Mapping[str, float]) -> int:
-        """Store a result and the seconds of each stage up to it; return the size in bytes."""
-        data = codec.encode(value, seconds)
+    def put(self, node: Node, value: Any, seconds: Mapping[str, float], notes: Sequence[str]) -> int:
+        """Store a result with the seconds of each stage and the notes up to it; return the size in bytes."""
+        data = codec.encode(value, seconds, notes)
         paths.write(self._path(node.stage, node.fingerprint), data)
         return len(data)
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,8 +28,18 @@ HEADER = "header.json"
 SHA256_BYTES = 32
 
 
-def encode(value: Any, seconds: Mapping[str, float]) -> bytes:
-    """Return the bytes of a result and of ``seconds``, the computing time of each stage up to it."""
+class Stored(NamedTuple):
+    """A result with what is known of its making."""
+
+    value: Any
+    seconds: dict[str, float]
+    """Computing time of each stage up to it (s)."""
+    notes: tuple[str, ...]
+    """Notes on the sources of all stages up to it."""
+
+
+def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str] = ()) -> bytes:
+    """Return the bytes of a result, of the seconds of each stage and of the notes up to it (`Stored`)."""
     arrays: dict[str, Any] = {}
     plain: dict[str, Any] = {}
     for field in fields(value):
@@ -40,14 +50,14 @@ def encode(value: Any, seconds: Mapping[str, float]) -> bytes:
             arrays[field.name] = np.asfortranarray(item) if points else item
         else:
             plain[field.name] = {"grid": asdict(item)} if isinstance(item, Grid) else item
-    header = {"type": type(value).__name__, "seconds": dict(seconds), "fields": plain}
+    header = {"type": type(value).__name__, "seconds": dict(seconds), "notes": list(notes), "fields": plain}
     arrays[HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     payload = npz(arrays)
     return payload + hashlib.sha256(payload).digest()
 
 
-def decode(data: bytes) -> tuple[Any, dict[str, float]]:
-    """Return the result and the seconds of each stage up to it.
+def decode(data: bytes) -> Stored:
+    """Return the result, the seconds of each stage and the notes up to it.
 
     Raises
     ------
@@ -61,7 +71,9 @@ def decode(data: bytes) -> tuple[Any, dict[str, float]]:
         arrays = {name: np.asarray(archive[name], order="C") for name in archive.files}
     header = json.loads(arrays.pop(HEADER).tobytes())
     plain = {name: _plain(item) for name, item in header["fields"].items()}
-    return _types()[header["type"]](**plain, **arrays), header["seconds"]
+    # Stores of earlier versions have no notes.
+    notes = tuple(header.get("notes", ()))
+    return Stored(_types()[header["type"]](**plain, **arrays), header["seconds"], notes)
 
 
 def _plain(item: Any) -> Any:

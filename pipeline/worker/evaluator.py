@@ -26,6 +26,9 @@ from flexroad.tasks.options import Options
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, Surface, TileData
 
+WITH_NOTES = ("load", "segment")
+"""Stages whose results have notes on their sources."""
+
 
 class StageError(Exception):
     """A stage failed; ``failure`` is its row in the table of failures."""
@@ -56,6 +59,8 @@ class Evaluator:
     """Results by fingerprint."""
     chain_seconds: dict[str, dict[str, float]] = field(default_factory=dict)
     """Fingerprint -> stage -> computing time (s) of the node and the nodes it depends on."""
+    notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Fingerprint -> notes on the sources of the node and of the nodes it depends on."""
     spans: defaultdict[str, StageCost] = field(default_factory=lambda: defaultdict(StageCost))
     """Cost of each stage in this process."""
     errors: dict[str, StageError] = field(default_factory=dict)
@@ -77,7 +82,7 @@ class Evaluator:
             if artefact is None:
                 self._compute(node)
             else:
-                self.results[fingerprint], self.chain_seconds[fingerprint] = artefact
+                self.results[fingerprint], self.chain_seconds[fingerprint], self.notes[fingerprint] = artefact
                 self.spans[node.stage].reused += 1
         return self.results[fingerprint]
 
@@ -97,6 +102,8 @@ class Evaluator:
         seconds = self._seconds_before(node)
         seconds[node.stage] = span.seconds - before
         self.results[node.fingerprint], self.chain_seconds[node.fingerprint] = result, seconds
+        own = result.notes if node.stage in WITH_NOTES else ()
+        self.notes[node.fingerprint] = tuple(dict.fromkeys((*self._notes_before(node), *own)))
         if node.stored and self.keep:
             self._store(node, result, seconds)
 
@@ -108,6 +115,10 @@ class Evaluator:
         if node.frame:
             seconds[STAGE] = sum(self.chain_seconds[name][STAGE] for name in node.frame)
         return seconds
+
+    def _notes_before(self, node: Node) -> tuple[str, ...]:
+        """Return the notes of the nodes before a node, each once."""
+        return tuple(dict.fromkeys(note for name in node.inputs for note in self.notes[name]))
 
     def _run_stage(self, node: Node, inputs: list[Any], frame: list[Any]) -> Any:
         try:
@@ -123,7 +134,9 @@ class Evaluator:
 
     def _store(self, node: Node, result: Any, seconds: Mapping[str, float]) -> None:
         try:
-            self.spans[node.stage].bytes += self.store.put(node, result, seconds)
+            self.spans[node.stage].bytes += self.store.put(
+                node, result, seconds, self.notes[node.fingerprint]
+            )
         except OSError as error:
             # The error names the store, not the file, so that a full disk is one failure for all variants.
             full = OSError(error.errno, error.strerror, str(self.store.root))

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from flexroad.catalog.index import item
 from flexroad.catalog.storage.paths import parse_location, stat
-from flexroad.pipeline.graph.graph import Node, TileGraph
+from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts, no_nan
@@ -128,7 +128,7 @@ def process_tile(job: TileJob) -> TileResult:
             rows.append(failed_row(graph, variant, error.failure.line))
             failures.append(error.failure)
     failures = list(dict.fromkeys(failures))
-    notes = tuple(dict.fromkeys(note for node in graph.nodes.values() for note in _notes(node, evaluator)))
+    notes = tuple(dict.fromkeys(note for name in graph.nodes for note in evaluator.notes.get(name, ())))
     entry = None
     if not failures:
         try:
@@ -205,14 +205,6 @@ def _head(graph: TileGraph, variant: str, status: Status) -> MetricsRow:
 
 def _seconds(evaluator: Evaluator) -> float:
     return sum(span.seconds for span in evaluator.spans.values())
-
-
-def _notes(node: Node, evaluator: Evaluator) -> tuple[str, ...]:
-    """Return the notes of a stage about its sources; empty if the node was not evaluated."""
-    if node.stage not in ("load", "segment") or node.fingerprint not in evaluator.results:
-        return ()
-    notes: tuple[str, ...] = evaluator.results[node.fingerprint].notes
-    return notes
 
 
 def _finish(

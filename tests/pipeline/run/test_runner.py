@@ -235,10 +235,10 @@ def test_missing_product_is_written_again(finished, executor):
 def test_full_disk_fails_tile_and_leaves_no_temporary_file(run, monkeypatch):
     put = ArtefactStore.put
 
-    def full(self, node, value, seconds):
+    def full(self, node, value, *rest):
         if node.stage == "fit" and len(list(self.root.rglob("*.npz"))) > 12:
             raise OSError(28, "No space left on device", str(self.root))
-        return put(self, node, value, seconds)
+        return put(self, node, value, *rest)
 
     monkeypatch.setattr(ArtefactStore, "put", full)
     results = results_of(run, SerialExecutor())

@@ -50,8 +50,8 @@ def test_codec_restores_every_result_exactly(evaluator):
         if node.stage == "load":
             continue
         value = evaluator(fingerprint)
-        back, seconds = codec.decode(codec.encode(value, {"fit": 0.25}))
-        assert seconds == {"fit": 0.25}
+        back, seconds, notes = codec.decode(codec.encode(value, {"fit": 0.25}, ("dsm: a note",)))
+        assert (seconds, notes) == ({"fit": 0.25}, ("dsm: a note",))
         assert type(back) is type(value)
         for field in fields(value):
             assert same(getattr(value, field.name), getattr(back, field.name)), (node.stage, field.name)
