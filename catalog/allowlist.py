@@ -9,7 +9,7 @@ from pathlib import Path
 from flexroad.catalog.headers import vrt
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.index import Catalog
-from flexroad.catalog.storage.paths import Location, normalise
+from flexroad.catalog.storage.paths import Location, resolved
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.trust import ADDRESS, AllowedFolders, full_name
 
@@ -70,7 +70,7 @@ def _outside(catalog: Catalog, allowed: AllowedFolders, layers: Collection[str])
     names = {full_name(tile.root, file) for tile, layer in _chosen(catalog, layers) for file in layer.files}
     for name in (name for file in names for name in (file, *_sources(file))):
         if not ADDRESS.match(name) and not allowed.permits(name):
-            yield normalise(name)
+            yield resolved(name)
 
 
 def _chosen(catalog: Catalog, layers: Collection[str]) -> Iterator[tuple[Tile, Layer]]:

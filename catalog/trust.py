@@ -4,8 +4,9 @@ A catalog may come from anyone, and its files are read with the user's rights. `
 its `AllowedFolders`, and `Tile.paths`, the only way to the locations of a tile's files, asks them: a command
 that reads a catalog cannot forget the check. Tiles that the program itself has just made have none.
 
-Names are compared as written, after ``..`` is resolved. Links are not followed: a folder of links to data
-elsewhere can be used. GDAL's virtual file systems (``/vsicurl/``) and web addresses are never allowed.
+Files and folders are compared with links resolved: a link in a catalog's folder that leads out of it needs
+the permission for its target. GDAL's virtual file systems (``/vsicurl/``) and web addresses are never
+allowed.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location
+from flexroad.catalog.storage.paths import Location, absolute, join, normalise, parse_location, resolved
 
 ADDRESS = re.compile(r"(?!(?i:s3):)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
 LONGEST_SHOWN = 500
@@ -38,13 +39,9 @@ class AllowedFolders:
     @classmethod
     def of(cls, home: Location | str, more: Sequence[str | Path] = ()) -> AllowedFolders:
         """Return the catalog's own folder and further ones."""
-        # The folder as given, and with links resolved.
+        # Both names are stored in a run: links may lead elsewhere on another machine.
         own = (normalise(str(home)), normalise(str(absolute(parse_location(home)))))
         return cls(str(home), tuple(dict.fromkeys((*own, *(normalise(str(folder)) for folder in more)))))
-
-    @cached_property
-    def _prefixes(self) -> tuple[str, ...]:
-        return tuple(folder.rstrip("/") + "/" for folder in self.folders)
 
     def permits(self, name: str) -> bool:
         """Return whether a file may be read.
@@ -54,7 +51,7 @@ class AllowedFolders:
         name : str
             Full path or address.
         """
-        return _permitted(name, self._prefixes)
+        return _permitted(name, self.folders)
 
     def refusal(self, subject: str, name: str, folders: Sequence[str] = ()) -> CatalogError:
         """Return the error that a file may not be read, with the options that allow it.
@@ -77,12 +74,13 @@ class AllowedFolders:
             return CatalogError(
                 f"{subject} names {name}; only files on disk and in s3:// are read: fetch it first"
             )
-        name = normalise(name)
+        name, target = normalise(name), resolved(name)
         options = " ".join(
-            f"--allow {shlex.quote(folder)}" for folder in folders or [posixpath.dirname(name)]
+            f"--allow {shlex.quote(folder)}" for folder in folders or [posixpath.dirname(target)]
         )
+        file = name if name == target else f"{name}, by a link {target}"
         return CatalogError(
-            f"{subject} names {name}, outside the catalog's folder {self.home}; to allow it, add {options}"
+            f"{subject} names {file}, outside the catalog's folder {self.home}; to allow it, add {options}"
         )
 
 
@@ -99,5 +97,10 @@ def located(name: str) -> Location:
 
 # Neighbouring tiles list the same files.
 @lru_cache(maxsize=65536)
-def _permitted(name: str, prefixes: tuple[str, ...]) -> bool:
-    return not ADDRESS.match(name) and normalise(name).startswith(prefixes)
+def _permitted(name: str, folders: tuple[str, ...]) -> bool:
+    return not ADDRESS.match(name) and resolved(name).startswith(_prefixes(folders))
+
+
+@lru_cache(maxsize=64)
+def _prefixes(folders: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(resolved(folder).rstrip("/") + "/" for folder in folders)

@@ -17,7 +17,7 @@ from typing import Any
 import rasterio
 from rasterio.errors import RasterioError
 
-from flexroad.catalog.headers.refused import Refused, head
+from flexroad.catalog.headers.refused import Refused, head, require_beside
 from flexroad.catalog.headers.vrt import sources
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 from flexroad.catalog.trust import AllowedFolders
@@ -216,13 +216,12 @@ def _side_cars(path: Path) -> list[Path]:
     Raises
     ------
     Refused
-        If one of them is not a regular file, or leads to other files.
+        If one of them is not a regular file of the raster's folder, or leads to other files.
     """
     found = [side for side in _candidates(path) if side.exists() or side.is_symlink()]
     for side in found:
         try:
-            # GDAL goes on without a side-car file that it cannot read.
-            head(side)
+            require_beside(side, path)
             _check_side_car(side)
         except FileNotFoundError:
             continue

@@ -11,13 +11,14 @@ import json
 import mmap
 import re
 import sqlite3
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 from xml.parsers import expat
 
-from flexroad.catalog.headers.refused import Refused, head
+from flexroad.catalog.headers.refused import Refused, head, require_beside
 
 UNKNOWN = (
     "is not a vector file: it is no GeoPackage, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
@@ -26,6 +27,7 @@ UNKNOWN = (
 SQLITE = b"SQLite format 3\0"
 GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
+SQLITE_PARTS = ("-wal", "-shm", "-journal")
 CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s*""", re.IGNORECASE)
 OTHER_THAN_OSM = re.compile(
     rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
@@ -59,8 +61,9 @@ def vector_name(path: Path) -> str:
         # The prefix selects the driver, so that a mark of another format in the text has no effect.
         return f"GeoJSON:{path}"
     if data.startswith(b"\0\0\x27\x0a"):
-        _require_regular_parts(path)
+        _require_own_parts(path, (path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())))
     elif data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
+        _require_own_parts(path, (path.with_name(path.name + end) for end in SQLITE_PARTS))
         _require_queries_that_end(path)
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
@@ -98,16 +101,15 @@ def _is_osm(text: bytes) -> bool:
     return names[:1] == ["osm"]
 
 
-def _require_regular_parts(path: Path) -> None:
-    for suffix in SHAPEFILE_PARTS:
-        for part in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
-            try:
-                # GDAL goes on without a part that it cannot read.
-                head(part)
-            except FileNotFoundError:
-                continue
-            except Refused as error:
-                raise Refused(f"has the part {part.name}, which {error}") from error
+def _require_own_parts(path: Path, parts: Iterable[Path]) -> None:
+    """Raise an error if a part of a file is not a regular file of its folder."""
+    for part in parts:
+        try:
+            require_beside(part, path)
+        except FileNotFoundError:
+            continue
+        except Refused as error:
+            raise Refused(f"has the part {part.name}, which {error}") from error
 
 
 def _require_no_linked_crs(path: Path) -> None:

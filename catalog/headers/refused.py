@@ -46,6 +46,21 @@ def read_through(path: Path) -> None:
             pass
 
 
+def require_beside(side: Path, path: Path) -> None:
+    """Raise an error if a file that a library opens with another one is not a regular file of its folder.
+
+    Raises
+    ------
+    Refused
+        If it is no regular file, or a link to another folder than that of the other file.
+    OSError
+        If it does not exist, or cannot be read: the library would go on without it.
+    """
+    if side.is_symlink() and side.resolve().parent not in (path.resolve().parent, path.parent.resolve()):
+        raise Refused("is a link to another folder; replace it by the file")
+    head(side)
+
+
 def require_regular(path: Path) -> None:
     """Raise an error if a path is not a regular file.
 

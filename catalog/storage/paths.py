@@ -16,6 +16,7 @@ import os
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -107,6 +108,24 @@ def normalise(name: str) -> str:
     if bucket is None:
         return os.path.normpath(name if name.startswith("/") else Path(name).absolute())
     return "s3:/" + os.path.normpath("/" + name[bucket.end() :])
+
+
+def resolved(name: str) -> str:
+    """Return an absolute path with links resolved, or an address without ``..``.
+
+    The links of a folder are read once, those of a file each time.
+    """
+    if _BUCKET.match(name) or "\0" in name:
+        return normalise(name)
+    folder, file = os.path.split(name if name.startswith("/") else f"{Path.cwd()}/{name}")
+    if file in ("", ".", "..") or os.path.islink(name):  # noqa: PTH114 (Path is slow)
+        return os.path.realpath(name)
+    return _resolved_folder(folder).rstrip("/") + "/" + file
+
+
+@lru_cache(maxsize=4096)
+def _resolved_folder(folder: str) -> str:
+    return os.path.realpath(folder)
 
 
 def gdal_name(where: Location) -> str:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import product
 
 import pytest
 
@@ -9,6 +10,9 @@ from flexroad.catalog import Catalog, CatalogError, Grid, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed, needed
 from flexroad.catalog.tile import LAYERS
 from flexroad.catalog.trust import AllowedFolders
+
+VRT = """<VRTDataset rasterXSize="1" rasterYSize="1"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">b.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
 def catalog(*files, root) -> Catalog:
@@ -79,16 +83,60 @@ def test_root_in_catalog_does_not_allow_files(tmp_path):
         check(catalog("passwd", root="/etc"), tmp_path)
 
 
-def test_folder_of_links_is_allowed(tmp_path):
+@pytest.mark.parametrize("file", ["dsm/a.tif", "link.tif", "dsm/../data/a.tif", "link.vrt"])
+def test_link_in_folder_that_leads_out_needs_allow(tmp_path, file):
     data, home = tmp_path / "data", tmp_path / "home"
     data.mkdir()
     home.mkdir()
+    for name in ("a.tif", "a.vrt"):
+        (data / name).write_text(VRT)
     (home / "dsm").symlink_to(data)
-    check(catalog("dsm/a.tif", root=home), home)
-    # The catalog's folder may be given by either name.
+    (home / "link.tif").symlink_to(data / "a.tif")
+    (home / "link.vrt").symlink_to(data / "a.vrt")
+    tile_catalog = catalog("inside.tif", file, root=home)
+    target = data / file.rpartition("/")[2].replace("link", "a")
+    line = f"^tile one: dsm names .*, by a link {target}, outside .*; to allow it, add --allow {data}$"
+    with pytest.raises(CatalogError, match=line):
+        check(tile_catalog, home)
+    assert needed(tile_catalog, home) == (str(data),)
+    # The folder to allow may be named by a link, too.
+    (tmp_path / "alias of data").symlink_to(data)
+    for folder in (data, tmp_path / "alias of data"):
+        check(tile_catalog, home, [folder])
+
+
+def test_vrt_of_a_link_that_leads_out_needs_allow(tmp_path):
+    data, home = tmp_path / "data", tmp_path / "home"
+    data.mkdir()
+    home.mkdir()
+    (home / "a.vrt").write_text(VRT)
+    (home / "b.tif").symlink_to(data / "b.tif")
+    with pytest.raises(CatalogError, match=f"a.vrt names {home}/b.tif, by a link {data}/b.tif, outside"):
+        check(catalog("a.vrt", root=home), home)
+    check(catalog("a.vrt", root=home), home, [data])
+
+
+def test_folder_given_by_a_link_is_the_folder_itself(tmp_path):
+    home = tmp_path / "disk" / "home"
+    home.mkdir(parents=True)
+    (home / "a.tif").touch()
+    (home / "b.tif").symlink_to("a.tif")
     (tmp_path / "alias").symlink_to(home)
-    check(catalog("dsm/a.tif", root=home), tmp_path / "alias")
-    check(catalog(f"{tmp_path}/alias/dsm/a.tif", root=home), tmp_path / "alias")
+    (tmp_path / "mounted").symlink_to(tmp_path / "disk")
+    names = [home, tmp_path / "alias", tmp_path / "mounted" / "home"]
+    for given, root in product(names, names):
+        check(catalog("a.tif", "b.tif", f"{root}/a.tif", root=root), given)
+
+
+def test_paths_of_links_are_checked_before_they_are_read(tmp_path):
+    path = tmp_path / "home" / "catalog.json"
+    catalog("a.tif", root=path.parent).write(path)
+    secret = tmp_path / "secret.tif"
+    secret.touch()
+    (path.parent / "a.tif").symlink_to(secret)
+    (tile,) = Catalog.read(path).tiles
+    with pytest.raises(CatalogError, match=f"by a link {secret}, outside .* --allow {tmp_path}"):
+        tile.paths(tile.layers[0])
 
 
 @pytest.mark.slow

@@ -206,6 +206,24 @@ def test_only_regular_files_are_opened(tmp_path, kind, name):
     check_refused(tmp_path / "m.vrt", "is a VRT of .*a.tif, which .*is not a regular file")
 
 
+@pytest.mark.parametrize("name", ["a.tif.aux.xml", "a.tfw", "a.tif.ovr", "a.prj"])
+def test_side_car_is_no_link_to_another_folder(tmp_path, name):
+    path = write(tmp_path / "home" / "a.tif", FLAT)
+    secret = write(tmp_path / "secret.tif", FLAT)
+    (path.parent / name).symlink_to(secret)
+    check_refused(path, f"has the side-car file {name}, which is a link to another folder")
+
+
+def test_side_car_of_a_folder_of_links_is_used(tmp_path):
+    path = write(tmp_path / "a.tif", FLAT, crs=None)
+    path.with_name("a.tif.aux.xml").write_text(f"<PAMDataset><SRS>{UTM}</SRS></PAMDataset>")
+    (tmp_path / "home").mkdir()
+    for name in ("a.tif", "a.tif.aux.xml"):
+        (tmp_path / "home" / name).symlink_to(tmp_path / name)
+    with open_raster(tmp_path / "home" / "a.tif") as src:
+        assert src.crs == UTM
+
+
 def test_missing_file_is_told_from_a_refused_one(tmp_path):
     with pytest.raises(FileNotFoundError):
         read(tmp_path / "a.tif")

@@ -131,6 +131,26 @@ def test_only_regular_files_are_opened(tmp_path):
         vector_name(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [("roads.shp", "roads.dbf"), ("roads.gpkg", "roads.gpkg-wal"), ("roads.shp", "roads.cpg")],
+)
+def test_part_is_no_link_to_another_folder(tmp_path, name, part):
+    path = tmp_path / "home" / name
+    path.parent.mkdir()
+    geopandas.GeoDataFrame(geometry=[LineString([(0, 0), (9, 9)])], crs=UTM).to_file(path)
+    (path.parent / part).unlink(missing_ok=True)
+    (tmp_path / part).write_bytes(b"secret")
+    (path.parent / part).symlink_to(tmp_path / part)
+    with pytest.raises(Refused, match=f"has the part {part}, which is a link to another folder"):
+        vector_name(path)
+    # A folder of links to the files of another folder.
+    (tmp_path / "links").mkdir()
+    for file in path.parent.iterdir():
+        file.unlink() if file.is_symlink() else (tmp_path / "links" / file.name).symlink_to(file)
+    assert vector_name(tmp_path / "links" / name)
+
+
 def test_path_that_gdal_would_divide_is_refused(tmp_path):
     path = tmp_path / "a!b.geojson"
     path.write_text(json.dumps(ROADS))
