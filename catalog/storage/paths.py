@@ -169,8 +169,8 @@ def listing(folder: Location) -> dict[str, FileStat]:
 def entries(folder: Location) -> Iterator[tuple[str, FileStat]]:
     """Yield relative name and stat of all files below a folder; none if it does not exist.
 
-    In a bucket, files come in the order of their names, in pages of a thousand: memory does not grow with
-    their number.
+    Links to folders inside it are not followed. In a bucket, files come in the order of their names, in pages
+    of a thousand: memory does not grow with their number.
 
     Raises
     ------
@@ -345,9 +345,9 @@ def _scan(folder: Path, prefix: str) -> Iterator[tuple[str, FileStat]]:
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         for entry in entries:
             name = prefix + entry.name
-            if entry.is_dir():
+            if entry.is_dir(follow_symlinks=False):
                 yield from _scan(folder / entry.name, name + "/")
-            else:
+            elif not entry.is_dir():
                 with contextlib.suppress(FileNotFoundError):
                     stats = entry.stat()
                     yield name, FileStat(stats.st_size, stats.st_mtime_ns)

@@ -28,6 +28,7 @@ def clean(
     """
     from flexroad.catalog.storage.paths import absolute, parse_location
     from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
+    from flexroad.pipeline.run.folder import check_links
     from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
     from flexroad.pipeline.run.lock import run_lock
     from flexroad.pipeline.run.record import Run
@@ -37,6 +38,7 @@ def clean(
         echo(f"note: {line}", err=True)
 
     location, forgotten = parse_location(path), [absolute(parse_location(text)) for text in forget or ()]
+    check_links(location)
     with run_lock(location, say):
         run = Run.open(location, allow or ())
         users = {str(user) for user in runs_using(run.store)}

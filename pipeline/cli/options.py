@@ -130,6 +130,15 @@ Settings = Annotated[
         rich_help_panel=INPUTS,
     ),
 ]
+WorkerSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Option of the workers for this command: cluster.memory='8 GiB'; repeatable.",
+        rich_help_panel=WORK,
+    ),
+]
 
 
 def read_area(path: Path | None, layer: str | None) -> CatalogArea | None:

@@ -155,6 +155,7 @@ def rerun(
             rich_help_panel=options.TILES,
         ),
     ] = None,
+    settings: options.WorkerSettings = None,
     allow: options.Allow = None,
     verify: options.Verify = False,
     executor: options.RunExecutor = "auto",
@@ -175,6 +176,7 @@ def rerun(
     from flexroad.pipeline.graph.stages import STAGE_NAMES
     from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.run.selection import rerun_filter
+    from flexroad.pipeline.run.workers import with_workers
 
     location = parse_location(path)
     with report_outcome(location, on_failure, prometheus) as outcome:
@@ -184,7 +186,7 @@ def rerun(
         force |= {BORDER} if "fit" in force else frozenset()
         with _locked(location) as died:
             with _named(f"reading {path}"):
-                opened = Run.open(location, allow or ())
+                opened = with_workers(Run.open(location, allow or ()), settings or ())
                 check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
             config = opened.config
@@ -214,7 +216,7 @@ def _locked(path: Location, create: bool = False) -> Iterator[bool]:
     Yields whether the process that held the lock before has died: one of the tiles may have ended it.
     """
     from flexroad.catalog.storage.outputs import made_folder
-    from flexroad.pipeline.run.folder import check_folder
+    from flexroad.pipeline.run.folder import check_folder, check_links
     from flexroad.pipeline.run.lock import run_lock
 
     taken_over: list[str] = []
@@ -233,6 +235,8 @@ def _locked(path: Location, create: bool = False) -> Iterator[bool]:
                     raise ConfigError(
                         f"cannot write the run to {path}: {error}; choose another --out"
                     ) from error
+        else:
+            check_links(path)
         stack.enter_context(run_lock(path, notify))
         yield bool(taken_over)
 

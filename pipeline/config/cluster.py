@@ -5,7 +5,7 @@ It does not affect results: it is not part of any fingerprint, and a file that e
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, get_origin
 
 from pydantic import ByteSize, Field
 
@@ -73,3 +73,11 @@ class Cluster(Options):
         """Whether tiles run on workers only: on other machines, or within limits of memory and time."""
         limited = self.memory is not None or self.tile_timeout_s != DEFAULT_TIMEOUT_S
         return limited or self.kind != "local"
+
+    @property
+    def programs(self) -> dict[str, Any]:
+        """The given options that can start programs: those of free text, in a job's script or a pod."""
+        fields = type(self).model_fields.items()
+        texts = {name for name, field in fields if get_origin(field.annotation) is not Literal}
+        given = self.model_dump(mode="json", include=texts, exclude_defaults=True).items()
+        return {name: value for name, value in given if not isinstance(value, int | float)}

@@ -102,7 +102,7 @@ class RunPlace:
 
     def marker(self, tile_id: str) -> MarkerStat | None:
         """Return name, size and version of the marker of a finished tile, None if there is none."""
-        file = stat(self._folder(tile_id).path / DONE)
+        file = stat(self._folder(tile_id).file(DONE))
         return (DONE, file.size, file.version) if file else None
 
     def graph(self, tile: Tile, state: TileState) -> TileGraph:
@@ -124,7 +124,7 @@ class RunPlace:
 
     def _recorded(self, tile_id: str) -> list[object]:
         try:
-            content = checked_json.loads(read(self._folder(tile_id).path / DONE))
+            content = checked_json.loads(read(self._folder(tile_id).file(DONE)))
             return from_item(content, None).sources
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return []

@@ -173,7 +173,7 @@ def leaf_piece(leaf: Leaf, place: Place) -> Piece:
 def _glb(leaf: Leaf, place: Place, texture: TileTexture) -> bytes:
     """Return the GLB file of the run, or a new one if the run has none that fits."""
     tile = leaf.tile
-    file = TileProducts.of(parse_location(place.run), tile.id).path / file_name(tile.id, tile.variant, GLB)
+    file = TileProducts.of(parse_location(place.run), tile.id).file(file_name(tile.id, tile.variant, GLB))
     if (leaf.own or not texture.image) and exists(file):
         data = read(file)
         tile.check_unchanged()

@@ -21,6 +21,7 @@ from flexroad.pipeline.export.pieces import write_pieces
 from flexroad.pipeline.export.source import FinishedTile
 from flexroad.pipeline.export.states import RunPlace, tile_states
 from flexroad.pipeline.export.viewer_tile import Look, Shown, piece
+from flexroad.pipeline.run.folder import check_links
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
 from flexroad.tasks.export import glb, viewer
@@ -146,8 +147,8 @@ def _claim(out: Location, run: Run) -> None:
     Raises
     ------
     ConfigError
-        If the folder is the run, its store or one of their folders, has files of others, or is the viewer of
-        another run.
+        If the folder is the run, its store or one of their folders, has files of others or links that lead
+        out of it, or is the viewer of another run.
     """
     for place in (run.path, run.store, run.path / "tiles"):
         if absolute(out) == absolute(place) or absolute(out) in absolute(place).parents:
@@ -167,6 +168,7 @@ def _claim(out: Location, run: Run) -> None:
         raise ConfigError(
             f"{out} has files that are not of a viewer, such as {other}; choose another folder with -o"
         )
+    check_links(out, below=True)
     write(out / OWNER, own.encode())
     remove(out / PAGE)
 

@@ -15,6 +15,7 @@ from flexroad.catalog import Bounds, Grid, Tile
 from flexroad.catalog.crs import same
 from flexroad.catalog.grid import LATTICE_TOLERANCE
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import absolute, parse_location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute.lazy import lazy_raster
@@ -86,7 +87,7 @@ class Mosaic:
         for (top, bottom, left, right, status), tile in zip(spans, near, strict=True):
             if not status.done:
                 continue
-            stem = str(absolute(run.folder(tile.id).path) / f"{safe_name(tile.id)}_{variant}")
+            stem = str(absolute(run.path) / "tiles" / safe_name(tile.id) / f"{safe_name(tile.id)}_{variant}")
             for i in _between(rows, top, bottom):
                 for j in _between(columns, left, right):
                     size = rows[i + 1] - rows[i], columns[j + 1] - columns[j]
@@ -154,6 +155,7 @@ def _read(source: tuple[Window, str]) -> NDArray[Any]:
 
     window, suffix = source
     path = parse_location(window.stem + suffix)
+    file = contained(path, path.parents[2])
     part = windows.Window(window.column, window.row, window.width, window.height)
-    values: NDArray[Any] = read_raster(path, path.name, lambda raster: raster.read(1, window=part))
+    values: NDArray[Any] = read_raster(file, path.name, lambda raster: raster.read(1, window=part))
     return values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.paths import Location, entries, exists, visible_entry
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -10,8 +11,38 @@ from flexroad.pipeline.run.lock import NAME as LOCK
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store.records import DONE, FAILED
 
+STORE = "store"
 RECORD = "run.json"
 """The first file of a run: a folder that has it is a run, also if it is not whole."""
+
+
+def check_links(path: Location, below: bool = False) -> None:
+    """Check that no file or folder of a run is a link that leads out of the run.
+
+    A run may come from anyone, and what is read, written or deleted behind such a link would not be the
+    run's. Tiles and artefacts are checked when they are used (`contained`).
+
+    Parameters
+    ----------
+    path : Location
+        The run's folder, or a folder in it; itself it may be a link.
+    below : bool
+        Whether folders inside it are searched, too.
+
+    Raises
+    ------
+    ConfigError
+        If there is one, or the folder cannot be read.
+    """
+    try:
+        link = next(links_out(path, below), None)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror or error}; correct that") from error
+    if link is not None:
+        remedy = f"move the files to {link}"
+        if link.name == STORE:
+            remedy += f", or give their folder with --store {link.resolve()}, without the link"
+        raise ConfigError(f"{link} is a link that leads out of {path}, to {link.resolve()}; {remedy}")
 
 
 def check_folder(path: Location) -> None:
@@ -20,7 +51,7 @@ def check_folder(path: Location) -> None:
     Raises
     ------
     ConfigError
-        If the folder has other files and is no run, or cannot be read.
+        If the folder has other files and is no run, or cannot be read, or `check_links` raises.
     """
     try:
         other = None if exists(path / RECORD) else visible_entry(path, {LOCK, LOG})
@@ -32,6 +63,7 @@ def check_folder(path: Location) -> None:
         raise ConfigError(
             f"{path} has other files, such as {other}, and is no run; choose an empty or new one with --out"
         )
+    check_links(path)
 
 
 def _has_results(path: Location) -> bool:

@@ -20,7 +20,7 @@ from flexroad.catalog.storage.paths import Location, absolute, entries, exists, 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.run.folder import RECORD
+from flexroad.pipeline.run.folder import RECORD, check_links
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
@@ -68,7 +68,8 @@ def exclusive(
     Raises
     ------
     ConfigError
-        If another run is active or cannot be read, so that its needed files are unknown.
+        If another run is active or cannot be read, so that its needed files are unknown, or has a link that
+        leads out of it.
     """
     with contextlib.ExitStack() as stack:
         runs = [run]
@@ -76,6 +77,7 @@ def exclusive(
             remedy = f"restore it, or `flexroad clean {run.path} --forget {path}` if it no longer exists"
             if not exists(path / RECORD):
                 raise ConfigError(f"{path} uses the store {run.store}, but is missing; {remedy}")
+            check_links(path)
             stack.enter_context(run_lock(path, notify))
             try:
                 runs.append(Run.open(path, allow))
@@ -189,11 +191,14 @@ def _temporary(folder: Location, files: dict[str, int]) -> Iterator[Garbage]:
 
 
 def _folders(parent: Location) -> Iterator[tuple[Location, dict[str, int]]]:
-    """Yield the folders directly below ``parent`` with the sizes of their files (bytes) by name."""
+    """Yield the folders directly below ``parent`` with the sizes of their files (bytes) by name.
+
+    Links are not followed: what they lead to need not be of the run.
+    """
     if isinstance(parent, Path):
-        names = sorted(path.name for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
-        for name in names:
-            yield parent / name, {file: stat.size for file, stat in listing(parent / name).items()}
+        for path in sorted(parent.iterdir()) if parent.is_dir() and not parent.is_symlink() else []:
+            if path.is_dir() and not path.is_symlink():
+                yield path, {file: stat.size for file, stat in listing(path).items()}
         return
     parts = ((name.partition("/"), file.size) for name, file in entries(parent))
     # The files of a folder follow each other.

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,6 +41,7 @@ from flexroad.catalog.storage.paths import (
     stat,
     write,
 )
+from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
@@ -48,7 +50,7 @@ from flexroad.pipeline.graph.graph import Pattern, TileGraph
 from flexroad.pipeline.graph.layers import check_layers
 from flexroad.pipeline.graph.sources import Recorded, Stat
 from flexroad.pipeline.graph.stages import model_files
-from flexroad.pipeline.run.folder import RECORD, check_folder
+from flexroad.pipeline.run.folder import RECORD, check_folder, check_links
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
@@ -80,6 +82,8 @@ class Run:
     """Variants exported by this or an earlier configuration of the run."""
     collection: str = ""
     """Id of the run's STAC collection: the name of its folder when it was made."""
+    programs_sealed: bool = True
+    """Whether this user has given the options of its workers that can start programs (`Cluster.programs`)."""
 
     @classmethod
     def create(
@@ -126,7 +130,8 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder has files of others (`check_folder`), no tile can be used, or `check_inputs` raises.
+            If the folder has files of others (`check_folder`), no tile can be used, its store was not given
+            by this user, or `check_inputs` raises.
         """
         check_folder(path)
         if not catalog.usable:
@@ -135,7 +140,7 @@ class Run:
         old = _record(path)
         # Existing meshes are relative to the earlier origin, which the last summary contains, too.
         origin = (old or read_summary(path)).get("origin") or _origin(catalog)
-        store = store or (parse_location(old["store"]) if old and old["shared_store"] else path / "store")
+        store = store or _store(old, path, "--store")
         exported = _exported(old, config)
         origin = (origin[0], origin[1])
         folders, collection = folders_of(catalog), _collection(old, path)
@@ -149,23 +154,25 @@ class Run:
         ----------
         path : Location or str
         allow : sequence of str or Path
-            Folders and addresses that sources may lie below, besides the run's own folder and those that the
-            user allowed when the run was made (`flexroad.pipeline.run.seal`).
+            Folders and addresses that sources and the store may lie below, besides the run's own folder and
+            those that the user gave when the run was made (`flexroad.pipeline.run.seal`).
 
         Raises
         ------
         ConfigError
-            If the folder is no run, or its configuration is invalid.
+            If the folder is no run, its configuration is invalid, its store lies outside and is neither
+            sealed nor in ``allow``, or `check_links` raises.
         CatalogError
             If its catalog is damaged.
         """
         path = parse_location(path)
+        check_links(path)
         record = _record(path)
         if record is None:
             raise ConfigError(
                 f"{path} is no run: run.json is missing or damaged; make one with `flexroad run --out {path}`"
             )
-        store = parse_location(record["store"]) if record["shared_store"] else path / "store"
+        store = _store(record, path, "--allow", allow)
         config = _config(path / "config.yaml").model_copy(update={"name": record["config"]})
         listed = record.get("allowed", [])
         allowed = tuple(listed) if sealed(listed, record.get("seal")) else ()
@@ -182,6 +189,7 @@ class Run:
             allowed,
             _exported(record, config),
             _collection(record, path),
+            sealed(config.cluster.programs, record.get("programs_seal")),
         )
 
     @cached_property
@@ -225,6 +233,8 @@ class Run:
             "versions": self.versions,
             "allowed": list(self.allowed),
             "seal": seal(self.allowed),
+            "store_seal": seal({"store": str(absolute(self.store))}),
+            "programs_seal": seal(self.config.cluster.programs),
             "exported": list(self.exported),
             "collection": self.collection,
         }
@@ -288,6 +298,20 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             by_name[package] = "not installed"
     return by_name
+
+
+def _store(record: dict[str, Any] | None, run: Location, option: str, allow: Sequence[Any] = ()) -> Location:
+    """Return the store of a run; one outside its folder must be sealed or allowed (`option`)."""
+    if record is None or not record["shared_store"]:
+        return run / "store"
+    named = str(record["store"])
+    permitted = AllowedFolders.of(run, allow).permits(f"{named}/{RECORD}")
+    if not permitted and not sealed({"store": named}, record.get("store_seal")):
+        raise ConfigError(
+            f"{run} has its store in {named}, which this user has not given on this machine; if it is right, "
+            f"add {option} {shlex.quote(named)}"
+        )
+    return parse_location(named)
 
 
 def _origin(catalog: Catalog) -> tuple[float, float]:

@@ -1,8 +1,9 @@
-"""The seal of a run's allowed folders: shows that this user gave them, on this machine.
+"""Seals of what a run may do outside its folder: they show that this user gave it, on this machine.
 
-``RUN/run.json`` holds the folders that the user allowed when the run was made. A run folder may come from
-anyone, like a catalog, and whoever wrote it could have written any list. So the list is sealed with a secret
-key of the user, and a list without the right seal allows nothing. The key is made on first use and lies in
+``RUN/run.json`` holds the folders that the user allowed when the run was made, and the shared store;
+``RUN/config.yaml`` the options of workers that can start programs. A run folder may come from anyone, like a
+catalog, and whoever wrote it could have written anything. So these values are sealed with a secret key of the
+user, and without the right seal they do not count. The key is made on first use and lies in
 ``$XDG_STATE_HOME/flexroad/key``, by default ``~/.local/state/flexroad/key``.
 """
 
@@ -14,30 +15,32 @@ import hmac
 import json
 import os
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from flexroad.catalog.storage.paths import flush_names
 
 KEY_BYTES = 32
 
 
-def seal(allowed: Sequence[str]) -> str:
-    """Return the seal of a list of folders; empty if the user has no key and none can be written."""
+def seal(values: Sequence[str] | Mapping[str, Any]) -> str:
+    """Return the seal of a list of folders or of named values; empty if no key can be read or written."""
     key = _key() or _new_key()
-    return _digest(key, allowed) if key else ""
+    return _digest(key, values) if key else ""
 
 
-def sealed(allowed: object, text: object) -> bool:
-    """Return whether a text is the seal of a list of folders."""
+def sealed(values: object, text: object) -> bool:
+    """Return whether a text is the seal of a list of folders or of named values."""
     key = _key()
-    if not key or not isinstance(allowed, list) or not isinstance(text, str):
+    if not key or not isinstance(values, list | dict) or not isinstance(text, str):
         return False
-    return hmac.compare_digest(_digest(key, allowed).encode(), text.encode())
+    return hmac.compare_digest(_digest(key, values).encode(), text.encode())
 
 
-def _digest(key: bytes, allowed: Sequence[str]) -> str:
-    return hmac.new(key, json.dumps(list(allowed)).encode(), hashlib.sha256).hexdigest()
+def _digest(key: bytes, values: Sequence[str] | Mapping[str, Any]) -> str:
+    content = dict(values) if isinstance(values, Mapping) else list(values)
+    return hmac.new(key, json.dumps(content, sort_keys=True).encode(), hashlib.sha256).hexdigest()
 
 
 def _path() -> Path:

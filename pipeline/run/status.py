@@ -18,7 +18,7 @@ from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.listed_files import ListedFiles
-from flexroad.catalog.storage.paths import FileStat, Location, entries, listing, read, refresh
+from flexroad.catalog.storage.paths import FileStat, Location, entries, read, refresh
 from flexroad.pipeline.graph.graph import TileGraph, any_file_missing
 from flexroad.pipeline.graph.sources import Stat
 from flexroad.pipeline.run.lock import Owner, owner
@@ -82,8 +82,8 @@ class Folders:
 
     def __call__(self, tile_id: str) -> dict[str, FileStat]:
         """Return the files of a tile by name."""
-        folder = TileProducts.of(self.run, tile_id).path
-        return listing(folder) if isinstance(folder, Path) else self._listed.files(folder.name)
+        folder = TileProducts.of(self.run, tile_id)
+        return folder.files() if isinstance(folder.path, Path) else self._listed.files(folder.path.name)
 
     @cached_property
     def _listed(self) -> ListedFiles:
@@ -118,7 +118,7 @@ def _status(
     run: Run, tile: Tile, entry: TileRecord | None, files: dict[str, FileStat], stat_file: Stat
 ) -> TileStatus:
     """Return the state of one tile that has this entry in the database and whose folder has ``files``."""
-    record = _last_record(run.folder(tile.id).path, entry, files)
+    record = _last_record(run.folder(tile.id), entry, files)
     graph = run.graph(tile, stat_file)
     current, from_marker = _matches(record, graph, files), record is not entry
     if record is None or current or not any_file_missing(graph):
@@ -127,7 +127,9 @@ def _status(
     return TileStatus(graph, record, _matches(record, graph, files), False, from_marker)
 
 
-def _last_record(folder: Location, entry: TileRecord | None, files: dict[str, FileStat]) -> TileRecord | None:
+def _last_record(
+    folder: TileProducts, entry: TileRecord | None, files: dict[str, FileStat]
+) -> TileRecord | None:
     """Return a tile's last record: the database entry if it is of the current marker, else the marker's."""
     name = DONE if DONE in files else FAILED if FAILED in files else None
     if name is None:
@@ -137,9 +139,9 @@ def _last_record(folder: Location, entry: TileRecord | None, files: dict[str, Fi
     return entry if entry and entry.marker == marker else _from_marker(folder, marker)
 
 
-def _from_marker(folder: Location, marker: MarkerStat) -> TileRecord | None:
+def _from_marker(folder: TileProducts, marker: MarkerStat) -> TileRecord | None:
     try:
-        content = checked_json.loads(read(folder / marker[0]))
+        content = checked_json.loads(read(folder.file(marker[0])))
         return (from_item if marker[0] == DONE else from_failed)(content, marker)
     except DAMAGED:
         return None
@@ -186,8 +188,8 @@ def open_database(run: Run, write: bool = False) -> RunDatabase:
 
 
 def _read_marker(run: Run, tile_id: str) -> TileRecord | None:
-    folder = run.folder(tile_id).path
-    return _last_record(folder, None, listing(folder))
+    folder = run.folder(tile_id)
+    return _last_record(folder, None, folder.files())
 
 
 def tile_states(

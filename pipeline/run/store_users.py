@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 
+from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import (
     Location,
     absolute,
@@ -45,7 +46,7 @@ def runs_using(store: Location) -> Iterator[Location]:
     # A store in a run's folder belongs to that run.
     if exists(store.parent / "run.json"):
         yield absolute(store.parent)
-    for name in sorted(listing(store / FOLDER)):
+    for name in sorted(listing(contained(store / FOLDER, store))):
         if name.endswith(".json") and not name.startswith("."):
             yield parse_location(json.loads(read(store / FOLDER / name))["run"])
 
@@ -60,4 +61,4 @@ def unregister(store: Location, run: Location) -> bool:
 
 def _entry(store: Location, run: Location) -> Location:
     name = hashlib.sha256(str(absolute(run)).encode()).hexdigest()[:16]
-    return store / FOLDER / f"{name}.json"
+    return contained(store / FOLDER / f"{name}.json", store)

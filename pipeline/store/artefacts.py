@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexroad.catalog.storage import paths
+from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
@@ -54,10 +55,15 @@ class ArtefactStore:
 
     def has(self, node: Node) -> bool:
         """Return whether the artefact exists; its content is not checked."""
-        return paths.exists(self._path(node.stage, node.fingerprint))
+        try:
+            return paths.exists(self._path(node.stage, node.fingerprint))
+        except OSError:
+            # To store it then raises the error.
+            return False
 
     def _path(self, stage: str, fingerprint: str) -> Location:
-        return self.root / stage / fingerprint[:2] / f"{fingerprint}.npz"
+        """Return the file of an artefact; OSError if it lies behind a link that leads out of the store."""
+        return contained(self.root / stage / fingerprint[:2] / f"{fingerprint}.npz", self.root)
 
 
 def probe_name() -> str:

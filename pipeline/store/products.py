@@ -6,11 +6,13 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.links import contained
+from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store import checked_json
 
@@ -26,6 +28,21 @@ class TileProducts:
         """Return the tile's folder in a run."""
         return cls(run / "tiles" / safe_name(tile_id))
 
+    def file(self, name: str) -> Location:
+        """Return a file of the folder.
+
+        Raises
+        ------
+        OSError
+            If it lies behind a link that leads out of the run.
+        """
+        return contained(self.path / name, self.path.parent.parent)
+
+    def files(self) -> dict[str, FileStat]:
+        """Return the files of the folder by name; none if it is a link."""
+        linked = isinstance(self.path, Path) and self.path.is_symlink()
+        return {} if linked else paths.listing(self.path)
+
     def done(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return the tile's item, None unless it has the graph's fingerprint and all products exist."""
         item = self._read("item.json")
@@ -34,7 +51,7 @@ class TileProducts:
                 return None
             # A marker without rows is damaged.
             iter(item["properties"]["flexroad:rows"])
-            files = paths.listing(self.path)
+            files = self.files()
             complete = all(
                 files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values()
             )
@@ -55,7 +72,7 @@ class TileProducts:
         item = self._read("item.json") or {}
         try:
             return all(
-                _checksum(paths.read(self.path / asset["href"])) == asset["file:checksum"]
+                _checksum(paths.read(self.file(asset["href"]))) == asset["file:checksum"]
                 for asset in item["assets"].values()
             )
         except (OSError, KeyError, TypeError, AttributeError):
@@ -69,7 +86,7 @@ class TileProducts:
         """
         self._unmark(flushed)
         for name, data in products.items():
-            paths.write(self.path / name, data)
+            paths.write(self.file(name), data)
         if flushed:
             # Together they take hardly longer than one.
             for name in products:
@@ -77,7 +94,7 @@ class TileProducts:
             # Otherwise a new item could meet an old product of the same size.
             paths.flush_names(self.path)
         self._mark("item.json", item, flushed)
-        paths.remove(self.path / "failed.json")
+        paths.remove(self.file("failed.json"))
 
     def fail(self, failure: dict[str, Any], flushed: bool = False) -> None:
         """Write failed.json and remove the item, so that the tile no longer counts as done.
@@ -89,19 +106,19 @@ class TileProducts:
 
     def _unmark(self, flushed: bool) -> None:
         """Remove the item; with ``flushed`` it is not back after a power failure."""
-        paths.remove(self.path / "item.json")
+        paths.remove(self.file("item.json"))
         if flushed:
             paths.flush_names(self.path)
 
     def _mark(self, name: str, content: dict[str, Any], flushed: bool) -> None:
-        paths.write(self.path / name, checked_json.dumps(content), flushed)
+        paths.write(self.file(name), checked_json.dumps(content), flushed)
         if flushed:
             # The tile's folder and the folder of all tiles may be new.
             paths.flush_names(self.path, self.path.parent, self.path.parent.parent)
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
-            return checked_json.loads(paths.read(self.path / name))
+            return checked_json.loads(paths.read(self.file(name)))
         except (OSError, ValueError):
             return None
 

@@ -334,9 +334,7 @@ def test_run_folder_read_only_midway_keeps_done_tiles(part, night, before_tile, 
 
 
 def test_run_log_not_writable_completes(night, undisturbed, out):
-    out.mkdir()
-    # /dev/full rejects every write, as a full disk does.
-    (out / "log.jsonl").symlink_to("/dev/full")
+    (out / "log.jsonl").mkdir(parents=True)
     assert night().code == 0
     assert_whole(out, undisturbed)
 

@@ -1,8 +1,13 @@
 """The folders that a run may read hold only with the seal of the user's key."""
 
+import json
+import shlex
+
 import pytest
+import yaml
 
 from flexroad.catalog import Catalog, CatalogError
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.store import checked_json
@@ -32,6 +37,84 @@ def test_seal_holds_for_its_list_and_its_user(home, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(home / "of another user"))
     assert not sealed(allowed, text)
     assert seal(allowed) != text
+
+
+def test_seal_of_named_values_holds_for_them_alone():
+    values = {"prologue": ["module load gdal"], "queue": "long"}
+    text = seal(values)
+    assert sealed(dict(reversed(values.items())), text)
+    for other in ({}, {"prologue": ["module load gdal"]}, values | {"queue": "short"}, list(values)):
+        assert not sealed(other, text)
+    assert not sealed(["prologue"], seal({"prologue": []}))
+
+
+PROGRAMS = {
+    "prologue": ["touch {mark}"],
+    "job_extra": ["--comment x\ntouch {mark}"],
+    "queue": "x\ntouch {mark}",
+    "image": "registry/other",
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_programs_of_a_changed_configuration_need_to_be_given_again(
+    name, flexroad, survey, quick_config, tmp_path
+):
+    run = tmp_path / "run"
+    Run.create(run, *_settings(survey, quick_config))
+    value = json.loads(json.dumps(PROGRAMS[name]).replace("{mark}", str(tmp_path / "mark")))
+    config = yaml.safe_load((run / "config.yaml").read_text()) | {"cluster": {name: value}}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    said = flexroad("rerun", run, "--executor", "serial").expected(2)
+    (line,) = said.errors
+    assert f"{run}/config.yaml: cluster.{name} can start programs, and this user has not given it" in line
+    assert not list(run.glob("tiles/*"))
+    assert flexroad("status", run).code == 0
+    # The words of the message, as a shell reads them.
+    again = shlex.split(line.partition("add ")[2])
+    assert flexroad("rerun", run, "--executor", "serial", *again).expected(0)
+    assert not (tmp_path / "mark").exists()
+
+
+def test_programs_given_to_run_hold_for_its_user(flexroad, survey, quick_config, tmp_path, monkeypatch):
+    run, one = tmp_path / "run", Catalog.read(survey).tiles[0].id
+    words = ("--executor", "serial", "--tile", one)
+    given = ("--set", "cluster.prologue=[module load gdal]")
+    flexroad("run", "--catalog", survey, "--config", quick_config, "--out", run, *given, *words).expected(0)
+    flexroad("rerun", run, *words).expected(0)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
+    option = ("--allow", survey.parent)
+    assert "cluster.prologue can start programs" in flexroad("rerun", run, *words, *option).expected(2).err
+    flexroad("rerun", run, *words, *option, *given).expected(0)
+
+
+@pytest.mark.parametrize(
+    "setting", ["fit.spacing_m=5", "clusters.workers=3", "cluster.no=3", "cluster.workers=0"]
+)
+def test_rerun_takes_options_of_workers_only(setting, flexroad, survey, quick_config, tmp_path):
+    Run.create(tmp_path / "run", *_settings(survey, quick_config))
+    said = flexroad("rerun", tmp_path / "run", "--set", setting).expected(2)
+    assert len(said.errors) == 1
+
+
+def test_store_outside_of_a_foreign_run_needs_allow(flexroad, survey, quick_config, tmp_path, monkeypatch):
+    run, store = tmp_path / "run", tmp_path / "store"
+    config, catalog = _settings(survey, quick_config)
+    Run.create(run, config, catalog, store)
+    assert Run.open(run).store == store
+    record = checked_json.loads((run / "run.json").read_bytes())
+    other = tmp_path / "other"
+    (run / "run.json").write_bytes(checked_json.dumps(record | {"store": str(other)}))
+    line = f"{run} has its store in {other}, which this user has not given .* add --allow {other}$"
+    with pytest.raises(ConfigError, match=line):
+        Run.open(run)
+    with pytest.raises(ConfigError, match=f"add --store {other}$"):
+        Run.create(run, config, catalog)
+    for command in ("rerun", "status", "clean"):
+        assert f"--allow {other}" in flexroad(command, run).expected(2).err
+    assert not other.exists()
+    assert Run.open(run, [other]).store == other
+    assert Run.create(run, config, catalog, store).store == Run.open(run).store
 
 
 def test_key_after_power_failure_is_whole_or_missing(home, tmp_path):

@@ -1,0 +1,58 @@
+"""Links in a folder that may come from anyone: none that leads out of the folder is followed.
+
+The folder itself may be a link, or lie behind one. In a bucket there are no links.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from flexroad.catalog.storage.paths import Location
+
+
+def contained(where: Location, home: Location) -> Location:
+    """Return a location in a folder.
+
+    Raises
+    ------
+    OSError
+        If it is, or lies behind, a link that leads out of the folder; names the location.
+    """
+    if isinstance(where, Path):
+        target = os.path.realpath(where)
+        if not _is_below(target, os.path.realpath(str(home))):
+            reason = f"a link leads to {target}, out of {home}; replace it by the file or folder itself"
+            raise OSError(errno.EXDEV, reason, str(where))
+    return where
+
+
+def links_out(folder: Location, below: bool = False) -> Iterator[Path]:
+    """Yield the links in a folder that lead out of it; none if it does not exist.
+
+    Parameters
+    ----------
+    below : bool
+        Whether folders inside it are searched, too.
+    """
+    if isinstance(folder, Path):
+        yield from _links_out(folder, os.path.realpath(folder), below)
+
+
+def _links_out(folder: Path, home: str, below: bool) -> Iterator[Path]:
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for entry in entries:
+        if entry.is_symlink():
+            if not _is_below(os.path.realpath(entry.path), home):
+                yield folder / entry.name
+        elif below and entry.is_dir():
+            yield from _links_out(folder / entry.name, home, below)
+
+
+def _is_below(target: str, home: str) -> bool:
+    return target == home or target.startswith(home.rstrip("/") + "/")
