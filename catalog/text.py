@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Iterable
+from typing import Any
 
 MAX_SHOWN = 160
 """Longest text of a value in a message."""
@@ -11,6 +13,9 @@ MAX_REASON = 500
 """Longest message of a library in a message."""
 MAX_LINE = 200
 """Longest line of an error of a decoder in a message."""
+FORMULA = ("=", "+", "-", "@", "\t", "\n")
+"""Starts of texts that spreadsheets take for formulas."""
+_NUMBER = re.compile(r"[+-][\d.,_]*(?:[eE][+-]?\d+)?%?(?: [a-z][^=@(|!]*)?")
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -22,6 +27,25 @@ def printable(text: str) -> str:
     a tag may have them, and a terminal would obey them.
     """
     return text if text.isprintable() else "".join(map(_escaped, text))
+
+
+def no_formula(value: Any) -> Any:
+    """Return a cell of a table for CSV: with an apostrophe first if its text could be taken for a formula.
+
+    Numbers stay, also as text (``-5.2``) and with words after them, and ids of digits (``-500_5600``).
+    `with_formula` is the inverse.
+    """
+    if not isinstance(value, str):
+        return value
+    # Python's writers of CSV put only some line breaks into quotes.
+    text = value.replace("\r\n", "\n").replace("\r", "\n")
+    return "'" + text if text.startswith(FORMULA) and not _NUMBER.fullmatch(text) else text
+
+
+def with_formula(text: str) -> str:
+    """Return the text of a cell that `no_formula` has changed; any other text as it is."""
+    plain = text.removeprefix("'")
+    return plain if no_formula(plain) == text else text
 
 
 def count(number: int, noun: str) -> str:

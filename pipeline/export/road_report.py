@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flexroad.catalog.storage.paths import Location, read, stat, write
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.network import Network
 from flexroad.pipeline.export.pieces import Row
@@ -109,7 +109,7 @@ def _table(rows: list[Row]) -> bytes:
     if rows:
         table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         table.writeheader()
-        table.writerows(rows)
+        table.writerows({name: no_formula(value) for name, value in row.items()} for row in rows)
     return file.getvalue().encode()
 
 

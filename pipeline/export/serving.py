@@ -7,6 +7,8 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from flexroad.catalog.storage.links import contained
+
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
 
@@ -19,6 +21,12 @@ class _Files(SimpleHTTPRequestHandler):
         host = self.headers.get("Host", "").rpartition(":")[0]
         if host not in NAMES:
             self.send_error(403)
+            return None
+        try:
+            contained(Path(self.translate_path(self.path)), Path(self.directory))
+        except (OSError, ValueError):
+            # A link that leads out of the folder, or no name of a file, such as /%00.
+            self.send_error(404)
             return None
         return super().send_head()
 

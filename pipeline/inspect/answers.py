@@ -17,6 +17,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.point_files import Points, to_crs
 from flexroad.pipeline.inspect.points import Answer, Ground
 from flexroad.pipeline.inspect.profile import stations
+from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class AnswerTable:
     decimal: str = "."
 
     def write_csv(self, out: TextIO | Path) -> None:
-        """Write the table as CSV.
+        """Write the table as CSV; text that spreadsheets would take for a formula begins with an apostrophe.
 
         Raises
         ------
@@ -56,7 +57,7 @@ class AnswerTable:
             if name in table and table[name].dtype.kind == "f":
                 texts = (f"{value:.3f}".replace(".", self.decimal) for value in table[name])
                 table[name] = ["" if text == "nan" else text for text in texts]
-        text = table.to_csv(sep=self.separator, decimal=self.decimal, index=False, float_format="%.9g")
+        text = csv_text(table, sep=self.separator, decimal=self.decimal, float_format="%.9g")
         if isinstance(out, Path):
             write(parse_location(out), text.encode())
         else:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds
 from flexroad.catalog.storage.paths import exists, parse_location, read
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.assembled import assembled
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
@@ -133,7 +133,8 @@ class RunView:
         if not exists(path):
             raise ConfigError(f"{path} does not exist; `flexroad rerun {self.run.path}` finishes the run")
         try:
-            return pd.read_csv(io.BytesIO(read(path)), dtype=str, keep_default_na=False)
+            table = pd.read_csv(io.BytesIO(read(path)), dtype=str, keep_default_na=False)
+            return table.map(with_formula)
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
 

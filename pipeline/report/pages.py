@@ -16,12 +16,15 @@ from markupsafe import Markup
 from flexroad.catalog.text import printable
 from flexroad.pipeline.report import meshes, quality
 from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.places import Place
 
 PRINTED = re.compile(r"–|[+-]?\d[\d,]*(\.\d+)?%?( \[.*\])?")
 """A number as text, with its interval if it has one."""
 MARKUP = re.compile(r"[\\`*|~$]|<(?=[A-Za-z/!?])|^>|(?<![^\W_])_|_(?![^\W_])|\](?=[\[(:])|&(?=#?\w+;)")
 """Characters that are markup in Markdown at this place: not, for example, ``_`` within a word."""
+ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
+"""Written for characters that some programs take for HTML also after a backslash."""
 
 MAIN = "Mean over tiles"
 WORST_ESTIMATES = "Worst tiles by error estimate, without ground truth"
@@ -41,10 +44,10 @@ class TilePictures:
 
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
-    parts = [f"# {_marked(content.title)}", content.state + ".", _marked(content.reference)]
+    parts = [f"# {marked(content.title)}", content.state + ".", marked(content.reference)]
     for title, table, line in sections(content):
         parts += [f"## {title}", *([line] if line else []), markdown(table)]
-    versions = ", ".join(f"{name} {version}" for name, version in content.versions.items())
+    versions = marked(", ".join(f"{name} {version}" for name, version in content.versions.items()))
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", content.config)), default=0))
     config = _without_controls(content.config)
     parts += ["## Configuration", f"{fence}yaml\n{config}{fence}", f"Versions: {versions}."]
@@ -53,7 +56,7 @@ def markdown_page(content: Content) -> str:
 
 def csv_page(content: Content) -> str:
     """Return the main table as CSV, unrounded."""
-    return content.main.to_csv(index=False)
+    return csv_text(content.main)
 
 
 def template(name: str, *folders: Path) -> jinja2.Template:
@@ -123,16 +126,16 @@ def _without_controls(value: object) -> object:
     return "\n".join(map(printable, value.split("\n")))
 
 
-def _marked(text: str) -> str:
+def marked(text: str) -> str:
     """Return a text in Markdown that shows as it is."""
-    return MARKUP.sub(r"\\\g<0>", printable(text))
+    return MARKUP.sub(lambda found: ENTITIES.get(found[0], f"\\{found[0]}"), printable(text))
 
 
 def markdown(table: pd.DataFrame) -> str:
     """Return a table as Markdown text."""
     numeric = are_numbers(table)
     lines = [list(table.columns), ["---:" if number else "---" for number in numeric], *_cells(table)]
-    return "\n".join("| " + " | ".join(map(_marked, line)) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(map(marked, line)) + " |" for line in lines)
 
 
 def _html(table: pd.DataFrame) -> Markup:

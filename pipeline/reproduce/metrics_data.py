@@ -10,7 +10,7 @@ from typing import Final
 import pandas as pd
 
 from flexroad.catalog.storage.paths import Location, write
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, printable
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.run.record import Run
@@ -61,7 +61,7 @@ class MetricsData:
         parts = f" ({', '.join(f'{n} {name}' for name, n in strata.items())})" if len(strata) else ""
         failed = len(self.tiles) - len(done)
         left_out = f"; {count(failed, 'failed tile')} left out" if failed else ""
-        return f"Data: {self.dataset}, {count(len(done), 'tile')}{parts}{left_out}{self._roads}."
+        return printable(f"Data: {self.dataset}, {count(len(done), 'tile')}{parts}{left_out}{self._roads}.")
 
     @property
     def _roads(self) -> str:

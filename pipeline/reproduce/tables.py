@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pandas as pd
+from markupsafe import escape
 
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.report.pages import are_numbers, markdown, template
+from flexroad.pipeline.report.pages import are_numbers, markdown, marked, template
 from flexroad.pipeline.reproduce.comparison import Comparison, compare
 from flexroad.pipeline.reproduce.metrics_data import MetricsData, collect, write_metrics_data
 from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.store.tables import csv_text
 
 TITLE = "The paper's tables, and ours"
 LATEX = {
@@ -85,15 +87,16 @@ def pages(data: MetricsData) -> dict[str, str]:
 
 def markdown_page(comparison: Comparison) -> str:
     """Return the comparison as Markdown; the first line names the data."""
-    parts = [comparison.line, f"# {TITLE}", *comparison.notes]
+    parts = [marked(comparison.line), f"# {TITLE}", *comparison.notes]
     for section in comparison.sections:
-        parts += [f"## {section.title}", *([section.line] if section.line else []), markdown(section.table)]
+        line = [section.line] if section.line else []
+        parts += [f"## {marked(section.title)}", *line, markdown(section.table)]
     return "\n\n".join(parts) + "\n"
 
 
 def csv_page(table: pd.DataFrame, line: str) -> str:
     """Return a table as CSV below a comment that names the data."""
-    return f"# {line}\n{table.to_csv(index=False)}"
+    return f"# {line}\n{csv_text(table)}"
 
 
 def html_page(comparison: Comparison) -> str:
@@ -102,7 +105,7 @@ def html_page(comparison: Comparison) -> str:
     page = template("tables.html.j2", Path(__file__).parent).render(
         title=TITLE, line=comparison.line, notes=comparison.notes, sections=sections
     )
-    return f"<!-- {comparison.line} -->\n{page}\n"
+    return f"<!-- {escape(comparison.line)} -->\n{page}\n"
 
 
 def latex_page(comparison: Comparison) -> str:

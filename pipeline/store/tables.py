@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.storage.paths import Location, exists, read
 from flexroad.catalog.storage.staging import atomic_file
+from flexroad.catalog.text import no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import Failure, MetricsRow
 
@@ -115,7 +116,18 @@ def write_tables(
     with atomic_file(run / "failures.csv", flushed) as path, path.open("w", newline="") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(names)
-        lines.writerows([getattr(failure, name) for name in names] for failure in failures)
+        lines.writerows([no_formula(getattr(failure, name)) for name in names] for failure in failures)
+
+
+def csv_text(table: pd.DataFrame, **options: Any) -> str:
+    """Return a table as CSV in which no text is a formula (`no_formula`); ``options`` as of pandas."""
+    from pandas.api.types import is_numeric_dtype
+
+    safe = table.set_axis([no_formula(name) for name in table.columns], axis="columns")
+    for number, kind in enumerate(table.dtypes):
+        if not is_numeric_dtype(kind):
+            safe.isetitem(number, [no_formula(value) for value in table.iloc[:, number]])
+    return str(safe.to_csv(index=False, **options))
 
 
 def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:

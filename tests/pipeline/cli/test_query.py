@@ -110,6 +110,17 @@ def test_query_keeps_semicolons_and_decimal_commas(run, flexroad, tmp_path):
     assert said.out.splitlines()[1].startswith("0;500010,25;5600020,50;a, b;")
 
 
+def test_query_writes_no_formulas(run, flexroad, tmp_path):
+    cells = ("=1+1", "-7", "@a")
+    points = tmp_path / "points.csv"
+    points.write_text("x,y,=head\n" + "".join(f"{x},{y},{cells[i]}\n" for i, (x, y) in enumerate(POINTS)))
+    flexroad("query", run, "--points", points, "-o", tmp_path / "answer.csv").expected(0)
+    for text in (flexroad("query", run, "--points", points).out, (tmp_path / "answer.csv").read_text()):
+        head, *rows = (line.split(",") for line in text.splitlines())
+        assert head[:3] == ["x", "y", "'=head"]
+        assert [row[2] for row in rows] == ["'=1+1", "-7"][: len(rows)]
+
+
 def test_query_of_tabs_and_dots(run, flexroad, tmp_path):
     points = csv(tmp_path / "points.txt", "x\ty", POINTS, "{}\t{}")
     assert_truth(answer(flexroad("query", run, "--points", points), sep="\t"))

@@ -264,8 +264,12 @@ def answer(port, path, host=None):
     return connection.getresponse().status
 
 
-def test_server_gives_files_of_the_folder_to_this_computer_alone(folder):
+@pytest.mark.filterwarnings("error")
+def test_server_gives_files_of_the_folder_to_this_computer_alone(folder, capfd):
     (folder.parent / "secret.txt").write_text("secret")
+    (folder / "link.txt").symlink_to(folder.parent / "secret.txt")
+    (folder / "linked").symlink_to(folder.parent)
+    (folder / "inside.js").symlink_to("run.js")
     with server(folder, 0) as web:
         thread = threading.Thread(target=web.serve_forever)
         thread.start()
@@ -276,11 +280,16 @@ def test_server_gives_files_of_the_folder_to_this_computer_alone(folder):
             assert answer(port, "/run.js", f"localhost:{port}") == 200
             assert answer(port, "/tiles/") == 404
             assert answer(port, "/../secret.txt") == 404
+            assert answer(port, "/inside.js") == 200
+            for name in ("link.txt", "linked/secret.txt", "%00", "a%00/b", "%2e%2e/secret.txt", "x" * 5000):
+                assert answer(port, f"/{name}") == 404, name
             assert answer(port, "/", "evil.example") == 403
         finally:
             web.shutdown()
             thread.join()
-    (folder.parent / "secret.txt").unlink()
+    for path in (folder.parent / "secret.txt", folder / "link.txt", folder / "linked", folder / "inside.js"):
+        path.unlink()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.slow

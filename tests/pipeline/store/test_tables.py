@@ -1,12 +1,16 @@
 """Damage of metrics.parquet is an error: no figure changes."""
 
+import csv
+import io
 import random
 
 import pandas as pd
 import pytest
 
+from flexroad.catalog.text import with_formula
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.store.tables import COLUMNS, read_metrics, write_tables
+from flexroad.pipeline.store.records import Failure
+from flexroad.pipeline.store.tables import COLUMNS, csv_text, read_metrics, write_tables
 
 VALUES = {"str": "done", "float64": 0.028, "Int64": 7}
 
@@ -40,6 +44,32 @@ def test_read_metrics_of_earlier_version_lacks_columns(tmp_path):
     read = read_metrics(tmp_path)
     assert list(read.columns) == list(COLUMNS)
     assert (read.l2_road_m[0], read.l2_terrain_m.isna().all()) == (0.028, True)
+
+
+FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\n=1"]
+PLAIN = ["", "a=1", "'quoted'", "-5", "+1.5e-3", "-81%", "-500_5600", "-1,5", "1-2", "-81% to -79%", "é"]
+
+
+def test_texts_that_are_formulas_get_an_apostrophe_in_csv():
+    texts = FORMULAS + PLAIN
+    table = pd.DataFrame({"=text": texts, "number": [-1.5] * len(texts), "count": [-2] * len(texts)})
+    table["mixed"] = pd.Series([None, "=1", *[-3.0] * (len(texts) - 2)], dtype=object)
+    before = table.copy()
+    rows = list(csv.reader(io.StringIO(csv_text(table, float_format="%.9g"), newline="")))
+    assert rows[0] == ["'=text", "number", "count", "mixed"]
+    assert [row[0] for row in rows[1:]] == [f"'{text}" for text in FORMULAS] + PLAIN
+    assert {tuple(row[1:3]) for row in rows[1:]} == {("-1.5", "-2")}
+    assert [row[3] for row in rows[1:4]] == ["", "'=1", "-3.0"]
+    pd.testing.assert_frame_equal(table, before)
+    # Outside quotes a line break would begin a new row.
+    assert csv_text(pd.DataFrame({"a": ["x\r=1", "\r\n=1"]})) == 'a\n"x\n=1"\n"\'\n=1"\n'
+    assert [with_formula(row[0]) for row in rows[1:]] == texts
+
+
+def test_failures_in_csv_are_no_formulas(tmp_path):
+    write_tables(tmp_path, [], [Failure("=1", "load", "TaskError", "@message", "-file")])
+    with (tmp_path / "failures.csv").open(newline="") as file:
+        assert list(csv.reader(file))[1] == ["'=1", "load", "TaskError", "'@message", "'-file"]
 
 
 def test_read_metrics_unknown_column_raises(tmp_path):
