@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from threading import Lock, local
 from typing import Any
@@ -19,7 +20,6 @@ from typing import Any
 from distributed import WorkerPlugin
 from distributed.protocol.pickle import dumps, loads
 
-import flexroad
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute.executor import J, Probe, R
 
@@ -29,7 +29,7 @@ RESULTS = ("flexroad", "numpy", "scipy", "numba", "rasterio", "startinpy", "torc
 """Packages whose versions must be equal for tiles to have equal results."""
 CODE = "the code of flexroad"
 """Name of the checksum of the installed program among the versions."""
-INSTALLED = Path(flexroad.__file__).parent
+INSTALLED = Path(str(files("flexroad")))
 """Folder of the package."""
 SAME = "install the same there, best with the same constraints.txt"
 """Remedy for other versions."""

@@ -168,7 +168,7 @@ def has_marker(run: Run, record: TileRecord) -> bool:
         if marker is not None and marker == record.marker:
             return True
         # Not every storage keeps the time that the worker was told.
-        found = _from_marker(folder.path, marker) if marker else None
+        found = _from_marker(folder, marker) if marker else None
         if found and (found.fingerprint, found.finished) == (record.fingerprint, record.finished):
             return True
         refresh(folder.path.parent, folder.path)
