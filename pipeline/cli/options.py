@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from flexroad.pipeline.cli.lifecycle import ON_FAILURE
+from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
     from flexroad.catalog.area import Area as CatalogArea
@@ -29,6 +30,19 @@ HEADINGS = (
     ALARMS,
 )
 """In the order of a help page."""
+
+
+def _address(value: str | None) -> str | None:
+    """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
+    from flexroad.pipeline.execute.clusters import check_address
+
+    if value is not None:
+        try:
+            check_address(value)
+        except ConfigError as error:
+            raise typer.BadParameter(str(error)) from error
+    return value
+
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
@@ -77,7 +91,12 @@ MostWorkers = Annotated[
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="A running Dask scheduler: tcp://host:8786.", rich_help_panel=WORK),
+    typer.Option(
+        metavar="ADDRESS",
+        help="A running Dask scheduler: tcp://host:8786, tls://host:8786.",
+        rich_help_panel=WORK,
+        callback=_address,
+    ),
 ]
 Executor = Annotated[
     Literal["dask", "serial"],

@@ -132,7 +132,7 @@ def run(
             with _named(f"preparing {out}"):
                 opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
             only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
-            make_executor = partial(_executor, executor, died, workers, scheduler, chosen, dashboard)
+            make_executor = partial(_executor, executor, died, workers, scheduler, chosen, dashboard, path)
             _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
     _exit(outcome)
 
@@ -190,7 +190,9 @@ def rerun(
                 check_allowed(opened.catalog, layers_read(opened.config))
             only = rerun_filter(opened, tile or (), failed)
             config = opened.config
-            make_executor = partial(_executor, executor, died, workers, scheduler, config, dashboard)
+            make_executor = partial(
+                _executor, executor, died, workers, scheduler, config, dashboard, location
+            )
             _run_tiles(opened, make_executor, only, force, verify, outcome)
     _exit(outcome)
 
@@ -248,6 +250,7 @@ def _executor(
     scheduler: str | None,
     config: Config,
     dashboard: bool,
+    path: Location,
     say: Callable[[str], None],
 ) -> Executor:
     from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, SerialExecutor
@@ -255,7 +258,8 @@ def _executor(
     if name == "serial":
         return SerialExecutor()
     cluster = config.cluster
-    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say)
+    logs = path.resolve() / "logs" if isinstance(path, Path) else None
+    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say, logs)
     if name == "dask" or died or scheduler or dashboard or cluster.needs_workers:
         return parallel
     return AdaptiveExecutor(workers or cluster.workers, parallel, say)

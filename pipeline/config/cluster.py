@@ -13,6 +13,8 @@ from flexroad.tasks.options import Options
 
 DEFAULT_TIMEOUT_S = 3600
 """Time limit of a tile if the configuration gives none."""
+DEFAULT_MEMORY_BYTES = 4 * 1024**3
+"""Memory of one SLURM or Kubernetes worker if the configuration gives none."""
 
 
 class Cluster(Options):
@@ -44,7 +46,16 @@ class Cluster(Options):
         "once more alone, and is then a failed row; only on workers: another value starts them for any tile",
     )
     patience_s: float = Field(
-        60, ge=0, le=86_400, description="waiting time for a new worker when all workers are lost (s)"
+        60,
+        ge=0,
+        le=86_400,
+        description="local, --scheduler: waiting time for a new worker when all are lost (s)",
+    )
+    security: Literal["tls", "none"] = Field(
+        "tls",
+        description="tls: scheduler and workers answer only processes with certificates made for this "
+        "command; none: whoever reaches their ports can run programs as you; kubernetes has no tls; for "
+        "--scheduler Dask's own configuration counts",
     )
     flush: bool = Field(
         True,
@@ -52,7 +63,11 @@ class Cluster(Options):
         "false saves some milliseconds per tile, but a power failure may leave damaged products",
     )
     start_s: float = Field(
-        3600, gt=0, le=604_800, description="slurm, kubernetes: waiting time for the first worker (s)"
+        3600,
+        gt=0,
+        le=604_800,
+        description="slurm, kubernetes: waiting time for the first worker, and for a new one when all "
+        "are lost (s)",
     )
     walltime_h: float = Field(8, gt=0, le=10_000, description="slurm: time limit of each job (hours)")
     queue: str | None = Field(None, min_length=1, description="slurm: partition (-p)")

@@ -5,46 +5,25 @@ from __future__ import annotations
 import contextlib
 import importlib
 import logging
-import shutil
-import sys
+import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import timedelta
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
-from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute.settings import certificates, environment, settings
+from flexroad.pipeline.execute.start import extra, one_line, opened, start_workers
 
-SETTINGS = {
-    "distributed.worker.memory.target": False,
-    "distributed.worker.memory.spill": False,
-    "distributed.worker.memory.pause": False,
-    "distributed.worker.memory.terminate": 0.95,
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.log-length": 1000,
-    "distributed.admin.system-monitor.log-length": 240,
-    "distributed.nanny.pre-spawn-environ": ONE_THREAD,
-}
-"""Dask settings of all workers. Dask's defaults suit data frames that are kept in workers. A tile leaves
-nothing that could be spilled to disk, and a paused worker would wait forever for its only tile to free
-memory: the worker is terminated at the limit instead. Profiling would cost 2% of a tile's time. The logs of
-scheduler and monitor are shorter than by default: they grew for the first hour of a run. Dask also
-makes workers return every freed array to the system at once (MALLOC_TRIM_THRESHOLD_), which costs 15% of a
-tile's time in page faults: it is left out of their environment."""
-DEFAULT_MEMORY_BYTES = 4 * 1024**3
-"""Memory of one SLURM or Kubernetes worker if the configuration gives none."""
-SILENT_S = 300.0
-"""How long a worker may be silent beyond the time limit of a tile (s)."""
 GRACE_S = 10.0
 """How long a running scheduler may have no workers (s): a nanny may be replacing one."""
-CLUSTER_PACKAGES = {
-    "slurm": ("dask_jobqueue", "dask-jobqueue"),
-    "kubernetes": ("dask_kubernetes.operator", "dask-kubernetes"),
-}
-"""Module and package by kind of cluster."""
+ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
+"""Address of a scheduler."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +36,41 @@ class ClusterTarget:
     """The cluster's name in messages."""
     start_s: float = 0
     """How long to wait for the first worker (s)."""
-    own: bool = False
-    """Whether the workers were started from this terminal."""
+    patience_s: float = 0
+    """How long to wait for a worker when all are lost (s)."""
+    remedy: str = "start some (`dask worker ADDRESS --nthreads 1`)"
+    """What to do if no worker comes."""
+    given_up: Callable[[], bool] = lambda: False
+    """Returns whether no worker will come."""
+
+
+def check_address(address: str) -> None:
+    """Check that a text is the address of a scheduler.
+
+    Raises
+    ------
+    ConfigError
+        If it is not.
+    """
+    if not ADDRESS.fullmatch(address):
+        raise ConfigError(
+            f"{address!r} is no address of a Dask scheduler; give its host and port, as tcp://host:8786 or "
+            "tls://host:8786"
+        )
 
 
 @contextlib.contextmanager
 def open_cluster(
-    cluster: Cluster, workers: int | None, scheduler: str | None, dashboard: bool
+    cluster: Cluster,
+    workers: int | None,
+    scheduler: str | None,
+    dashboard: bool,
+    logs: Path | None = None,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[ClusterTarget]:
     """Connect to, start or request a cluster; on exit, stop it if it was started here.
+
+    ``logs`` is the folder for the output of SLURM jobs, and ``say`` prints one line about them.
 
     Raises
     ------
@@ -73,31 +78,73 @@ def open_cluster(
         If a package or program is not installed, or the cluster cannot be started.
     """
     if scheduler:
-        yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S)
+        check_address(scheduler)
+        _check_certificates(scheduler)
+        yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, cluster.patience_s)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
     import dask
 
-    make = {"local": local, "slurm": slurm, "kubernetes": kubernetes}[cluster.kind]
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
-        stack.enter_context(dask.config.set(settings(cluster)))
-        scratch = stack.enter_context(ScratchFolder())
-        opened = stack.enter_context(make(cluster, scratch, dashboard))
-        start_s = 0 if cluster.kind == "local" else cluster.start_s
-        yield ClusterTarget(opened, f"the {cluster.kind} cluster", start_s, cluster.kind == "local")
+        stack.enter_context(dask.config.set(settings(cluster, dashboard)))
+        if cluster.kind == "local":
+            started = stack.enter_context(local(cluster, dashboard))
+            yield ClusterTarget(started, "the local cluster", 0, cluster.patience_s)
+        elif cluster.kind == "slurm":
+            # It imports Dask.
+            from flexroad.pipeline.execute.slurm import slurm
+
+            jobs = stack.enter_context(slurm(cluster, dashboard, logs, say))
+            yield ClusterTarget(
+                jobs.cluster,
+                "the slurm cluster",
+                cluster.start_s,
+                cluster.start_s,
+                f"`squeue --me` shows its jobs, {jobs.folder} has their output",
+                lambda: jobs.given_up,
+            )
+        else:
+            started = stack.enter_context(kubernetes(cluster))
+            yield ClusterTarget(
+                started,
+                "the kubernetes cluster",
+                cluster.start_s,
+                cluster.start_s,
+                "`kubectl get pods` shows its pods",
+            )
 
 
-def settings(cluster: Cluster) -> dict[str, Any]:
-    """Return the Dask settings of scheduler and workers."""
-    # A worker is silent while a library holds the interpreter. By default it counts as dead after 5 minutes;
-    # the time limit of a tile ends it if it hangs.
-    return SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
+def _check_certificates(scheduler: str) -> None:
+    """Check that Dask has the certificates for an address.
+
+    Raises
+    ------
+    ConfigError
+        If it has none, or cannot load them.
+    """
+    from distributed.security import Security
+
+    names = "distributed.comm.tls.ca-file, distributed.comm.tls.client.cert and .key"
+    try:
+        missing = Security().get_connection_args("client")["ssl_context"] is None
+    except OSError as error:
+        raise ConfigError(
+            f"cannot load the certificates of Dask's configuration: {error}; look at {names}"
+        ) from error
+    if missing and scheduler.startswith(("tls://", "wss://")):
+        raise ConfigError(
+            f"{scheduler}: Dask has no certificates for it; set {names} in ~/.config/dask/dask.yaml, or "
+            "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ...TLS__CLIENT__CERT and ...TLS__CLIENT__KEY"
+        )
 
 
-def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return a cluster of single-threaded processes on this machine.
+@contextlib.contextmanager
+def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
+    """Open a cluster of single-threaded processes on this machine.
+
+    It listens on the loopback interface only.
 
     Raises
     ------
@@ -109,9 +156,10 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
     from flexroad.pipeline.execute.memory import bytes_of_worker, workers_here
 
     workers = workers_here(cluster)
-    try:
-        return LocalCluster(
-            n_workers=workers,
+    with ScratchFolder() as scratch, contextlib.ExitStack() as stack:
+        make = partial(
+            LocalCluster,
+            n_workers=0,
             threads_per_worker=1,
             processes=True,
             memory_limit=bytes_of_worker(cluster),
@@ -120,67 +168,34 @@ def local(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
             local_directory=scratch,
             env=ONE_THREAD,
             silence_logs=logging.CRITICAL,
+            security=certificates(cluster),
         )
-    except (OSError, RuntimeError) as error:
-        raise ConfigError(
-            f"cannot start {workers} worker processes here: {_one_line(error).rstrip('.')}; use fewer "
-            "--workers, or allow more processes and open files (ulimit -u, ulimit -n)"
-        ) from error
+        try:
+            started = stack.enter_context(opened(make))
+            start_workers(started, workers)
+        except (OSError, RuntimeError) as error:
+            raise ConfigError(
+                f"cannot start {workers} worker processes here: {one_line(error).rstrip('.')}; use fewer "
+                "--workers, or allow more processes and open files (ulimit -u, ulimit -n)"
+            ) from error
+        yield started
 
 
-def slurm(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
-    """Return a cluster of SLURM jobs; a job that ends at its walltime is replaced.
-
-    Raises
-    ------
-    ConfigError
-        If dask-jobqueue or sbatch is not installed.
-    """
-    jobqueue = _extra("slurm")
-    if shutil.which("sbatch") is None:
-        raise ConfigError(
-            "cluster.kind slurm: there is no sbatch here; run this on a login node of the cluster, with the "
-            "SLURM client installed, or set `cluster: local`"
-        )
-    slurm_cluster = jobqueue.SLURMCluster(**slurm_options(cluster, dashboard))
-    jobs = -(-(cluster.workers or 1) // cluster.per_job)
-    slurm_cluster.adapt(minimum_jobs=jobs, maximum_jobs=jobs)
-    return slurm_cluster
-
-
-def slurm_options(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
-    """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each."""
-    walltime = timedelta(hours=cluster.walltime_h)
-    # A worker that closes before SLURM kills it returns its tiles to the scheduler.
-    lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
-    exports = [f"export {name}={value}" for name, value in _environment(cluster).items()]
-    return {
-        "queue": cluster.queue,
-        "account": cluster.account,
-        "cores": cluster.per_job,
-        "processes": cluster.per_job,
-        "memory": f"{(cluster.memory or DEFAULT_MEMORY_BYTES) * cluster.per_job} B",
-        "walltime": _clock(walltime),
-        "job_extra_directives": list(cluster.job_extra),
-        "job_script_prologue": [*exports, *cluster.prologue],
-        "worker_extra_args": ["--lifetime", f"{lifetime.total_seconds():.0f}s", "--lifetime-stagger", "60s"],
-        "python": sys.executable,
-        "job_name": "flexroad",
-        "interface": cluster.interface,
-        "scheduler_options": {"dashboard_address": ":8787" if dashboard else ":0"},
-        "silence_logs": "critical",
-    }
-
-
-def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
+def kubernetes(cluster: Cluster) -> Any:
     """Return a cluster of Kubernetes pods, created by the Dask operator.
 
     Raises
     ------
     ConfigError
-        If dask-kubernetes is not installed, no image is set, or the cluster cannot be reached.
+        If dask-kubernetes is not installed, no image is set, TLS is demanded, or the cluster cannot be
+        reached.
     """
-    operator = _extra("kubernetes")
+    operator = extra("kubernetes")
+    if cluster.security == "tls":
+        raise ConfigError(
+            "cluster.kind kubernetes: Dask's operator has no TLS: whoever reaches the port of the scheduler "
+            "can run programs in its pods; close it with a NetworkPolicy, and set cluster.security to none"
+        )
     if not cluster.image:
         raise ConfigError(
             "cluster.kind kubernetes: no image is set; set cluster.image to one that contains flexroad"
@@ -191,7 +206,7 @@ def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
         importlib.import_module("kr8s").api(namespace=cluster.namespace).version()
     except Exception as error:
         raise ConfigError(
-            f"cluster.kind kubernetes: {_one_line(error)}; does `kubectl get pods` work?"
+            f"cluster.kind kubernetes: {one_line(error)}; does `kubectl get pods` work?"
         ) from error
     try:
         return operator.KubeCluster(
@@ -199,7 +214,7 @@ def kubernetes(cluster: Cluster, scratch: str, dashboard: bool) -> Any:
         )
     except Exception as error:
         raise ConfigError(
-            f"cluster.kind kubernetes: {_one_line(error)}; is the Dask operator installed, and may this "
+            f"cluster.kind kubernetes: {one_line(error)}; is the Dask operator installed, and may this "
             "account create DaskCluster resources?"
         ) from error
 
@@ -212,37 +227,8 @@ def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
         "image": cluster.image,
         "n_workers": cluster.workers or 1,
         "resources": {"requests": size, "limits": size},
-        "env": _environment(cluster),
+        "env": environment(cluster, dashboard=True),
         "worker_command": "dask worker --nthreads 1",
         # If the client is killed, the cluster ends by itself after this many seconds.
         "idle_timeout": 900,
     }
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or repr(error)
-
-
-def _environment(cluster: Cluster) -> dict[str, str]:
-    """Return the environment of workers, and of a scheduler that is started elsewhere."""
-    values = settings(cluster).items()
-    return ONE_THREAD | {_variable(key): str(value) for key, value in values}
-
-
-def _variable(key: str) -> str:
-    return f"DASK_{key.replace('.', '__').replace('-', '_').upper()}"
-
-
-def _extra(kind: str) -> Any:
-    module, package = CLUSTER_PACKAGES[kind]
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ConfigError(
-            f"cluster.kind {kind} needs {package}: pip install 'flexroad[{kind}]' ({error})"
-        ) from error
-
-
-def _clock(time: timedelta) -> str:
-    minutes = round(time.total_seconds() / 60)
-    return f"{minutes // 60:02}:{minutes % 60:02}:00"

@@ -8,13 +8,16 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
+from functools import partial
 from itertools import chain, islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.clusters import ClusterTarget, open_cluster
 from flexroad.pipeline.execute.executor import J, Probe, R
+from flexroad.pipeline.execute.start import opened
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -39,6 +42,9 @@ class DaskExecutor:
         Serve Dask's dashboard; its address is passed to ``say``.
     say : callable
         Prints one line for the user: the address of the dashboard, a wait for workers.
+    logs : Path, optional
+        Folder for the output of SLURM jobs, on a disk that all machines share; by default one in the home
+        folder, which is removed at the end.
     """
 
     def __init__(
@@ -48,12 +54,14 @@ class DaskExecutor:
         cluster: Cluster = LOCAL,
         dashboard: bool = False,
         say: Callable[[str], None] = lambda line: None,
+        logs: Path | None = None,
     ) -> None:
         self.workers = workers
         self.scheduler = scheduler
         self.cluster = cluster
         self.dashboard = dashboard
         self.say = say
+        self.logs = logs
 
     def map(
         self,
@@ -72,7 +80,9 @@ class DaskExecutor:
 
         with (
             _quiet(),
-            open_cluster(self.cluster, self.workers, self.scheduler, self.dashboard) as target,
+            open_cluster(
+                self.cluster, self.workers, self.scheduler, self.dashboard, self.logs, self.say
+            ) as target,
             self._connected(target) as client,
             probe or contextlib.nullcontext(),
         ):
@@ -84,7 +94,7 @@ class DaskExecutor:
                 function,
                 chain(first, queue),
                 lost,
-                self.cluster,
+                self.cluster.model_copy(update={"patience_s": target.patience_s}),
                 self.say,
                 probe,
             )
@@ -94,24 +104,24 @@ class DaskExecutor:
     def _connected(self, target: ClusterTarget) -> Iterator[Client]:
         from distributed import Client
 
-        try:
-            client = Client(target.target, timeout=ANSWER_S, set_as_default=False)
-        except OSError as error:
-            raise ConfigError(f"{target.name} does not answer: {error}") from error
-        with client:
+        make = partial(Client, target.target, timeout=ANSWER_S, set_as_default=False)
+        with contextlib.ExitStack() as stack:
+            try:
+                client = stack.enter_context(opened(make))
+            except OSError as error:
+                raise ConfigError(f"{target.name} does not answer: {error}") from error
             if self.dashboard:
                 self.say(_dashboard(client))
-            if not _any_worker(client, time.monotonic() + target.start_s):
-                raise ConfigError(
-                    f"{target.name} has no workers; start some (`dask worker ADDRESS --nthreads 1`)"
-                )
+            if not _any_worker(client, target):
+                raise ConfigError(f"{target.name} has no workers; {target.remedy}")
             yield client
 
 
-def _any_worker(client: Client, end: float) -> bool:
+def _any_worker(client: Client, target: ClusterTarget) -> bool:
+    end = time.monotonic() + target.start_s
     with contextlib.suppress(OSError):
         while not client.nthreads():
-            if time.monotonic() > end:
+            if time.monotonic() > end or target.given_up():
                 return False
             time.sleep(0.2)
         return True
@@ -136,7 +146,7 @@ def _check_workers(client: Client, target: ClusterTarget, probe: Probe | None) -
     try:
         _compare(client, here)
         client.register_plugin(retry_blocker(client.id, name), name=f"flexroad-{name}")
-        _register(client, workers.WorkerCheck(here, probe, ignore_sigint=target.own), name)
+        _register(client, workers.WorkerCheck(here, probe), name)
     except ConfigError:
         raise
     except OSError as error:

@@ -8,7 +8,6 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -47,26 +46,18 @@ class WorkerCheck(WorkerPlugin):  # type: ignore[misc]
         Versions of the client, from `versions`.
     probe : Probe, optional
         Check of what the jobs need.
-    ignore_sigint : bool
-        Ignore Ctrl-C in the worker. A terminal sends it to all processes of the command, and workers would
-        only print tracebacks.
     """
 
-    def __init__(
-        self, versions: Mapping[str, str], probe: Probe | None = None, ignore_sigint: bool = False
-    ) -> None:
+    def __init__(self, versions: Mapping[str, str], probe: Probe | None = None) -> None:
         self.versions = dict(versions)
         # Pickled, so that a worker with another program says so before it looks for the class of the probe.
         self.probe = dumps(probe)
-        self.ignore_sigint = ignore_sigint
 
     def setup(self, worker: Any) -> None:
         """Prepare the worker; called for workers that join later, too."""
         self._lock = Lock()
         self._accepted = False
         self._answer: tuple[str, Any] | None = None
-        if self.ignore_sigint:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
         pin_threads()
 
     def admit(self, packed: bytes, accepted: bool) -> tuple[str, Any]:

@@ -1,0 +1,258 @@
+"""Workers as jobs of SLURM; a job that ends is submitted again: at its walltime, cancelled, with its node."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shlex
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from distributed.core import Status
+from tornado.ioloop import PeriodicCallback
+
+from flexroad.catalog.text import count
+from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute.settings import certificates, environment
+from flexroad.pipeline.execute.start import extra, opened, start_workers
+
+CHECK_S = 15.0
+"""Interval between questions to SLURM about the jobs (s)."""
+TRIES = 3
+"""Number of jobs that may end one after another, in place of one job, before a worker of theirs connects."""
+NAME = "flexroad"
+"""Name of the jobs; the names of the files with their output begin with it."""
+
+
+class SlurmJobs:
+    """The jobs of a cluster. Those that SLURM no longer has are submitted again.
+
+    Dask itself does so only for jobs of one worker (dask-jobqueue#611), and not for jobs that end while they
+    wait. It takes a worker that is away for 15 s for a lost job, also if its nanny is about to replace it.
+
+    Parameters
+    ----------
+    cluster : dask_jobqueue.SLURMCluster
+        The cluster that the jobs belong to.
+    folder : Path
+        Folder of the output of the jobs, for messages.
+    say : callable
+        Prints one line for the user.
+    """
+
+    def __init__(self, cluster: Any, folder: Path, say: Callable[[str], None]) -> None:
+        self.cluster = cluster
+        self.folder = folder
+        self.say = say
+        self.failures: Counter[str] = Counter()
+        """Number of jobs since one had a worker that connected, by name in Dask."""
+
+    @property
+    def given_up(self) -> bool:
+        """Whether no job is left that would be submitted again."""
+        return not self.cluster.worker_spec
+
+    def start(self, number: int) -> None:
+        """Submit jobs.
+
+        Raises
+        ------
+        ConfigError
+            If SLURM takes none of them.
+        """
+        try:
+            start_workers(self.cluster, number)
+        except RuntimeError as error:
+            if not any(job.job_id for job in self.cluster.workers.values()):
+                raise ConfigError(
+                    f"cluster.kind slurm: sbatch refuses the jobs: {_answer(error)}; correct the options "
+                    "of the cluster"
+                ) from error
+            self.say(f"sbatch refuses a job: {_answer(error)}")
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[None]:
+        """Look for ended jobs meanwhile."""
+        timer = PeriodicCallback(self.check, CHECK_S * 1000)
+        self.cluster.loop.add_callback(timer.start)
+        try:
+            yield
+        finally:
+            self.cluster.loop.add_callback(timer.stop)
+
+    async def check(self) -> None:
+        """Submit the jobs again that SLURM no longer has."""
+        # Before the question: a job that is submitted meanwhile is not in its answer.
+        jobs = dict(self.cluster.workers)
+        listed = await _listed_jobs()
+        if listed is None:
+            return
+        for worker in self.cluster.scheduler_info["workers"].values():
+            self.failures.pop(self._job_of(worker["name"]), None)
+        ended = [name for name, job in jobs.items() if job.job_id not in listed]
+        for name in ended:
+            self._forget(name)
+        if ended:
+            await self._replace(ended)
+
+    def _job_of(self, worker: str) -> str:
+        """Return the name of the job of a worker: the worker's, or that without its number within the job."""
+        return worker if worker in self.cluster.worker_spec else worker.rpartition("-")[0]
+
+    def _forget(self, name: str) -> None:
+        job = self.cluster.workers.pop(name)
+        job.status = Status.closed
+        self.failures[name] += 1
+        if self.failures[name] >= TRIES:
+            self.cluster.worker_spec.pop(name, None)
+
+    async def _replace(self, ended: list[str]) -> None:
+        left = [name for name in ended if name in self.cluster.worker_spec]
+        if given_up := len(ended) - len(left):
+            self.say(
+                f"{count(given_up, 'SLURM job')} given up: {TRIES} in a row ended before a worker connected; "
+                f"{self.folder} has their output"
+            )
+        if left:
+            self.say(f"{count(len(left), 'SLURM job')} ended; submitted again")
+            try:
+                await self.cluster._correct_state()
+            except RuntimeError as error:
+                self.say(f"sbatch refuses a job: {_answer(error)}")
+
+
+@contextlib.contextmanager
+def slurm(
+    cluster: Cluster, dashboard: bool, logs: Path | None, say: Callable[[str], None]
+) -> Iterator[SlurmJobs]:
+    """Open a cluster of SLURM jobs, whose output is written to the folder ``logs``.
+
+    Raises
+    ------
+    ConfigError
+        If dask-jobqueue or SLURM is not installed, or SLURM takes no job.
+    """
+    jobqueue = extra("slurm")
+    for program in ("sbatch", "squeue", "scancel"):
+        if shutil.which(program) is None:
+            raise ConfigError(
+                f"cluster.kind slurm: there is no {program} here; run this on a login node of the cluster, "
+                "with the SLURM client installed, or set `cluster: local`"
+            )
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(_shared_folder(logs))
+        options = slurm_options(cluster, dashboard, folder)
+        make = partial(jobqueue.SLURMCluster, job_cls=_job_class(), **options)
+        jobs = SlurmJobs(stack.enter_context(opened(make)), folder, say)
+        jobs.start(-(-(cluster.workers or 1) // cluster.per_job))
+        stack.enter_context(jobs.watched())
+        yield jobs
+
+
+def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, Any]:
+    """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each.
+
+    The certificates are passed as files in ``folder`` that only this user can read.
+    """
+    walltime = timedelta(hours=cluster.walltime_h)
+    # A worker that closes before SLURM kills it returns its tiles to the scheduler.
+    lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
+    stagger = min(timedelta(minutes=1), lifetime / 2)
+    exports = [
+        f"export {name}={shlex.quote(value)}" for name, value in environment(cluster, dashboard).items()
+    ]
+    return {
+        "queue": cluster.queue,
+        "account": cluster.account,
+        "cores": cluster.per_job,
+        "processes": cluster.per_job,
+        "memory": f"{(cluster.memory or DEFAULT_MEMORY_BYTES) * cluster.per_job} B",
+        "walltime": _clock(walltime),
+        "job_extra_directives": list(cluster.job_extra),
+        "job_script_prologue": [*exports, *cluster.prologue],
+        "worker_extra_args": [
+            "--no-dashboard",
+            "--lifetime",
+            f"{lifetime.total_seconds():.0f}s",
+            "--lifetime-stagger",
+            f"{stagger.total_seconds():.0f}s",
+        ],
+        "python": sys.executable,
+        "job_name": NAME,
+        "log_directory": str(folder),
+        "interface": cluster.interface,
+        "security": certificates(cluster),
+        "shared_temp_directory": str(folder),
+        # Dask's pages have no password: they are served to this machine only.
+        "scheduler_options": {
+            "dashboard": dashboard,
+            "dashboard_address": f"127.0.0.1:{8787 if dashboard else 0}",
+        },
+        "silence_logs": "critical",
+    }
+
+
+@contextlib.contextmanager
+def _shared_folder(logs: Path | None) -> Iterator[Path]:
+    """Yield a folder that all machines share, without the output of an earlier run.
+
+    It is ``logs``, or one in the home folder, which is removed at the end.
+    """
+    with contextlib.ExitStack() as stack:
+        if logs is None:
+            home = tempfile.TemporaryDirectory(
+                prefix=f".{NAME}-", dir=Path.home(), ignore_cleanup_errors=True
+            )
+            logs = Path(stack.enter_context(home))
+        if shlex.quote(str(logs)) != str(logs):
+            raise ConfigError(
+                f"cluster.kind slurm: dask-jobqueue cannot pass the path {str(logs)!r} to its jobs; choose a "
+                "RUN without blanks, quotes and other special characters in its path"
+            )
+        logs.mkdir(exist_ok=True)
+        for pattern in (f"{NAME}-*.out", f"{NAME}-*.err", ".dask-jobqueue.*"):
+            for path in logs.glob(pattern):
+                path.unlink(missing_ok=True)
+        yield logs
+
+
+def _job_class() -> Any:
+    """Return the class of a job: Dask asserts at the end that jobs are closed; dask-jobqueue's never are."""
+    from dask_jobqueue.slurm import SLURMJob
+
+    class Job(SLURMJob):  # type: ignore[misc]
+        async def close(self) -> None:
+            await super().close()
+            self.status = Status.closed
+
+    return Job
+
+
+async def _listed_jobs() -> set[str] | None:
+    """Return the ids of this user's jobs that wait or run, None if SLURM does not answer."""
+    words = ["squeue", "--noheader", "--format=%A", f"--user={os.getuid()}"]
+    # The user may have filters in the environment.
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("SQUEUE_")}
+    pipe, nowhere = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
+    asked = await asyncio.create_subprocess_exec(*words, env=plain, stdout=pipe, stderr=nowhere)
+    answer, _ = await asked.communicate()
+    return set(answer.decode().split()) if asked.returncode == 0 else None
+
+
+def _answer(error: RuntimeError) -> str:
+    """Return what sbatch says, of an error of dask-jobqueue."""
+    return " ".join(str(error).rpartition("stderr:")[2].split())
+
+
+def _clock(time: timedelta) -> str:
+    minutes = round(time.total_seconds() / 60)
+    return f"{minutes // 60:02}:{minutes % 60:02}:00"
