@@ -75,7 +75,7 @@ class Border:
 
 
 def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
-    """Return the border of a tile.
+    """Return the border of a tile, in the order of `places_of`.
 
     Parameters
     ----------
@@ -83,31 +83,40 @@ def border_of(tile: Grid, reach_m: float) -> tuple[Border, ...]:
         The tile, without halo.
     reach_m : float
         Distance from the corner or edge up to which its grid reaches (m).
+    """
+    size = tile.width, tile.height
+    return tuple(
+        border_at(kind, start, size, tile.crs, tile.cell, reach_m) for kind, start in places_of(tile)
+    )
 
-    Returns
-    -------
-    tuple of Border
-        The corners in the south-west, south-east, north-west and north-east, then the edges in the south,
-        north, west and east.
+
+def places_of(tile: Grid) -> list[tuple[Kind, tuple[float, float]]]:
+    """Return `Border.kind` and `Border.start` of each part of the border of a tile.
+
+    First come the corners in the south-west, south-east, north-west and north-east, then the edges in the
+    south, north, west and east.
     """
     west, south, east, north = tile.exact_bounds
-    corners = [(west, south), (east, south), (west, north), (east, north)]
-    edges: list[tuple[Kind, tuple[float, float]]] = [
+    return [
+        ("corner", (west, south)),
+        ("corner", (east, south)),
+        ("corner", (west, north)),
+        ("corner", (east, north)),
         ("east", (west, south)),
         ("east", (west, north)),
         ("north", (west, south)),
         ("north", (east, south)),
     ]
-    return tuple(
-        _border(tile, kind, start, reach_m) for kind, start in [*(("corner", c) for c in corners), *edges]
-    )
 
 
-def _border(tile: Grid, kind: Kind, start: tuple[float, float], reach_m: float) -> Border:
-    reach = math.ceil(round(reach_m / tile.cell, 6))
-    width = tile.width if kind == "east" else 0
-    height = tile.height if kind == "north" else 0
-    west = round(start[0] - reach * tile.cell, DECIMALS)
-    north = round(start[1] + (height + reach) * tile.cell, DECIMALS)
-    grid = Grid(tile.crs, west, north, tile.cell, width + 2 * reach, height + 2 * reach)
-    return Border(kind, start, (tile.width, tile.height), grid)
+def border_at(
+    kind: Kind, start: tuple[float, float], tile: tuple[int, int], crs: str, cell: float, reach_m: float
+) -> Border:
+    """Return a part of the border of tiles; the arguments are as in `Border`, `Grid` and `border_of`."""
+    reach = math.ceil(round(reach_m / cell, 6))
+    width = tile[0] if kind == "east" else 0
+    height = tile[1] if kind == "north" else 0
+    west = round(start[0] - reach * cell, DECIMALS)
+    north = round(start[1] + (height + reach) * cell, DECIMALS)
+    grid = Grid(crs, west, north, cell, width + 2 * reach, height + 2 * reach)
+    return Border(kind, start, tile, grid)

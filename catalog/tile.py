@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from itertools import compress
+from itertools import combinations
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid, overlap
@@ -73,34 +73,43 @@ class Layer:
         bounds : Bounds
             West, south, east, north (m, in the tile's CRS).
         """
-        if not self.extents:
+        numbers = self._overlapping(bounds)
+        if len(numbers) == len(self.files):
             return self
-        kept = [overlap(extent, bounds, TOUCH_M) for extent in self.extents]
-        if all(kept):
-            return self
-        return self._of(list(compress(range(len(kept)), kept))) if any(kept) else None
+        return self.part(numbers) if numbers else None
 
-    def in_common_order(self) -> Layer:
-        """Return the layer with its files in an order that all tiles that list them agree on.
+    def in_common_order(self, bounds: Bounds) -> list[int]:
+        """Return the numbers of the files that overlap an area, in the order that all tiles agree on.
 
         The files are sorted by name, but of two that overlap the first one stays first, because its values
-        are used. Files of unknown extents stay as they are.
+        are used. Of unknown extents all files are returned as they are.
         """
-        left = sorted(range(len(self.extents)), key=self.files.__getitem__)
+        numbers = self._overlapping(bounds)
+        if len(numbers) < 2 or not self.extents:
+            return numbers
+        left = sorted(numbers, key=self.files.__getitem__)
+        if not any(self._touch(one, other) for one, other in combinations(numbers, 2)):
+            return left
         order = []
         while left:
             first = next(k for k in left if not any(j < k and self._touch(j, k) for j in left))
             left.remove(first)
             order.append(first)
-        return self._of(order) if order else self
+        return order
+
+    def part(self, numbers: Sequence[int]) -> Layer:
+        """Return the layer with the files of these numbers, in that order."""
+        files = tuple(self.files[number] for number in numbers)
+        extents = tuple(self.extents[number] for number in numbers) if self.extents else ()
+        return replace(self, files=files, extents=extents)
+
+    def _overlapping(self, bounds: Bounds) -> list[int]:
+        if not self.extents:
+            return list(range(len(self.files)))
+        return [number for number, extent in enumerate(self.extents) if overlap(extent, bounds, TOUCH_M)]
 
     def _touch(self, one: int, other: int) -> bool:
         return overlap(self.extents[one], self.extents[other], TOUCH_M)
-
-    def _of(self, chosen: Sequence[int]) -> Layer:
-        """Return the layer with the chosen files, in that order."""
-        files = tuple(self.files[number] for number in chosen)
-        return replace(self, files=files, extents=tuple(self.extents[number] for number in chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +159,14 @@ class Tile:
         CatalogError
             If a file lies outside the folders that the tile may read.
         """
-        if self.allowed and (outside := self.outside(layer)):
-            raise self.allowed.refusal(f"tile {self.id}: {layer.name}", outside)
-        return tuple(located(full_name(self.root, file)) for file in layer.files)
+        return tuple(self.path(layer.name, file) for file in layer.files)
+
+    def path(self, layer: str, file: str) -> Location:
+        """Return the location of one file of the named layer; raises what `paths` raises."""
+        name = full_name(self.root, file)
+        if self.allowed and not self.allowed.permits(name):
+            raise self.allowed.refusal(f"tile {self.id}: {layer}", name)
+        return located(name)
 
     def lacks(self, path: Location) -> bool:
         """Return whether a file of the tile is missing: when its graph was made, or if unknown, now."""
@@ -189,7 +203,11 @@ class Tile:
         )
         return replace(self, layers=layers)
 
-    def around(self, grid: Grid, reach: Bounds) -> Tile:
+    def layers_around(self, names: Collection[str] = BORDER_LAYERS) -> list[Layer]:
+        """Return the layers of ground along the tile's border (`around`) with one of these names."""
+        return [layer for layer in self.all_layers if layer.name in BORDER_LAYERS and layer.name in names]
+
+    def around(self, grid: Grid, reach: Bounds, names: Collection[str] = BORDER_LAYERS) -> Tile:
         """Return a tile of other ground within `REACH_M`, made of this tile's files, with this tile's id.
 
         Its layers are the same whichever tile of the catalog they are taken from, if their extents are known
@@ -201,14 +219,28 @@ class Tile:
             The grid of the new tile: rasters keep the files that reach it.
         reach : Bounds
             West, south, east, north (m): photo and roads keep the files that reach this area.
+        names : collection of str
+            Names of the layers that it has.
         """
-        limited = (
-            layer.reaching(grid.bounds if layer.name in LOADED else reach)
-            for layer in self.all_layers
-            if layer.name in BORDER_LAYERS
-        )
-        layers = tuple(layer.in_common_order() for layer in limited if layer)
+        found = files_around(self.layers_around(names), grid.bounds, reach)
+        layers = tuple(layer.part(numbers) for layer, numbers in found)
         return replace(self, grid=grid, layers=layers, nearby=())
+
+
+def files_around(layers: Iterable[Layer], bounds: Bounds, reach: Bounds) -> list[tuple[Layer, list[int]]]:
+    """Return the layers with files that reach other ground, and the numbers of these files (`Tile.around`).
+
+    Parameters
+    ----------
+    layers : iterable of Layer
+        Those of a tile (`Tile.layers_around`).
+    bounds : Bounds
+        The ground: files of rasters reach it.
+    reach : Bounds
+        Photo and roads reach this area.
+    """
+    found = ((layer, layer.in_common_order(bounds if layer.name in LOADED else reach)) for layer in layers)
+    return [(layer, numbers) for layer, numbers in found if numbers]
 
 
 def faulty(tile_id: str, fault: str, root: str) -> Tile:

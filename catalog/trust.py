@@ -25,6 +25,8 @@ from flexroad.catalog.storage.paths import Location, absolute, join, normalise, 
 ADDRESS = re.compile(r"(?!(?i:s3):)[a-zA-Z][a-zA-Z0-9+.-]*:/|/+vsi")
 LONGEST_SHOWN = 500
 """Longest path that a message repeats."""
+KEPT = 16384
+"""Names of files of which the location and the permission are kept: tiles come row by row."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ class AllowedFolders:
         )
 
 
+# Neighbouring tiles list the same files.
+@lru_cache(maxsize=KEPT)
 def full_name(root: str, file: str) -> str:
     """Return the full path or address of a tile's file."""
     return next((text for text in (file, root) if ADDRESS.match(text)), None) or join(root, file)
@@ -91,12 +95,18 @@ def full_name(root: str, file: str) -> str:
 
 def located(name: str) -> Location:
     """Return a file as an absolute location; GDAL takes ``GTIFF_DIR:1:a.tif`` for more than a name."""
+    if name.startswith("/"):
+        return _on_disk(name)
     location = parse_location(name)
     return location.absolute() if isinstance(location, Path) else location
 
 
-# Neighbouring tiles list the same files.
-@lru_cache(maxsize=65536)
+@lru_cache(maxsize=KEPT)
+def _on_disk(name: str) -> Path:
+    return Path(name)
+
+
+@lru_cache(maxsize=KEPT)
 def _permitted(name: str, folders: tuple[str, ...]) -> bool:
     return not ADDRESS.match(name) and resolved(name).startswith(_prefixes(folders))
 

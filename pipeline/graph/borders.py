@@ -12,19 +12,23 @@ around it, and not from a tile: neighbouring tiles have the same node, and the f
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 
-from flexroad.catalog import Catalog, Grid, Tile
-from flexroad.catalog.borders import Border, border_of
-from flexroad.catalog.tile import REACH_M
+from flexroad.catalog import Catalog, Grid, Layer, Tile
+from flexroad.catalog.borders import Border, Kind, border_at, border_of, places_of
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.tile import REACH_M, files_around
 from flexroad.pipeline.config.models import Chain, Config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.stages import stage_function, stage_module
+from flexroad.pipeline.graph.sources import border_json, to_json
+from flexroad.pipeline.graph.stages import model_files, stage_function, stage_head, stage_module
 from flexroad.tasks.errors import LayerMissing, TaskError
 from flexroad.tasks.load import READS, load_border
 from flexroad.tasks.load import Options as LoadOptions
@@ -42,6 +46,9 @@ its cluster, and a short piece of a viaduct would look like an object. A larger 
 the distance up to which the control points act: without ground there, the mesh must not depend on them."""
 ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
 """Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
+
+KEPT = 4096
+"""Corners and edges that are kept because the tiles of the next row have them, too: of a thousand tiles."""
 
 
 def has_borders(fit: Options) -> bool:
@@ -147,14 +154,68 @@ class BorderTask:
 
     def ground(self, tile: Tile) -> Tile:
         """Return the ground around it, with the files of a tile that reach it and that the stages read."""
-        ground = tile.around(self.border.grid, self.border.within(REACH_M))
-        layers = tuple(layer for layer in ground.layers if layer.name in self.stages.reads)
-        return replace(ground, layers=layers)
+        return tile.around(self.border.grid, self.border.within(REACH_M), self.stages.reads)
 
     def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:
         """Return the control points of the corner, or of the edge between its two ends."""
         data = load_border(self.ground(tile), tile.grid, self.stages.load)
         return self.stages.part(self.border, data, ends)
+
+
+@dataclass(frozen=True)
+class BorderPattern:
+    """The part of the nodes of corners and edges that is the same for all tiles of a run, computed once."""
+
+    stages: BorderStages
+    head: str
+    """Stages, their `VERSION` and options as JSON, the part of the hashed text that all share."""
+    reach_m: float
+    """`BorderStages.reach_m`."""
+    reads: frozenset[str]
+    """`BorderStages.reads`."""
+    files: tuple[Path, ...]
+    """Files named by the options, such as a model."""
+
+    @classmethod
+    def of(cls, chain: Chain) -> BorderPattern:
+        """Return that of a variant."""
+        stages = BorderStages.of(chain)
+        heads = [stage_head(stage, options) for stage, options in stages.by_name.items()]
+        head = to_json([STAGE, stage_module(stages.load).VERSION, stages.heights, heads])[1:-1]
+        files = tuple(file for options in stages.by_name.values() for file in model_files(options))
+        return cls(stages, head, stages.reach_m, stages.reads, files)
+
+    def parts(self, tile: Tile) -> Iterator[BorderPart]:
+        """Yield the corners and edges of a tile, in the order of `Frame`'s fields."""
+        grid, layers = tile.grid, tile.layers_around(self.reads)
+        size = grid.width, grid.height
+        for kind, start in places_of(grid):
+            border, place, bounds, reach = _described(
+                kind, repr(start), size, grid.crs, grid.cell, self.reach_m
+            )
+            yield BorderPart(BorderTask(border, self.stages), place, files_around(layers, bounds, reach))
+
+
+@dataclass(frozen=True)
+class BorderPart:
+    """A corner or edge of a tile, as it enters fingerprints."""
+
+    task: BorderTask
+    place: str
+    """Its position as JSON, without the closing bracket."""
+    layers: list[tuple[Layer, list[int]]]
+    """The layers of `BorderTask.ground`, and the numbers of their files."""
+
+
+# The text of a position tells -0.0 from 0.0, and the types of the sizes count: they do in fingerprints.
+@lru_cache(maxsize=KEPT, typed=True)
+def _described(
+    kind: Kind, start: str, tile: tuple[int, int], crs: str, cell: float, reach_m: float
+) -> tuple[Border, str, Bounds, Bounds]:
+    """Return a corner or edge, its position as JSON, its ground, and the area that photo and roads reach."""
+    east, north = map(float, start.strip("()").split(", "))
+    border = border_at(kind, (east, north), tile, crs, cell, reach_m)
+    return border, border_json(border)[:-1], border.grid.bounds, border.within(REACH_M)
 
 
 def check_tiles(config: Config, catalog: Catalog) -> None:

@@ -18,27 +18,34 @@ node whose artefact is in the store is not computed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Layer, Tile
-from flexroad.catalog.borders import border_of
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
-from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, BorderTask, has_borders
+from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderPattern, BorderTask, has_borders
 from flexroad.pipeline.graph.products import product_layers, product_options, product_versions
-from flexroad.pipeline.graph.sources import Recorded, SourceFiles, Stat, hashed, to_json
+from flexroad.pipeline.graph.sources import (
+    Recorded,
+    SourceFiles,
+    Stat,
+    grid_json,
+    hashed,
+    names_json,
+    to_json,
+)
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
     STAGES,
     Stage,
     model_files,
     stage_function,
+    stage_head,
     stage_module,
 )
-from flexroad.tasks import load
 from flexroad.tasks.options import Options
 
 
@@ -127,7 +134,7 @@ class Step:
     files: tuple[Path, ...]
     """Files named by its options, such as a model."""
     stored: bool
-    borders: BorderStages | None = None
+    borders: BorderPattern | None = None
     """The stages of the border that it takes, None if it takes none."""
     framed: int | None = None
     """Index of the step whose frame it takes, None if it takes none."""
@@ -190,20 +197,21 @@ class Pattern:
         own = tile.within(tile.grid.buffered(self.halo_m).bounds)
         sources = SourceFiles(tile, stat_file, checksum, recorded)
         layers_read = [layer for layer in own.layers if layer.name in self.reads]
-        texts = [(layer.name, to_json(sources.entry(layer))) for layer in layers_read]
+        texts = [(layer.name, sources.text(layer)) for layer in layers_read]
+        grid = grid_json(tile.grid)
         names: list[str] = []
         nodes: dict[str, Node] = {}
         for step in self.steps:
             inputs = tuple(names[number] for number in step.inputs)
             frame: tuple[str, ...] = ()
             if step.borders:
-                shared = _border_nodes(tile, step, sources)
+                shared = _border_nodes(tile, step, sources, grid)
                 nodes |= {node.fingerprint: node for node in shared}
                 frame = tuple(node.fingerprint for node in shared)
             elif step.framed is not None:
                 frame = nodes[names[step.framed]].frame
             # The input of the first stage is the tile, hashed by its grid.
-            hashed_inputs = to_json((*inputs, *frame)) if inputs else to_json(asdict(tile.grid))
+            hashed_inputs = names_json((*inputs, *frame)) if inputs else grid
             layers = ",".join(text for layer, text in texts if layer in step.reads)
             name = hashed(f"[{step.head},{hashed_inputs},[{layers}],{sources.models(step.files)}]")
             names.append(name)
@@ -225,9 +233,9 @@ class Pattern:
             tile.stratum,
             [[variant, names["evaluate"], names["assess"]] for variant, names in variants.items()],
             [variants[variant]["sample"] for variant in self.export.variants],
-            *(sources.entry(layer) for layer in _product_sources(tile, self.export)),
         ]
-        return hashed(f"{to_json(requested)[:-1]},{self.exported}]")
+        layers = [sources.text(layer) for layer in _product_sources(tile, self.export)]
+        return hashed(f"{','.join([to_json(requested)[:-1], *layers, self.exported])}]")
 
 
 def _product_sources(tile: Tile, export: Export) -> tuple[Layer, ...]:
@@ -241,9 +249,9 @@ def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) 
     module = stage_module(options)
     stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
     reads = getattr(module, "READS", ())
-    head = to_json(_head(stage.name, options))[1:-1]
+    head = to_json(stage_head(stage.name, options))[1:-1]
     shared = has_borders(chain["fit"])
-    borders = BorderStages.of(chain) if shared and stage.name == "fit" else None
+    borders = BorderPattern.of(chain) if shared and stage.name == "fit" else None
     # A second fit and the mesh of a tile take the frame of its surface.
     refit = chain["fit"] if getattr(options, "holdout", 0) else None
     framed = inputs[stage.inputs.index("fit")] if shared and (refit or stage.name == "sample") else None
@@ -252,28 +260,18 @@ def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) 
     )
 
 
-def _head(stage: str, options: Options) -> list[Any]:
-    return [stage, stage_module(options).VERSION, options.model_dump(mode="json")]
-
-
-def _border_nodes(tile: Tile, step: Step, sources: SourceFiles) -> list[Node]:
-    """Return the nodes of a tile's corners and edges, in the order of `Frame`'s fields."""
+def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> list[Node]:
+    """Return the nodes of a tile's corners and edges, in the order of `Frame`'s fields; ``grid`` is JSON."""
     assert step.borders
-    chain = step.borders.by_name
-    stages = [_head(stage, options) for stage, options in chain.items()]
-    head = to_json([STAGE, load.VERSION, step.borders.heights, stages])[1:-1]
-    models = sources.models([file for options in chain.values() for file in model_files(options)])
-    nodes: list[Node] = []
-    for number, border in enumerate(border_of(tile.grid, step.borders.reach_m)):
-        task = BorderTask(border, step.borders)
-        layers = task.ground(tile).layers
+    pattern, nodes = step.borders, list[Node]()
+    models = sources.models(pattern.files)
+    for number, part in enumerate(pattern.parts(tile)):
         ends = tuple(nodes[end].fingerprint for end in ENDS[number - 4]) if number >= 4 else ()
         # Files of unknown position may have none of their own: it is then that of the tile.
-        core = None if all(layer.extents for layer in layers) else asdict(tile.grid)
-        place = to_json([border.kind, border.start, border.tile, asdict(border.grid), core])
-        text = to_json([sources.entry(layer) for layer in layers])
-        name = hashed(f"[{head},{place},{to_json(ends)},{text},{models}]")
-        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=task))
+        core = "null" if all(layer.extents for layer, _ in part.layers) else grid
+        text = ",".join([sources.text(layer, numbers) for layer, numbers in part.layers])
+        name = hashed(f"[{pattern.head},{part.place},{core}],{names_json(ends)},[{text}],{models}]")
+        nodes.append(Node(name, STAGE, step.options, ends, stored=True, border=part.task))
     return nodes
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, fields
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog import Layer, Tile
+from flexroad.catalog import Grid, Layer, Tile
+from flexroad.catalog.borders import Border
 from flexroad.catalog.storage.paths import FileStat, Location, read, stat
 
 Stat = Callable[[Location], FileStat | None]
@@ -25,11 +26,31 @@ Entry = list[Any]
 """Name of a layer, its files (`File`), values, CRS and, if it has one, its conversion."""
 
 to_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
+_GRID = tuple(field.name for field in fields(Grid))
 
 
 def hashed(text: str) -> str:
     """Return the first 32 hexadecimal digits of the SHA-256 of a text."""
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def names_json(fingerprints: Iterable[str]) -> str:
+    """Return fingerprints as JSON: they need no escapes."""
+    return "[" + ",".join([f'"{name}"' for name in fingerprints]) + "]"
+
+
+def grid_json(grid: Grid) -> str:
+    """Return a grid as JSON."""
+    return to_json(_fields(grid))
+
+
+def border_json(border: Border) -> str:
+    """Return a corner or edge as JSON."""
+    return to_json([border.kind, border.start, border.tile, _fields(border.grid)])
+
+
+def _fields(grid: Grid) -> dict[str, Any]:
+    return {name: getattr(grid, name) for name in _GRID}
 
 
 @dataclass
@@ -47,16 +68,21 @@ class SourceFiles:
     """Size and version of each file, by path; None if it was missing, or could not be read to be hashed."""
     files: dict[tuple[str, str], File] = field(default_factory=dict)
     """Hashed description of each file, by layer and name."""
+    texts: dict[tuple[str, str], str] = field(default_factory=dict)
+    """These descriptions as JSON."""
     layers: dict[str, Layer] = field(default_factory=dict)
     """The layers of these files, by name."""
+    frames: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """The JSON of an entry before and after its files, by name of the layer."""
 
-    def entry(self, layer: Layer) -> Entry:
-        """Return the hashed description of a layer and its files."""
-        self.layers.setdefault(layer.name, layer)
-        for name, path in zip(layer.files, self.tile.paths(layer), strict=True):
-            if (layer.name, name) not in self.files:
-                self.files[layer.name, name] = self._file(layer.name, name, path)
-        return _entry(layer, [self.files[layer.name, name] for name in layer.files])
+    def text(self, layer: Layer, numbers: Iterable[int] | None = None) -> str:
+        """Return the hashed description of a layer (`Entry`) as JSON; with ``numbers``, of these files."""
+        if layer.name not in self.layers:
+            self.layers[layer.name] = layer
+            self.frames[layer.name] = f"[{to_json(layer.name)},[", f"],{to_json(_about(layer))[1:]}"
+        start, end = self.frames[layer.name]
+        names = layer.files if numbers is None else [layer.files[number] for number in numbers]
+        return f"{start}{','.join([self._text(layer.name, name) for name in names])}{end}"
 
     def models(self, files: Iterable[Path]) -> str:
         """Return the checksums of files that options name, such as a model, as JSON."""
@@ -69,6 +95,13 @@ class SourceFiles:
         for (layer, _), file in self.files.items():
             by_layer.setdefault(layer, []).append(file)
         return [_entry(layer, by_layer.get(name, [])) for name, layer in self.layers.items()]
+
+    def _text(self, layer: str, name: str) -> str:
+        text = self.texts.get((layer, name))
+        if text is None:
+            file = self.files[layer, name] = self._file(layer, name, self.tile.path(layer, name))
+            text = self.texts[layer, name] = to_json(file)
+        return text
 
     def _file(self, layer: str, name: str, path: Location) -> File:
         found = self.stat_file(path)
@@ -85,16 +118,21 @@ class SourceFiles:
         self.stats[str(path)] = found if checksum else None
         return checksum
 
-    @property
+    @cached_property
     def _recorded(self) -> dict[tuple[str, str], File]:
         return {(name, file[0]): file for name, files, *_ in self.recorded for file in files}
 
 
 def _entry(layer: Layer, files: list[File]) -> Entry:
+    return [layer.name, files, *_about(layer)]
+
+
+def _about(layer: Layer) -> list[Any]:
+    """Return the part of an entry that does not depend on the files."""
     # Only where they are set, so that older fingerprints stay valid.
     how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject or layer.height_unit else []
     how += [["sublayer", layer.sublayer]] if layer.sublayer else []
-    return [layer.name, files, list(layer.values), layer.crs, *how]
+    return [list(layer.values), layer.crs, *how]
 
 
 def _checksum(path: Location, file: FileStat | None) -> str | None:

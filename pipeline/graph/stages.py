@@ -59,6 +59,11 @@ def stage_version(stage: str, options: Options) -> tuple[str, int]:
     return f"{stage}.{method}" if method else stage, stage_module(options).VERSION
 
 
+def stage_head(stage: str, options: Options) -> list[Any]:
+    """Return stage, `VERSION` and options as they enter fingerprints."""
+    return [stage, stage_module(options).VERSION, options.model_dump(mode="json")]
+
+
 def stage_function(stage: str, options: Options) -> Callable[..., Any]:
     """Return the function that computes a stage: the function named ``stage`` in the options' module."""
     function: Callable[..., Any] = getattr(stage_module(options), stage)

@@ -120,6 +120,8 @@ def test_common_order_is_by_name_unless_files_overlap(first, second):
         stacked = iter([2, 1, 0])
         kept = [number if number > 2 else next(stacked) for number in order]
         layer = Layer("dsm", tuple(names[k] for k in kept), (), None, tuple(extents[k] for k in kept))
-        orders.append(layer.in_common_order())
+        orders.append(layer.part(layer.in_common_order((0.0, 0.0, 300.0, 100.0))))
+        touched = layer.part(layer.in_common_order((120.0, 0.0, 130.0, 100.0)))
+        assert touched.files == ("c_2022",)
     assert orders[0] == orders[1]
     assert orders[0].files == ("a", "c_2022", "b_2020", "b_2018", "d")

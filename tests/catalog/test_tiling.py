@@ -1,5 +1,7 @@
 """Folders of rasters in several CRSs and units, cut into tiles of one CRS."""
 
+import json
+
 import numpy as np
 import pytest
 from pyproj import Transformer
@@ -67,7 +69,7 @@ def test_fingerprint_changes_with_the_decision_to_reproject(mixed):
         for conversion in (Conversion(), Conversion(True), Conversion(True, height_unit="foot"))
     )
     entries = [
-        SourceFiles(tile, lambda path: None, checksum=False).entry(tile.layer("dtm"))
+        json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(tile.layer("dtm")))
         for tile in (plain, warped, feet)
     ]
     assert len(entries[0]) == 4

@@ -1,21 +1,29 @@
 """Corners and edges as nodes of the graph: shared by neighbours, changed only by files that reach them."""
 
+import hashlib
+import json
 import os
 import shutil
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import asdict, replace
+from random import Random
 
 import numpy as np
 import pytest
 import rasterio
 
 from flexroad.catalog import Catalog, Grid, Layer, Tile
+from flexroad.catalog.borders import border_of
 from flexroad.catalog.sources import prepared, rasters
+from flexroad.catalog.storage.paths import FileStat
+from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.borders import STAGE, BorderStages, check_tiles
+from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, check_tiles
 from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
+from flexroad.pipeline.graph.stages import model_files, stage_module
+from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.lattice import Lattice
 
@@ -150,6 +158,89 @@ def test_options_of_fit_and_filter_change_borders_and_others_do_not(survey):
         raw = {**PRODUCTION.raw, stage: {**PRODUCTION.raw[stage], **option}}
         _, other = names(catalog, compose(raw, "other"))
         assert (other != parts) == changes, stage
+
+
+def reference_nodes(tile, config, stat_file):
+    """Compute the fingerprints of corners and edges directly from the definition in `borders.py`."""
+
+    def described(layer):
+        files = [(name, stat_file(path)) for name, path in zip(layer.files, tile.paths(layer), strict=True)]
+        how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject else []
+        return [
+            *(
+                layer.name,
+                [[name, file.size, file.version] if file else [name, None] for name, file in files],
+            ),
+            *(list(layer.values), layer.crs, *how),
+        ]
+
+    stages = BorderStages.of(config.chains["flexroad"])
+    heads = [
+        [name, stage_module(options).VERSION, options.model_dump(mode="json")]
+        for name, options in stages.by_name.items()
+    ]
+    found = []
+    for number, border in enumerate(border_of(tile.grid, stages.reach_m)):
+        ground = tile.around(border.grid, border.within(REACH_M), stages.reads)
+        known = all(layer.extents for layer in ground.layers)
+        place = [
+            border.kind,
+            border.start,
+            border.tile,
+            asdict(border.grid),
+            None if known else asdict(tile.grid),
+        ]
+        ends = [found[end] for end in ENDS[number - 4]] if number >= 4 else []
+        models = [hashlib.sha256(path.read_bytes()).hexdigest() for path in model_files(stages.segment)]
+        layers = [described(layer) for layer in ground.layers]
+        content = [STAGE, load.VERSION, stages.heights, heads, place, ends, layers, models]
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        found.append(hashlib.sha256(text.encode()).hexdigest()[:32])
+    return found
+
+
+def scattered(seed):
+    """Return a tile whose layers have files of any extent, order and name, some of them missing."""
+    random = Random(seed)
+    grid = Grid("EPSG:25832", random.choice([500000.0, 0.3, -250.0]), 5600000.3, 1.0, 250, 250)
+    west, south, *_ = grid.bounds
+    layers = []
+    for name in ("dsm", "dtm", "road_height", "dop", "road_mask", "roads"):
+        files = random.sample(
+            ["b.tif", "a.tif", 'ü"x.tif', "sub/c.tif", "gone.tif", "z.tif"], random.randint(1, 6)
+        )
+        corners = [(west + random.uniform(-300, 400), south + random.uniform(-300, 400)) for _ in files]
+        extents = tuple((x, y, x + random.uniform(1, 400), y + random.uniform(1, 400)) for x, y in corners)
+        known = extents if random.random() < 0.9 else ()
+        layers.append(Layer(name, tuple(files), (1, 3), None, known, random.random() < 0.3))
+    return Tile("t", grid, tuple(layers[:4]), "/data", MADE, nearby=tuple(layers[4:]))
+
+
+@pytest.mark.parametrize("method", ["mask", "dinov2"])
+def test_fingerprint_of_border_is_hash_of_stages_place_ends_files_and_models(method, tmp_path):
+    (tmp_path / "model").write_bytes(b"any")
+    segment = {"method": method} | ({"model": str(tmp_path / "model")} if method == "dinov2" else {})
+    config = compose({**PRODUCTION.raw, "segment": segment}, "x")
+
+    def stat_file(path):
+        return None if path.name == "gone.tif" else FileStat(len(str(path)), 7)
+
+    for tile in map(scattered, range(40)):
+        graph = Pattern.of(config).graph(tile, stat_file=stat_file)
+        assert [node.fingerprint for node in borders(graph)] == reference_nodes(tile, config, stat_file)
+
+
+def test_fingerprint_of_border_does_not_depend_on_tiles_before():
+    """0.0 and -0.0, or 1 and 1.0, are equal numbers, but other texts."""
+    layers = (Layer("dsm", ("a.tif",), (), None, ((-300.0, -300.0, 500.0, 500.0),)),)
+    tiles = [
+        Tile("t", Grid("EPSG:25832", west, 250.0, cell, 250, 250), layers, "/data", MADE)
+        for west, cell in ((0.0, 1.0), (-0.0, 1.0), (0.0, 1))
+    ]
+    for tile in (*tiles, *reversed(tiles)):
+        graph = Pattern.of(PRODUCTION).graph(tile, stat_file=lambda path: FileStat(1, 2))
+        names = reference_nodes(tile, PRODUCTION, lambda path: FileStat(1, 2))
+        assert [node.fingerprint for node in borders(graph)] == names
 
 
 def test_paper_has_no_borders(survey):
