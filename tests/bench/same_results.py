@@ -28,14 +28,21 @@ SEED, SIZE_M = 7, 120
 PRODUCTS = (".glb", ".ply", ".tif", ".npz", ".vrt")
 ITEM = ("fingerprint", "nodes", "sources", "versions", "notes")
 """Properties of an item that are compared, after ``flexroad:``."""
-COMMAND = "from flexroad.pipeline.cli.main import main; main()"
+COMMAND = """
+import sys, flexroad
+assert flexroad.__file__ == sys.argv.pop(1), f"{flexroad.__file__} is imported, not the checkout"
+from flexroad.pipeline.cli.main import main
+main()
+"""
 
 
 def run(root: Path, catalog: Path, config: str, out: Path) -> dict[str, str]:
     """Run a configuration with a checkout; return what it has given, by name."""
     words = ["run", "--config", config, "--catalog", str(catalog), "--out", str(out), "--executor", "serial"]
     environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(root)}
-    subprocess.run([sys.executable, "-c", COMMAND, *words], cwd=catalog.parent, env=environment, check=True)
+    command = [sys.executable, "-c", COMMAND, str(root / "flexroad" / "__init__.py"), *words]
+    # In another folder: Python would import the package of the folder that it is started in.
+    subprocess.run(command, cwd=catalog.parent, env=environment, check=True)
     results = {str(path.relative_to(out)): "stored" for path in (out / "store").rglob("*.npz")}
     for path in out.rglob("*"):
         if path.suffix in PRODUCTS and out / "store" not in path.parents:

@@ -1,0 +1,60 @@
+"""Print how large the project is: lines, files, public classes, imports in functions, words of the docs.
+
+Counted is what git tracks. Public classes stand at the top level of a module, without a leading underscore.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SOURCE = ("catalog", "tasks", "pipeline", "flexroad")
+
+
+def tracked(*patterns: str) -> list[Path]:
+    """Return the tracked files below the folders, or of the names."""
+    command = ["git", "ls-files", "-z", "--", *patterns]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [ROOT / name for name in names.split("\0") if name and not (ROOT / name).is_symlink()]
+
+
+def lines(files: list[Path]) -> int:
+    return sum(len(file.read_text().splitlines()) for file in files)
+
+
+def words(files: list[Path]) -> int:
+    return sum(len(file.read_text().split()) for file in files)
+
+
+def inner_imports(tree: ast.Module) -> int:
+    """Return the number of imports inside the functions of a module."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    inside = {node for function in functions for node in ast.walk(function)}
+    return sum(isinstance(node, ast.Import | ast.ImportFrom) for node in inside)
+
+
+def main() -> None:
+    source = [file for file in tracked(*SOURCE) if file.suffix == ".py"]
+    tests = [file for file in tracked("tests") if file.suffix == ".py"]
+    trees = [ast.parse(file.read_text()) for file in source]
+    classes = [node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
+    pages = [file for file in tracked("docs") if file.suffix == ".md"]
+    live = [file for file in pages if not {"archive", "results"} & set(file.parts)]
+    figures = {
+        "source: lines of Python": lines(source),
+        "source: files": len(source),
+        "source: public classes": sum(not name.startswith("_") for name in classes),
+        "source: imports in functions": sum(map(inner_imports, trees)),
+        "tests: lines of Python": lines(tests),
+        "tests: files": len(tests),
+        "README: lines": lines([ROOT / "README.md"]),
+        "docs: words": words(live),
+        "docs: words of results, archive": words(pages) - words(live),
+    }
+    for name, value in figures.items():
+        print(f"{name:32}{value:8,}")
+
+
+main()
