@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from flexroad.pipeline.execute.workers import checksum_of_code
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
@@ -31,3 +33,6 @@ def test_wheel_contains_one_import_package(tmp_path):
         "py.typed",
     ):
         assert f"flexroad/{file}" in names
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    # Clients and workers may be installed in either way.
+    assert checksum_of_code(tmp_path / "flexroad") == checksum_of_code()

@@ -227,6 +227,13 @@ def visible_entry(folder: Location, without: Collection[str] = ()) -> str | None
     return next((name for name in names if not name.startswith(".") and name not in left_out), None)
 
 
+def hidden_files(folder: Location) -> dict[str, int]:
+    """Return the sizes of a folder's hidden files (bytes) by name, without those in subfolders."""
+    if isinstance(folder, Path):
+        return {path.name: path.stat().st_size for path in folder.glob(".*") if path.is_file()}
+    return {name: file.size for name, file in entries_of(folder) if name.startswith(".")}
+
+
 def sidecars(where: UPath) -> set[str]:
     """Return the names of a file in a bucket and of the files with the same stem, by one list request.
 

@@ -80,11 +80,12 @@ class DaskExecutor:
 
         with (
             _quiet(),
+            # Left after the workers have ended, which may still write files of the probe.
+            probe or contextlib.nullcontext(),
             open_cluster(
                 self.cluster, self.workers, self.scheduler, self.dashboard, self.logs, self.say
             ) as target,
             self._connected(target) as client,
-            probe or contextlib.nullcontext(),
         ):
             check = _check_workers(client, target, probe)
             session = Session(

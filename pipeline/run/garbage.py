@@ -16,7 +16,7 @@ from typing import Literal
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.ids import safe_name
-from flexroad.catalog.storage.paths import Location, absolute, entries, exists, listing, remove
+from flexroad.catalog.storage.paths import Location, absolute, entries, exists, hidden_files, listing, remove
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -106,10 +106,7 @@ def find_garbage(runs: Sequence[Run]) -> Iterator[Garbage]:
     yield from _in_store(first.store, needed)
     yield from _in_tiles(first)
     for folder in (first.path, first.store):
-        # Buckets have no temporary files.
-        if isinstance(folder, Path):
-            files = [path for path in folder.glob(".*") if path.is_file()]
-            yield from _temporary(folder, {path.name: path.stat().st_size for path in files})
+        yield from _temporary(folder, hidden_files(folder))
 
 
 def delete(garbage: Iterable[Garbage]) -> Iterator[Garbage]:

@@ -242,7 +242,7 @@ def _close(
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
     summary = replace(
-        _final_summary(run, database, start, plan is not None, interrupted),
+        _final_summary(run, database, start, plan, interrupted),
         interrupted=interrupted,
         refused=refused,
     )
@@ -262,11 +262,14 @@ def _close(
     return summary
 
 
-def _final_summary(run: Run, database: RunDatabase, start: str, planned: bool, interrupted: bool) -> Summary:
+def _final_summary(
+    run: Run, database: RunDatabase, start: str, plan: Plan | None, interrupted: bool
+) -> Summary:
     """Return the summary at the end of a run, of which ``start`` is the time."""
-    if planned:
+    if plan:
         _repair(run, database, start)
-        if not interrupted:
+        if plan.todo and not interrupted:
+            # Without any tile to process they have just been looked at.
             _check_markers(run, database)
     elif interrupted and database.listed(tile.id for tile in run.catalog.tiles) is None:
         # The run is to end soon: checking the tiles would take as long as the start that was interrupted.

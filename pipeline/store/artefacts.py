@@ -25,7 +25,7 @@ from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
 
 PROBE = ".probe-"
-"""Start of the names of files that only try whether a folder can be written."""
+"""Start of the names of files that only try a folder; 32 hexadecimal digits follow."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -66,11 +66,6 @@ class ArtefactStore:
         return contained(self.root / stage / fingerprint[:2] / f"{fingerprint}.npz", self.root)
 
 
-def probe_name() -> str:
-    """Return a new name of a file that only tries a folder; such files are removed by ``flexroad clean``."""
-    return f"{PROBE}{uuid.uuid4().hex}"
-
-
 def check_writable(folder: Location) -> None:
     """Check that files can be written in ``folder``.
 
@@ -79,6 +74,6 @@ def check_writable(folder: Location) -> None:
     OSError
         If not; with the reason and the path.
     """
-    probe = folder / probe_name()
+    probe = folder / f"{PROBE}{uuid.uuid4().hex}"
     paths.write(probe, b"")
     paths.remove(probe)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import PurePath
@@ -10,7 +11,7 @@ from types import TracebackType
 
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import FileStat, parse_location
-from flexroad.pipeline.store.artefacts import probe_name
+from flexroad.pipeline.store.artefacts import PROBE
 from flexroad.pipeline.worker.tile import TileJob
 
 MOUNT = "mount it there under the same path"
@@ -32,14 +33,20 @@ class Proof:
 class SharedFiles:
     """The folders that client and workers share (a `flexroad.pipeline.execute.executor.Probe`).
 
-    The client writes a file with a random name into each folder, and removes it at the end. A worker looks
-    for it, and writes one of its own, which the client looks for and removes.
+    The client writes a file with a random name into each folder. A worker looks for it, and writes one of its
+    own, which the client looks for. At the end the client removes all of them; ``flexroad clean`` removes
+    those of a client that was killed.
     """
 
     folders: tuple[str, ...]
     """The run and its store."""
-    name: str = field(default_factory=probe_name)
-    """Name of the client's files."""
+    start: str = field(default_factory=lambda: f"{PROBE}{secrets.token_hex(8)}")
+    """Start of the names of all files; 16 hexadecimal digits follow."""
+
+    @property
+    def name(self) -> str:
+        """Name of the client's files."""
+        return f"{self.start}{0:016x}"
 
     def __enter__(self) -> SharedFiles:
         """Write the client's files."""
@@ -50,7 +57,11 @@ class SharedFiles:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._remove(self.name)
+        for folder in map(parse_location, self.folders):
+            with contextlib.suppress(OSError):
+                for name in paths.hidden_files(folder):
+                    if name.startswith(self.start):
+                        paths.remove(folder / name)
 
     def answer(self, job: TileJob) -> Proof:
         """Return the proof of this process, a worker, whose first job is ``job``.
@@ -60,7 +71,7 @@ class SharedFiles:
         OSError
             If a folder is not that of the client, or cannot be written.
         """
-        own = probe_name()
+        own = f"{self.start}{secrets.token_hex(8)}"
         try:
             for folder in self.folders:
                 self._meet(folder, own)
@@ -77,7 +88,7 @@ class SharedFiles:
         OSError
             If not.
         """
-        missing = [folder for folder in self.folders if not _exists(folder, proof.name)]
+        missing = [folder for folder in self.folders if not _arrived(folder, proof.name)]
         self._remove(proof.name)
         if missing:
             raise OSError(f"what it writes to {missing[0]} does not arrive here; {MOUNT}")
@@ -104,8 +115,11 @@ class SharedFiles:
                 paths.remove(parse_location(folder) / name)
 
 
-def _exists(folder: str, name: str) -> bool:
-    return paths.stat(parse_location(folder) / name) is not None
+def _arrived(folder: str, name: str) -> bool:
+    location = parse_location(folder)
+    if paths.stat(location / name) is None:
+        paths.refresh(location)
+    return paths.stat(location / name) is not None
 
 
 def _different(job: TileJob) -> dict[str, FileStat | None]:

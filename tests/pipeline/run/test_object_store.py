@@ -108,6 +108,17 @@ def assert_files_complete(run):
         assert folder.verified() == paths.exists(folder.path / "item.json")
 
 
+def test_clean_removes_files_that_only_try_a_folder(run, flexroad):
+    """A client that is killed leaves such a file in the run and in the store."""
+    killed = [folder / f".probe-{'0a' * 16}" for folder in (run.path, run.store)]
+    others = [run.path / ".probe-others", run.path / "mine" / killed[0].name]
+    for file in (*killed, *others):
+        paths.write(file, b"")
+    flexroad("clean", run.path)
+    assert not any(map(paths.exists, killed))
+    assert all(map(paths.exists, others))
+
+
 def test_run_in_bucket_equals_run_on_disk(survey, made_survey, bucket, tmp_path):
     config = compose(QUICK, "quick")
     local = on_disk(made_survey, tmp_path, config)

@@ -42,7 +42,11 @@ def test_worker_with_the_same_files_is_accepted_and_leaves_none(run, job):
         assert len(left(run)) == 4
         shared.accept(pickle.loads(pickle.dumps(proof)))
         assert left(run) == [shared.name] * 2
-    assert left(run) == []
+        # Its client does not take this one any more.
+        shared.answer(job)
+        other = run.path / f".probe-{'0a' * 16}"
+        other.touch()
+    assert left(run) == [other.name]
 
 
 @pytest.mark.parametrize("name", ["path", "store"])
