@@ -32,6 +32,10 @@ def settings(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
     # A worker is silent while a library holds the interpreter. By default it counts as dead after 5 minutes;
     # the time limit of a tile ends it if it hangs.
     values = SETTINGS | {"distributed.scheduler.worker-ttl": f"{cluster.tile_timeout_s + SILENT_S:.0f} s"}
+    if cluster.kind == "local":
+        # A worker that died is started again here. Dask looks for it 15 s after each death, by default, and
+        # gives it up for ever if it has died a second time and is just being started.
+        values["distributed.deploy.lost-worker-timeout"] = "1000 d"
     if cluster.kind != "kubernetes":
         # Web pages ask for no certificate. The Dask operator of Kubernetes needs them.
         values["distributed.worker.http.routes"] = []

@@ -260,6 +260,8 @@ def test_job_that_kills_all_workers_each_time_loses_no_other_job(running):
 
 
 def test_local_workers_share_the_memory_and_may_be_silent(monkeypatch):
+    import dask
+    from dask.utils import parse_timedelta
     from distributed import Client
 
     monkeypatch.setattr("flexroad.pipeline.execute.memory.MEMORY_LIMIT", 2 * 1024**3)
@@ -269,6 +271,8 @@ def test_local_workers_share_the_memory_and_may_be_silent(monkeypatch):
     ):
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         assert [worker["memory_limit"] for worker in workers] == [1024**3, 1024**3]
+        # A worker that dies again and again is started again each time.
+        assert parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout")) > 1e7
         # A tile may hold the interpreter for as long as it may take.
         assert client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.worker_ttl) == 3900
 
