@@ -76,6 +76,8 @@ class Worker:
     versions: dict = field(default_factory=workers.versions)
     """Versions of the client that it compares with its own."""
     dies: bool = False
+    stays: int = 1000
+    """Number of jobs after which it leaves, before the session knows."""
     done: int = 0
 
     def __post_init__(self):
@@ -140,6 +142,7 @@ class WorkingClient(Client):
         return self.events
 
     def submit(self, function, packed, check, accepted, *, workers, **options):
+        self.there = {name: worker for name, worker in self.there.items() if worker.done < worker.stays}
         able = [worker for address, worker in self.there.items() if address in (workers or self.there)]
         if not able:
             future = MadeFuture()
@@ -242,27 +245,30 @@ def test_session_that_loses_its_only_able_worker_can_be_resumed(working):
     assert 5 <= len(done) < 20
 
 
-def test_able_worker_that_joins_later_gets_the_jobs(working):
-    session, lines = working(Worker("bad", OSError("fault")))
+def join_when_none_is_left(session, worker):
     say = session.say
 
     def join(line):
         say(line)
         if line.startswith("no worker is left"):
-            session.client.there["good"] = Worker("good")
+            session.client.there[worker.address] = worker
 
     session.say = join
+
+
+def test_able_worker_that_joins_later_gets_the_jobs(working):
+    session, lines = working(Worker("bad", OSError("fault")))
+    join_when_none_is_left(session, Worker("good"))
     assert sorted(session.results()) == sorted(map(str, range(20)))
     assert len(lines) == 2
 
 
 def test_jobs_of_a_worker_that_left_before_they_started_go_to_another(working):
-    session, _ = working(Worker("good"), Worker("bad", OSError("fault")))
-    results = session.results()
-    done = [next(results) for _ in range(5)]
-    session.client.there["other"] = Worker("other")
-    del session.client.there["good"]
-    assert sorted([*done, *results]) == sorted(map(str, range(20)))
+    bad, good = Worker("bad", OSError("fault")), Worker("good", stays=8)
+    session, _ = working(bad, good)
+    join_when_none_is_left(session, Worker("other"))
+    assert sorted(session.results()) == sorted(map(str, range(20)))
+    assert good.done == 8
 
 
 def test_workers_that_all_die_for_memory_end_the_session(working):
