@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from distributed.core import Status
+from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
 from flexroad.catalog.text import count
@@ -150,7 +151,8 @@ def slurm(
             )
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(_shared_folder(logs))
-        options = slurm_options(cluster, dashboard, folder)
+        security = stack.enter_context(_certificates(cluster, folder))
+        options = slurm_options(cluster, dashboard, folder) | {"security": security}
         make = partial(jobqueue.SLURMCluster, job_cls=_job_class(), **options)
         jobs = SlurmJobs(stack.enter_context(opened(make)), folder, say)
         jobs.start(-(-(cluster.workers or 1) // cluster.per_job))
@@ -159,10 +161,7 @@ def slurm(
 
 
 def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, Any]:
-    """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each.
-
-    The certificates are passed as files in ``folder`` that only this user can read.
-    """
+    """Return the options of ``SLURMCluster``: jobs of ``per_job`` workers, one thread and core each."""
     walltime = timedelta(hours=cluster.walltime_h)
     # A worker that closes before SLURM kills it returns its tiles to the scheduler.
     lifetime = max(walltime - timedelta(minutes=5), walltime / 2)
@@ -190,8 +189,6 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
         "job_name": NAME,
         "log_directory": str(folder),
         "interface": cluster.interface,
-        "security": certificates(cluster),
-        "shared_temp_directory": str(folder),
         # Dask's pages have no password: they are served to this machine only.
         "scheduler_options": {
             "dashboard": dashboard,
@@ -203,9 +200,9 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
 
 @contextlib.contextmanager
 def _shared_folder(logs: Path | None) -> Iterator[Path]:
-    """Yield a folder that all machines share, without the output of an earlier run.
+    """Yield a folder for the output of jobs and certificates, without the output of an earlier run.
 
-    It is ``logs``, or one in the home folder, which is removed at the end.
+    All machines share it: it is ``logs``, or one in the home folder, which is removed at the end.
     """
     with contextlib.ExitStack() as stack:
         if logs is None:
@@ -219,10 +216,32 @@ def _shared_folder(logs: Path | None) -> Iterator[Path]:
                 "RUN without blanks, quotes and other special characters in its path"
             )
         logs.mkdir(exist_ok=True)
-        for pattern in (f"{NAME}-*.out", f"{NAME}-*.err", ".dask-jobqueue.*"):
+        for pattern in (f"{NAME}-*.out", f"{NAME}-*.err"):
             for path in logs.glob(pattern):
                 path.unlink(missing_ok=True)
         yield logs
+
+
+@contextlib.contextmanager
+def _certificates(cluster: Cluster, folder: Path) -> Iterator[Security | None]:
+    """Yield new certificates in files of a folder that only this user can read; it is removed at the end."""
+    made = certificates(cluster)
+    if made is None:
+        yield None
+        return
+    private = folder / ".certificates"
+    # A killed run has left it.
+    shutil.rmtree(private, ignore_errors=True)
+    private.mkdir(mode=0o700)
+    try:
+        files = {}
+        for name in Security.__slots__:
+            if name.endswith(("_file", "_cert", "_key")):
+                (private / name).write_text(getattr(made, name))
+                files[name] = str(private / name)
+        yield Security(require_encryption=True, **files)
+    finally:
+        shutil.rmtree(private, ignore_errors=True)
 
 
 def _job_class() -> Any:

@@ -30,12 +30,16 @@ def extra(kind: str) -> Any:
         If its package is not installed.
     """
     module, package = PACKAGES[kind]
+    interrupt = signal.getsignal(signal.SIGINT)
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise ConfigError(
             f"cluster.kind {kind} needs {package}: pip install 'flexroad[{kind}]' ({error})"
         ) from error
+    finally:
+        # The import of dask_jobqueue makes Ctrl-C end the program at once, with jobs left behind.
+        signal.signal(signal.SIGINT, interrupt)
 
 
 @contextlib.contextmanager
