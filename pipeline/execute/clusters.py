@@ -17,7 +17,7 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.settings import certificates, environment, settings
+from flexroad.pipeline.execute.settings import certificates, environment, settings, web_address
 from flexroad.pipeline.execute.start import extra, one_line, opened, start_workers
 
 GRACE_S = 10.0
@@ -85,6 +85,7 @@ def open_cluster(
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
     import dask
+    import distributed  # noqa: F401 (its defaults would end with the settings if they came later)
 
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
@@ -163,7 +164,8 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
             threads_per_worker=1,
             processes=True,
             memory_limit=bytes_of_worker(cluster),
-            dashboard_address="127.0.0.1:8787" if dashboard else None,
+            dashboard_address=web_address(dashboard),
+            scheduler_kwargs={"dashboard": dashboard},
             worker_dashboard_address=None,
             local_directory=scratch,
             env=ONE_THREAD,
@@ -190,12 +192,12 @@ def kubernetes(cluster: Cluster) -> Any:
         If dask-kubernetes is not installed, no image is set, TLS is demanded, or the cluster cannot be
         reached.
     """
-    operator = extra("kubernetes")
     if cluster.security == "tls":
         raise ConfigError(
             "cluster.kind kubernetes: Dask's operator has no TLS: whoever reaches the port of the scheduler "
             "can run programs in its pods; close it with a NetworkPolicy, and set cluster.security to none"
         )
+    operator = extra("kubernetes")
     if not cluster.image:
         raise ConfigError(
             "cluster.kind kubernetes: no image is set; set cluster.image to one that contains flexroad"

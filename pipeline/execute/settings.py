@@ -44,6 +44,11 @@ def settings(cluster: Cluster, dashboard: bool) -> dict[str, Any]:
     return values
 
 
+def web_address(dashboard: bool) -> str:
+    """Return the address of the scheduler's web pages: on this machine only, as they ask for no password."""
+    return f"127.0.0.1:{8787 if dashboard else 0}"
+
+
 def environment(cluster: Cluster, dashboard: bool) -> dict[str, str]:
     """Return the environment of workers, and of a scheduler that is started elsewhere."""
     values = settings(cluster, dashboard).items()

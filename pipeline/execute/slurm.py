@@ -23,7 +23,7 @@ from tornado.ioloop import PeriodicCallback
 from flexroad.catalog.text import count
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.settings import certificates, environment
+from flexroad.pipeline.execute.settings import certificates, environment, web_address
 from flexroad.pipeline.execute.start import extra, opened, start_workers
 
 CHECK_S = 15.0
@@ -189,11 +189,7 @@ def slurm_options(cluster: Cluster, dashboard: bool, folder: Path) -> dict[str, 
         "job_name": NAME,
         "log_directory": str(folder),
         "interface": cluster.interface,
-        # Dask's pages have no password: they are served to this machine only.
-        "scheduler_options": {
-            "dashboard": dashboard,
-            "dashboard_address": f"127.0.0.1:{8787 if dashboard else 0}",
-        },
+        "scheduler_options": {"dashboard": dashboard, "dashboard_address": web_address(dashboard)},
         "silence_logs": "critical",
     }
 

@@ -17,7 +17,8 @@ from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor
-from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster, slurm_options
+from flexroad.pipeline.execute.clusters import kubernetes_options, open_cluster
+from flexroad.pipeline.execute.slurm import slurm_options
 from flexroad.pipeline.execute.workers import checksum_of_code
 from tests.dask_processes import Processes, until, wait_for
 
@@ -349,43 +350,50 @@ def test_map_ended_leaves_nothing_on_the_cluster(running, wanted):
         until(lambda: client.run_on_scheduler(scheduler_state) == before)
 
 
-def test_slurm_options_write_job_script():
+def test_slurm_options_write_job_script(tmp_path):
     jobqueue = pytest.importorskip("dask_jobqueue")
     cluster = Cluster(
         kind="slurm", workers=6, per_job=3, memory="2 GiB", walltime_h=2.5, queue="night", account="roads",
         job_extra=["--exclusive"], prologue=["module load gdal"],
     )  # fmt: skip
-    with jobqueue.SLURMCluster(**slurm_options(cluster, dashboard=False)) as made:
+    with jobqueue.SLURMCluster(**slurm_options(cluster, False, tmp_path)) as made:
         script = made.job_script()
     lines = script.splitlines()
     assert {
         "#SBATCH -p night", "#SBATCH -A roads", "#SBATCH -n 1", "#SBATCH --cpus-per-task=3",
         "#SBATCH --mem=6G", "#SBATCH -t 02:30:00", "#SBATCH --exclusive", "module load gdal",
         "export OMP_NUM_THREADS=1", "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",
+        "export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES='[]'",
+        f"#SBATCH -e {tmp_path}/flexroad-%J.err",
     } <= set(lines)  # fmt: skip
     assert "--nthreads 1 --memory-limit 2.00GiB --nworkers 3 --nanny" in lines[-1]
     assert "--lifetime 8700s" in lines[-1]
 
 
 def test_map_on_slurm_starts_and_ends_jobs(tmp_path, monkeypatch):
-    """``sbatch`` and ``scancel`` are replaced by commands that start and kill local processes."""
+    """Commands replace those of SLURM: they start, list and kill local processes."""
     pytest.importorskip("dask_jobqueue")
     jobs = tmp_path / "jobs"
     commands = {
         # The script is copied, as SLURM does: dask-jobqueue removes it at once.
         "sbatch": f'cp "$1" {jobs}.sh; setsid bash {jobs}.sh >/dev/null 2>&1 &\n'
         f"echo $! >>{jobs}; echo Submitted batch job $!",
+        "squeue": f"for job in $(cat {jobs}); do kill -0 $job && echo $job; done; true",
         "scancel": 'kill -- -"$1"',
     }
     for name, text in commands.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    # Without a folder for the output there is one at home, which is removed at the end.
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
     night = Cluster(kind="slurm", interface="lo", memory="2 GiB", start_s=60)
     assert sorted(DaskExecutor(cluster=night).map(double, range(5), lost)) == [0, 2, 4, 6, 8]
     started = [int(line) for line in jobs.read_text().split()]
     assert len(started) == 1
     until(lambda: not any(psutil.pid_exists(pid) for pid in started))
+    assert not list((tmp_path / "home").iterdir())
 
 
 def test_kubernetes_options_set_pods():
@@ -407,7 +415,15 @@ def test_kubernetes_options_set_pods():
 def test_open_cluster_missing_program_raises(kind, remedy, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "dask_kubernetes.operator", None)
-    with pytest.raises(ConfigError, match=remedy), open_cluster(Cluster(kind=kind), None, None, False):
+    cluster = Cluster(kind=kind, security="none")
+    with pytest.raises(ConfigError, match=remedy), open_cluster(cluster, None, None, False):
+        pass
+
+
+def test_open_cluster_kubernetes_with_tls_raises():
+    cluster = Cluster(kind="kubernetes", image="roads:1")
+    match = "Dask's operator has no TLS.*set cluster.security to none"
+    with pytest.raises(ConfigError, match=match), open_cluster(cluster, None, None, False):
         pass
 
 
