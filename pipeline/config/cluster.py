@@ -91,8 +91,11 @@ class Cluster(Options):
 
     @property
     def programs(self) -> dict[str, Any]:
-        """The given options that can start programs: those of free text, in a job's script or a pod."""
+        """The given options that can start programs, or let others do so.
+
+        These are those of free text, in a job's script or a pod, and ``security: none``.
+        """
         fields = type(self).model_fields.items()
-        texts = {name for name, field in fields if get_origin(field.annotation) is not Literal}
+        texts = {name for name, field in fields if get_origin(field.annotation) is not Literal} | {"security"}
         given = self.model_dump(mode="json", include=texts, exclude_defaults=True).items()
         return {name: value for name, value in given if not isinstance(value, int | float)}

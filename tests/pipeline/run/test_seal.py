@@ -53,6 +53,7 @@ PROGRAMS = {
     "job_extra": ["--comment x\ntouch {mark}"],
     "queue": "x\ntouch {mark}",
     "image": "registry/other",
+    "security": "none",
 }
 
 
