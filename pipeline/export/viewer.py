@@ -182,11 +182,12 @@ def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[Shown]:
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
     """Return the index of the run, and its finished tiles."""
-    states, rows, errors = list[int](), list[dict[str, Any]](), list[str]()
+    states, rows, errors, stale = list[int](), list[dict[str, Any]](), list[str](), list[bool]()
     for status in peek_statuses(run, tiles):
         states.append(DONE if status.done else FAILED if status.failed else PENDING)
         rows.append(_row(status, variant))
         errors.append(_error(status))
+        stale.append(status.stale)
     bounds = [tile.grid.bounds for tile in tiles]
     measures = {name: [_figure(row.get(name)) for row in rows] for name in MEASURES}
     known = {name: values for name, values in measures.items() if any(value is not None for value in values)}
@@ -198,6 +199,7 @@ def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any
         "width": [east - west for west, _, east, _ in bounds],
         "height": [north - south for _, south, _, north in bounds],
         "state": states,
+        "stale": stale,
         "flags": [_flags(row) for row in rows],
         "error": errors,
         "measures": known,

@@ -17,16 +17,17 @@ from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.records import TileRecord
 
 NAME = "tiles.geojson"
-COLUMNS = ("id", "state", "error", "seconds", "error_estimate_m", "flags", "finished")
+COLUMNS = ("id", "state", "stale", "error", "seconds", "error_estimate_m", "flags", "finished")
 
 
 def write_states(run: Run, where: Location) -> None:
     """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
 
     Columns: ``id``; ``state`` (``done``: computed by the last run; ``cached``: done before it; ``failed``;
-    ``pending``); ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``,
-    the error estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``;
-    ``finished``, the time of completion.
+    ``pending``); ``stale``, whether a failed or pending tile still has products of an earlier result;
+    ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``, the error
+    estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``; ``finished``, the
+    time of completion.
 
     Raises
     ------
@@ -70,7 +71,8 @@ def outlines(tiles: Sequence[Tile]) -> Any:
 
 
 def _row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:
-    row: dict[str, Any] = {"id": tile_id, "state": state}
+    stale = state in ("failed", "pending") and record is not None and record.has_products
+    row: dict[str, Any] = {"id": tile_id, "state": state, "stale": stale}
     # The record of a pending tile belongs to earlier files or options.
     if record is not None and state != "pending":
         row |= {"seconds": round(record.seconds, 3), "finished": record.finished or None}

@@ -73,6 +73,11 @@ class TileStatus:
         """Whether the tile failed with the current sources and options."""
         return self.up_to_date and self.last_record is not None and self.last_record.state == "failed"
 
+    @property
+    def stale(self) -> bool:
+        """Whether the tile has products that are not of its current sources and options."""
+        return not self.done and self.last_record is not None and self.last_record.has_products
+
 
 @dataclass(frozen=True)
 class Folders:

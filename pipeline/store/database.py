@@ -395,5 +395,6 @@ def _record(tile_id: str, finished: Any, text: Any, checksum: Any) -> TileRecord
             "rows": tuple(content["rows"]),
             "failures": tuple(Failure(**failure) for failure in content["failures"]),
             "marker": (marker[0], marker[1], marker[2]) if marker else None,
+            "stale": tuple(content.get("stale", ())),
         }
     )

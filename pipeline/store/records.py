@@ -61,6 +61,13 @@ class TileRecord:
     """Computing time in the worker (s)."""
     marker: MarkerStat | None = None
     """None if the marker could not be written, for example on a full disk."""
+    stale: tuple[str, ...] = ()
+    """Names of the products of an earlier result that a failed tile still has."""
+
+    @property
+    def has_products(self) -> bool:
+        """Whether the tile's folder has products: its own, or stale ones."""
+        return bool(self.sizes or self.stale)
 
     @property
     def without_roads(self) -> bool:
@@ -100,6 +107,7 @@ def to_failed(entry: TileRecord) -> dict[str, Any]:
         "rows": list(entry.rows),
         "finished": entry.finished,
         "seconds": entry.seconds,
+        "stale": list(entry.stale),
     }
 
 
@@ -120,4 +128,5 @@ def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecor
         finished=content.get("finished", ""),
         seconds=content.get("seconds", 0.0),
         marker=marker,
+        stale=tuple(content.get("stale", ())),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +69,12 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 def file_name(tile_id: str, variant: str, kind: Kind) -> str:
     """Return the name of a product in the tile's folder."""
     return f"{safe_name(tile_id)}_{variant}{kind.suffix}"
+
+
+def product_names(tile_id: str, files: Iterable[str]) -> tuple[str, ...]:
+    """Return which of the files in a tile's folder are products, of any variant and format."""
+    start, ends = f"{safe_name(tile_id)}_", tuple(kind.suffix for kinds in KINDS.values() for kind in kinds)
+    return tuple(sorted(name for name in files if name.startswith(start) and name.endswith(ends)))
 
 
 def products(

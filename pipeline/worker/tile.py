@@ -29,7 +29,7 @@ from flexroad.pipeline.store.records import (
     to_failed,
 )
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
-from flexroad.pipeline.worker.exports import Product, products
+from flexroad.pipeline.worker.exports import Product, product_names, products
 from flexroad.pipeline.worker.profiling import StageCost, utc_now
 from flexroad.pipeline.worker.stac import EXTENSIONS, assets, links
 from flexroad.pipeline.worker.texture import tile_texture
@@ -147,12 +147,24 @@ def process_tile(job: TileJob) -> TileResult:
 def record_failure(
     job: TileJob, rows: Sequence[MetricsRow], failures: Sequence[Failure], seconds: float = 0.0
 ) -> TileRecord:
-    """Write the tile's failed.json and return the record of the failure."""
+    """Write the tile's failed.json and return the record of the failure.
+
+    Products of an earlier result stay, and are named there as stale.
+    """
     tile_id, fingerprint = job.graph.tile.id, job.graph.fingerprint
+    marker, stale = None, tuple[str, ...]()
+    with contextlib.suppress(OSError):
+        stale = product_names(tile_id, job.folder.files())
     entry = TileRecord(
-        tile_id, "failed", fingerprint, tuple(rows), tuple(failures), finished=utc_now(), seconds=seconds
+        tile_id,
+        "failed",
+        fingerprint,
+        tuple(rows),
+        tuple(failures),
+        finished=utc_now(),
+        seconds=seconds,
+        stale=stale,
     )
-    marker = None
     # If the marker cannot be written (disk full), the returned record still has the failure.
     with contextlib.suppress(OSError):
         job.folder.fail(to_failed(entry), job.flushed)

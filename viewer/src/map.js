@@ -128,7 +128,7 @@ export class OverviewMap {
         context.globalCompositeOperation = "source-over";
       }
       if (tile.state === FAILED && width > HATCH_PX) cross(context, left, top, width, height);
-      if (width > LABEL_PX) label(context, tile.id, left, top, width);
+      if (width > LABEL_PX) label(context, tile, left, top, width);
     }
     context.globalAlpha = 1;
     if (this.selected) this.outline(context, this.selected, text);
@@ -179,12 +179,13 @@ function cross(context, left, top, width, height) {
   context.restore();
 }
 
-function label(context, text, left, top, width) {
+function label(context, tile, left, top, width) {
   context.font = "12px system-ui, sans-serif";
   // A canvas gives an opaque fill back as #rrggbb.
   const [red, green, blue] = [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16));
   context.fillStyle = 0.3 * red + 0.59 * green + 0.11 * blue > 150 ? "#14252e" : "#ffffff";
-  context.fillText(text, left + 8, top + 18, width - 16);
+  context.fillText(tile.id, left + 8, top + 18, width - 16);
+  if (tile.stale) context.fillRect(left + 8, top + 14, Math.min(context.measureText(tile.id).width, width - 16), 1);
 }
 
 function scaleBar(context, box, colour, font) {

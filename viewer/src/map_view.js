@@ -3,7 +3,7 @@
 import { byId, el, fill, show } from "./dom.js";
 import { OverviewMap } from "./map.js";
 import { choices } from "./map_colours.js";
-import { legend, reason, section, select, tileHead, tileList } from "./panel.js";
+import { legend, reason, section, select, tileHead, tileId, tileList } from "./panel.js";
 import { DONE, FAILED, worst } from "./run.js";
 import { count, isFlagged, stateText } from "./words.js";
 
@@ -124,7 +124,7 @@ export class MapView {
     const value = this.choice.text?.(tile);
     fill(
       element,
-      el("b", {}, tile.id),
+      el("b", {}, tileId(tile)),
       value ? el("div", {}, `${this.choice.label}: ${value}`) : el("div", {}, stateText(tile)),
       reason(tile) ? el("div", { class: "quiet" }, reason(tile)) : null,
     );

@@ -101,6 +101,11 @@ export function surfaceLegend(colour) {
   ]);
 }
 
+/** Returns the id of a tile: struck through if its files are of an earlier result. */
+export function tileId(tile) {
+  return tile.stale ? el("s", {}, tile.id) : tile.id;
+}
+
 /** Returns a list of tiles as buttons: mark, id, value, and why a tile is listed. */
 export function tileList(tiles, { mark, value, open }) {
   const rows = tiles.map((tile) =>
@@ -111,7 +116,7 @@ export function tileList(tiles, { mark, value, open }) {
         "button",
         { type: "button", click: () => open(tile) },
         el("span", { class: "swatch", style: `background: ${mark(tile)}` }),
-        el("span", { class: "id" }, tile.id),
+        el("span", { class: "id" }, tileId(tile)),
         el("span", { class: "value" }, value(tile) ?? ""),
         reason(tile) ? el("span", { class: "why" }, reason(tile)) : null,
       ),
@@ -129,7 +134,7 @@ export function reason(tile) {
 /** Returns id, state and problems of a tile. */
 export function tileHead(tile) {
   return [
-    el("h3", {}, tile.id),
+    el("h3", {}, tileId(tile)),
     el("p", { class: "quiet" }, stateText(tile)),
     tile.state === FAILED ? el("p", { class: "error" }, tile.error || "The reason is in the run's failures.csv.") : null,
     tile.state === DONE && tile.flags.length

@@ -16,6 +16,7 @@ export function runOf(data) {
     east: columns.west[number] + columns.width[number],
     north: columns.south[number] + columns.height[number],
     state: columns.state[number],
+    stale: columns.stale[number],
     flags: columns.flags[number],
     error: columns.error[number],
     measures: Object.fromEntries(Object.entries(columns.measures).map(([name, values]) => [name, values[number]])),

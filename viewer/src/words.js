@@ -30,6 +30,7 @@ export function flagText(flag) {
 
 /** Returns the state of a tile in words. */
 export function stateText(tile) {
+  if (tile.stale) return `${STATES[tile.state]}; its files are of an earlier result`;
   return tile.state === 1 && isFlagged(tile) ? "done, look at it" : STATES[tile.state];
 }
 

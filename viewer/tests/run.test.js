@@ -4,6 +4,7 @@ import { test } from "node:test";
 import { choices } from "../src/map_colours.js";
 import { near, runOf, tileAt, worst } from "../src/run.js";
 import { ViewBox } from "../src/view_box.js";
+import { stateText } from "../src/words.js";
 
 /** A run of three tiles of 100 m side by side: done, failed, done with a flag. */
 function run() {
@@ -18,6 +19,7 @@ function run() {
       width: [100, 100, 100],
       height: [100, 100, 100],
       state: [1, 2, 1],
+      stale: [false, true, false],
       flags: [[], [], ["spike"]],
       error: ["", "load: broken", ""],
       measures: { error_estimate_m: [0.02, null, 0.05] },
@@ -38,6 +40,12 @@ test("near tiles are finished ones, the nearest first", () => {
 
 test("failed tiles need a look first, then large error estimates", () => {
   assert.deepEqual(worst(run(), 2).map(({ id }) => id), ["b", "c"]);
+});
+
+test("files of an earlier result are told", () => {
+  const [done, failed] = run().tiles;
+  assert.equal(stateText(done), "done");
+  assert.equal(stateText(failed), "failed; its files are of an earlier result");
 });
 
 test("each choice colours all tiles, and tiles without a value differ from the others", () => {

@@ -60,6 +60,7 @@ def made(folder, ids, states, errors=None):
         "width": [100.0] * number,
         "height": [100.0] * number,
         "state": states,
+        "stale": [False] * number,
         "flags": [[] for _ in ids],
         "error": errors or [""] * number,
         "measures": {"error_estimate_m": [0.001 * (i % 97) for i in range(number)]},
