@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+import traceback
+from collections.abc import Callable
 from typing import NamedTuple
 from unittest import mock
 
@@ -17,6 +19,10 @@ from flexroad.pipeline.cli.main import main
 
 PROCESS = (sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()")
 """Command of a new process; the words of a command line follow."""
+FORKED_S = 600
+"""Longest time of a function in a copy of this process (s)."""
+RAISED = 99
+"""Exit code of a copy of this process in which the function raised an error."""
 built = functools.cache(typer.main.get_command)
 """The commands of an app, which each call of it would build anew: that takes longer than many a command."""
 
@@ -82,3 +88,19 @@ def process(*words) -> Said:
     )
     assert "Traceback" not in done.stderr
     return Said(done.returncode, done.stdout, done.stderr)
+
+
+def forked(function: Callable[[], int]) -> int:
+    """Call a function in a copy of this process; return the exit code that it gives, or minus a signal."""
+    sys.stderr.flush()
+    if child := os.fork():
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    code = RAISED
+    try:
+        signal.alarm(FORKED_S)
+        code = int(function())
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)

@@ -8,10 +8,12 @@ fault also leaves half-written data.
 
 import builtins
 import contextlib
+import errno
 import io
 import os
+import signal
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 from unittest import mock
@@ -37,6 +39,37 @@ class Operation:
 
 
 Observer = Callable[[Operation], None]
+
+
+@dataclass
+class Faulty:
+    """An observer that counts operations and lets one fail, or all that need space from there on."""
+
+    at: int
+    act: Callable[[], None]
+    lasting: bool = False
+    met: list[Operation] = field(default_factory=list)
+    failed: list[Operation] = field(default_factory=list)
+
+    def __call__(self, operation: Operation) -> None:
+        number = len(self.met)
+        self.met.append(operation)
+        needs_space = operation.kind in ("create", "write", "mkdir")
+        if number == self.at or (self.lasting and number > self.at and needs_space):
+            self.failed.append(operation)
+            self.act()
+
+
+def _raise(number: int) -> None:
+    raise OSError(number, os.strerror(number))
+
+
+FAULTS = {
+    "no space": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC)),
+    "disk stays full": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC), lasting=True),
+    "input/output error": lambda at: Faulty(at, lambda: _raise(errno.EIO)),
+    "killed": lambda at: Faulty(at, lambda: os.kill(os.getpid(), signal.SIGKILL)),
+}
 
 
 @contextlib.contextmanager

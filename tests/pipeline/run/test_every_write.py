@@ -4,13 +4,11 @@ By default a sample of the operations has a fault; with the environment variable
 each of them, which takes about ten minutes (``pytest -s`` then prints the numbers).
 """
 
-import errno
 import json
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,46 +17,13 @@ import yaml
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.run.lock import Owner
 from tests import command_line
-from tests.faulty_files import Operation, intercepted
+from tests.faulty_files import FAULTS, Faulty, Operation, intercepted
 from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files
 
 pytestmark = pytest.mark.slow
 
 SAMPLE = 12
 """Operations that have a fault, of each kind of fault."""
-KILL_S = 600
-"""Longest time of a run that is to be killed (s)."""
-
-
-@dataclass
-class Faulty:
-    """An observer that counts operations and lets one fail, or all that need space from there on."""
-
-    at: int
-    act: Callable[[], None]
-    lasting: bool = False
-    met: list[Operation] = field(default_factory=list)
-    failed: list[Operation] = field(default_factory=list)
-
-    def __call__(self, operation: Operation) -> None:
-        number = len(self.met)
-        self.met.append(operation)
-        needs_space = operation.kind in ("create", "write", "mkdir")
-        if number == self.at or (self.lasting and number > self.at and needs_space):
-            self.failed.append(operation)
-            self.act()
-
-
-def _raise(number: int) -> None:
-    raise OSError(number, os.strerror(number))
-
-
-FAULTS = {
-    "no space": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC)),
-    "disk stays full": lambda at: Faulty(at, lambda: _raise(errno.ENOSPC), lasting=True),
-    "input/output error": lambda at: Faulty(at, lambda: _raise(errno.EIO)),
-    "killed": lambda at: Faulty(at, lambda: os.kill(os.getpid(), signal.SIGKILL)),
-}
 
 
 @pytest.fixture(scope="module")
@@ -88,16 +53,7 @@ def run_with(fault: Faulty, words: list, out: Path) -> command_line.Said:
 
 def killed_with(fault: Faulty, words: list, out: Path) -> None:
     """Run in a copy of this process, which ends itself."""
-    if child := os.fork():
-        _, status = os.waitpid(child, 0)
-        assert os.WIFSIGNALED(status), "the run was not killed"
-        assert os.WTERMSIG(status) == signal.SIGKILL
-        return
-    try:
-        signal.alarm(KILL_S)
-        run_with(fault, words, out)
-    finally:
-        os._exit(0)
+    assert command_line.forked(lambda: run_with(fault, words, out).code) == -signal.SIGKILL
 
 
 def check_after_error(said: command_line.Said, out: Path, fault: Faulty, undisturbed: Path) -> None:
