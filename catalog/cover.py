@@ -49,7 +49,7 @@ def height_share(
     import numpy as np
     from rasterio.errors import RasterioError
 
-    from flexroad.catalog.headers.open_raster import open_raster
+    from flexroad.catalog.headers.kept_rasters import kept_raster
     from flexroad.catalog.headers.rasters import quiet
 
     known = np.zeros(grid.shape, np.bool_)
@@ -57,7 +57,8 @@ def height_share(
         if Path(str(path)).suffix.lower() in AS_TEXT:
             return None
         try:
-            with quiet(), open_raster(path, allowed) as raster:
+            # Neighbouring tiles lie on the same files.
+            with quiet(), kept_raster(path, allowed) as raster:
                 if not _add(known, grid, raster, raster.crs.to_wkt() if raster.crs else crs):
                     return None
         except (RasterioError, OSError):

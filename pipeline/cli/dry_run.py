@@ -10,7 +10,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.text import count
 from flexroad.pipeline.execute.adaptive import Estimate, decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
-from flexroad.pipeline.graph.graph import TileGraph, layers_read
+from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.pipeline.inspect.reasons import Kind, reason
@@ -45,6 +45,7 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
     todo: list[Tile] = []
     times: list[float] = []
     counted: set[str] = set()
+    borders: dict[str, str] = {}
     for status in peek_statuses(run, tiles):
         graph, why = status.graph, reason(run, status)
         yield f"{graph.tile.id}: {why.line}"
@@ -53,10 +54,10 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
         if status.last_record and status.last_record.state == "done":
             times.append(status.last_record.seconds)
         todo += [] if done else [graph.tile]
-        states: dict[str, str] = {}
+        states = {
+            name: DONE if done else _state(node, artefacts, borders) for name, node in graph.nodes.items()
+        }
         for name, node in graph.nodes.items():
-            stored = not done and node.stored and artefacts.has(node)
-            states[name] = DONE if done else STORED if stored else TO_DO
             if name not in counted:
                 totals[node.stage, states[name]] += 1
             # Corners and edges are nodes of several tiles.
@@ -74,6 +75,14 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
             yield f"  {stage:9}{counts}"
     for finding in expected_failures(todo, run.config, layers_read(run.config)):
         yield f"warning: {finding.text}"
+
+
+def _state(node: Node, artefacts: ArtefactStore, borders: dict[str, str]) -> str:
+    """Return whether a node is stored; corners and edges are looked up once, and added to ``borders``."""
+    state = borders.get(node.fingerprint) or (STORED if node.stored and artefacts.has(node) else TO_DO)
+    if node.border:
+        borders[node.fingerprint] = state
+    return state
 
 
 def _nodes(graph: TileGraph, states: dict[str, str]) -> Iterator[str]:

@@ -11,10 +11,11 @@ from flexroad.catalog.storage.paths import exists
 from flexroad.catalog.text import count
 from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import held_out, highest_error_estimates, over_tiles
+from flexroad.pipeline.report.results import Results, add_results
 from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
 from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, open_database, recorded, summary, untracked
+from flexroad.pipeline.run.status import TileStatus, Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.database import TileState
 from flexroad.pipeline.store.tables import METRICS, metrics_frame, read_metrics
@@ -84,6 +85,8 @@ class Content:
     """Ids of the finished tiles, in the order of the catalog."""
     running: bool = False
     """Whether another process is computing tiles of the run."""
+    results: Results = field(default_factory=dict)
+    """Where the surfaces of the finished tiles are in the store."""
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Second fits beside the squares withheld from them, per variant; empty if nothing was withheld."""
 
@@ -99,7 +102,13 @@ def gather(run: Run, track: Track = untracked) -> Content:
     rows = _rows(run)
     done = rows[rows.status == "done"]
     states: dict[str, TileState] = {}
-    counts = summary(run, track, states.__setitem__)
+    results: Results = {}
+
+    def keep(status: TileStatus, state: TileState) -> None:
+        states[status.graph.tile.id] = state
+        add_results(results, status)
+
+    counts = summary(run, track, keep)
     variants = [name for name in run.config.chains if name in set(done.variant)]
     exported = run.config.export.variants[0]
     failures = pd.DataFrame(
@@ -123,11 +132,12 @@ def gather(run: Run, track: Track = untracked) -> Content:
         held_out=held_out(done, variants),
         worst_estimates=highest_error_estimates(done, exported, WORST),
         meshes=mesh_checks(rows, run.config.chains),
-        steps=edge_steps(run, track=track),
+        steps=edge_steps(run, results, track=track),
         failures=failures,
         versions=run.versions,
         config=yaml.safe_dump(run.config.raw, sort_keys=False),
         tiles=tuple(dict.fromkeys(done.tile_id)),
+        results=results,
         running=bool((holder := owner(run.path)) and exit_reason(holder) is None),
     )
 

@@ -7,7 +7,7 @@ Other fits know nothing of the neighbours.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,9 +16,9 @@ import pandas as pd
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.graph.graph import Node, TileGraph
+from flexroad.pipeline.report.results import Results, find_results, stored
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, peek_statuses, untracked
+from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
@@ -29,9 +29,6 @@ MOST = 2000
 """Largest number of tiles compared with their neighbours; of larger runs, every n-th tile is compared."""
 KEPT = 1024
 """Tiles whose surfaces are kept in memory until their other neighbours are compared."""
-
-Nodes = tuple[Node, Node]
-"""Nodes of the surface and of the road mask."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +43,17 @@ class EdgeSteps:
     """Which tiles were compared; empty if all."""
 
 
-def edge_steps(run: Run, most: int = MOST, track: Track = untracked) -> EdgeSteps:
+def edge_steps(
+    run: Run, results: Results | None = None, most: int = MOST, track: Track = untracked
+) -> EdgeSteps:
     """Return the steps per exported variant and pair of neighbours.
 
     Parameters
     ----------
     run : Run
         The run; pairs whose surfaces are not in its store are left out.
+    results : Results, optional
+        The results of all finished tiles; by default the tiles to be compared are checked.
     most : int
         Largest number of tiles compared with their neighbours.
     track : callable
@@ -61,16 +62,12 @@ def edge_steps(run: Run, most: int = MOST, track: Track = untracked) -> EdgeStep
     tiles = run.catalog.usable
     every = math.ceil(len(tiles) / most)
     pairs = list(_pairs(tiles, every))
-    wanted = {tile.id: tile for pair in pairs for tile in pair}
-    done = {
-        status.graph.tile.id: _nodes(status.graph)
-        for status in peek_statuses(run, wanted.values())
-        if status.done
-    }
+    if results is None:
+        results = find_results(run, {tile.id: tile for pair in pairs for tile in pair}.values())
     rows = [
         row
         for variant in run.config.export.variants
-        for row in _rows(run, track(pairs, "comparing neighbours", len(pairs)), done, variant)
+        for row in _rows(run, track(pairs, "comparing neighbours", len(pairs)), results, variant)
     ]
     table = pd.DataFrame(rows, columns=COLUMNS)
     check = [_checked(run, str(variant), part) for variant, part in table.groupby("variant", sort=False)]
@@ -105,20 +102,14 @@ def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
                 yield tile, other
 
 
-def _nodes(graph: TileGraph) -> dict[str, Nodes]:
-    exported = {variant: graph.variants[variant] for variant in graph.export.variants}
-    return {v: (graph.nodes[names["fit"]], graph.nodes[names["segment"]]) for v, names in exported.items()}
-
-
 def _rows(
-    run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Mapping[str, Mapping[str, Nodes]], variant: str
+    run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Results, variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float, float]]:
     store = ArtefactStore(run.store)
 
     @lru_cache(KEPT)
     def results(tile_id: str) -> tuple[Surface, RoadMask] | None:
-        surface, road = (store.get(node) for node in done[tile_id][variant])
-        return (surface[0], road[0]) if surface and road else None
+        return stored(store, done[tile_id][variant])
 
     for tile, other in pairs:
         if tile.id not in done or other.id not in done:

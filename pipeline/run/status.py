@@ -79,6 +79,10 @@ class TileStatus:
         return not self.done and self.last_record is not None and self.last_record.has_products
 
 
+def ignored(status: TileStatus, state: TileState) -> None:
+    """Do nothing with a tile that was checked."""
+
+
 @dataclass(frozen=True)
 class Folders:
     """The files of a run's tiles: one listing per tile on disk, one listing for all tiles in a bucket."""
@@ -233,11 +237,11 @@ def recorded(run: Run, database: RunDatabase) -> Iterator[tuple[str, TileState, 
 
 
 def summary(
-    run: Run, track: Track = untracked, each: Callable[[str, TileState], object] = lambda tile_id, state: None
+    run: Run, track: Track = untracked, each: Callable[[TileStatus, TileState], object] = ignored
 ) -> Summary:
     """Return the current summary of a run; checks every tile, its sources and its products.
 
-    ``each`` receives id and state of every tile, in the catalog's order.
+    ``each`` receives status and state of every tile, in the catalog's order.
     """
     with open_database(run) as database:
         current = _checked(run, database, track=track, each=each)[0]
@@ -263,14 +267,14 @@ def _checked(
     database: RunDatabase,
     since: str | None = None,
     track: Track = untracked,
-    each: Callable[[str, TileState], object] = lambda tile_id, state: None,
+    each: Callable[[TileStatus, TileState], object] = ignored,
 ) -> tuple[Summary, int]:
     """Return what `recorded_summary` returns, from the tiles' folders and source files."""
     counts, failures, finished, without_roads = Counter[TileState](), list[Failure](), 0, 0
     states = tile_states(run, database, since)
     for status, state in track(states, "checking tiles", len(run.catalog.tiles)):
         counts[state] += 1
-        each(status.graph.tile.id, state)
+        each(status, state)
         record = status.last_record
         finished += record is not None and record.finished >= (since or "")
         without_roads += status.done and record is not None and record.without_roads

@@ -99,7 +99,7 @@ def html_page(
     pictures = {tile.tile_id: tile for tile in tile_pictures(run, content, first, track)}
     comparison = compare(table, before[1], content.variant, before[0]) if before else None
     numbers = {tile.id: i for i, tile in enumerate(table.tiles)}
-    background = relief(run, table.finished, track)
+    background = relief(run, table.finished, content.results, track)
     data = _data(table, failed, options, pictures, viewer, comparison)
     if background:
         places = [background.places.get(tile.id) for tile in table.tiles]

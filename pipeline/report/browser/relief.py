@@ -14,8 +14,9 @@ from PIL import Image
 
 from flexroad.catalog import Tile
 from flexroad.pipeline.report.render import SUN_ALTITUDE_DEG, SUN_AZIMUTH_DEG
+from flexroad.pipeline.report.results import Results, stored
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, peek_statuses, untracked
+from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
@@ -46,7 +47,7 @@ class Relief:
     """Number of the square of each tile by id, row by row from the top left."""
 
 
-def relief(run: Run, tiles: Iterable[Tile], track: Track = untracked) -> Relief | None:
+def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = untracked) -> Relief | None:
     """Draw the surfaces of tiles as a shaded relief with their roads; None if none is in the store.
 
     Parameters
@@ -55,6 +56,8 @@ def relief(run: Run, tiles: Iterable[Tile], track: Track = untracked) -> Relief 
         The run.
     tiles : iterable of Tile
         The tiles to draw; those whose surface is not in the store are left out.
+    results : Results
+        The results of all finished tiles.
     track : callable
         Shows the progress.
     """
@@ -66,17 +69,13 @@ def relief(run: Run, tiles: Iterable[Tile], track: Track = untracked) -> Relief 
     picture = np.zeros((side * math.ceil(len(tiles) / columns), side * columns, 2), np.uint8)
     store, variant = ArtefactStore(run.store), run.config.export.variants[0]
     places: dict[str, int] = {}
-    for status in track(peek_statuses(run, tiles), "drawing the map", len(tiles)):
-        graph = status.graph
-        nodes = graph.variants[variant]
-        surface, road = (store.get(graph.nodes[nodes[stage]]) for stage in ("fit", "segment"))
-        if surface is None or road is None:
+    for tile in track(tiles, "drawing the map", len(tiles)):
+        if tile.id not in results or not (found := stored(store, results[tile.id][variant])):
             continue
         row, column = divmod(len(places), columns)
-        picture[row * side : (row + 1) * side, column * side : (column + 1) * side] = _square(
-            surface[0], road[0], side
-        )
-        places[graph.tile.id] = len(places)
+        square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
+        square[:] = _square(*found, side)
+        places[tile.id] = len(places)
     return Relief(_encoded(picture), side, columns, places) if places else None
 
 
