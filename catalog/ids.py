@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import shown
@@ -52,6 +53,8 @@ def check(ids: Sequence[str]) -> None:
             raise CatalogError(f"tile ids {names} give the same file names; rename one of those tiles")
 
 
+# The name of a tile is needed for each of its files.
+@lru_cache(maxsize=1024)
 def safe_name(tile_id: str) -> str:
     """Return the name of a tile's folder and files: its id, changed if it is not a valid file name."""
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in tile_id).lstrip(".")
