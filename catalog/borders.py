@@ -21,7 +21,7 @@ DECIMALS = 6
 Kind = Literal["corner", "east", "north"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Border:
     """A corner of tiles, or an edge between two tiles, with the cells around it."""
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from flexroad.catalog.storage.scratch import ScratchFolder
 
 Item = dict[str, Any]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+AT_ONCE = 1000
+"""Rows that are objects at a time: these take many times the memory of a table."""
 MAX_ROWS = 10_000_000
 MAX_UNPACKED = 8 * 2**30
 """Most rows and bytes of a table, unpacked; ten million tiles of 250 m are 625,000 km2."""
@@ -54,11 +56,22 @@ def entries(data: bytes) -> Iterator[Item]:
     plain = [name for name in columns if name.startswith(("id", "proj:", "flexroad:", "datetime"))]
     plain += [name for name in columns if name.startswith("assets.") and name.endswith(FIELDS)]
     # Reader threads may still be alive when a short process ends, and would abort it.
-    rows = _values(file.read(plain, use_threads=False))
-    extents = [name for name in columns if name.endswith(".flexroad:extents")]
-    if extents:
-        _add_extents(rows, file.read(extents, use_threads=False)["assets"].combine_chunks())
-    return ({**_top(row), "properties": row} for row in rows)
+    table = file.read(plain, use_threads=False)
+    names = [name for name in columns if name.endswith(".flexroad:extents")]
+    extents = {}
+    if names:
+        assets = file.read(names, use_threads=False)["assets"].combine_chunks()
+        extents = {field.name: assets.field(field.name).field("flexroad:extents") for field in assets.type}
+    return _rows(table, extents)
+
+
+def _rows(table: Any, extents: Mapping[str, Any]) -> Iterator[Item]:
+    """Yield the fields of each row; as objects, a part of the rows at a time."""
+    for start in range(0, table.num_rows, AT_ONCE):
+        rows = _values(table.slice(start, AT_ONCE))
+        for name, column in extents.items():
+            _add_extents(rows, name, column.slice(start, AT_ONCE))
+        yield from ({**_top(row), "properties": row} for row in rows)
 
 
 def _check_size(metadata: Any) -> None:
@@ -104,22 +117,20 @@ def _value(column: Any, number: int) -> Any:
         return Unreadable(str(error))
 
 
-def _add_extents(rows: list[Item], assets: Any) -> None:
-    """Add the extents to the rows' assets as arrays; as lists of numbers they take several times as long."""
-    for field in assets.type:
-        column = assets.field(field.name).field("flexroad:extents")
-        try:
-            # `to_numpy` would import pandas.
-            ends, edges = column.offsets.to_pylist(), np.from_dlpack(column.values)
-            found = [edges[a:b] if a < b else None for a, b in pairwise(ends)]
-        except Exception:
-            # Not lists of numbers, or with gaps.
-            found = [_value(column, number) for number in range(len(column))]
-        for row, extents in zip(rows, found, strict=True):
-            assets_of_row = row.get("assets")
-            asset = assets_of_row.get(field.name) if isinstance(assets_of_row, dict) else None
-            if extents is not None and isinstance(asset, dict):
-                asset["flexroad:extents"] = extents
+def _add_extents(rows: list[Item], name: str, column: Any) -> None:
+    """Add the extents to an asset of each row, as arrays: lists of numbers take several times as long."""
+    try:
+        # `to_numpy` would import pandas.
+        ends, edges = column.offsets.to_pylist(), np.from_dlpack(column.values)
+        found = [edges[a:b] if a < b else None for a, b in pairwise(ends)]
+    except Exception:
+        # Not lists of numbers, or with gaps.
+        found = [_value(column, number) for number in range(len(column))]
+    for row, extents in zip(rows, found, strict=True):
+        assets = row.get("assets")
+        asset = assets.get(name) if isinstance(assets, dict) else None
+        if extents is not None and isinstance(asset, dict):
+            asset["flexroad:extents"] = extents
 
 
 def schema_of(full: Item) -> Any:
@@ -129,7 +140,7 @@ def schema_of(full: Item) -> Any:
     return parse_stac_items_to_arrow([full]).read_all().schema
 
 
-def table_bytes(items: list[Item], schema: Any) -> bytes:
+def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
     """Return a table of items; stac-geoparquet's own conversion is many times slower.
 
     Parameters
@@ -143,8 +154,10 @@ def table_bytes(items: list[Item], schema: Any) -> bytes:
     with ScratchFolder() as folder:
         # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"
-        table = pa.Table.from_pylist([row(item) for item in items], schema)
-        to_parquet(table, file, write_page_checksum=True)
+        rows, parts = map(row, items), [schema.empty_table()]
+        while part := list(islice(rows, AT_ONCE)):
+            parts.append(pa.Table.from_pylist(part, schema))
+        to_parquet(pa.concat_tables(parts).combine_chunks(), file, write_page_checksum=True)
         return file.read_bytes()
 
 

@@ -124,8 +124,8 @@ class Catalog:
         if path.suffix not in (".parquet", *JSON_SUFFIXES):
             raise CatalogError(f"a catalog's name ends in .parquet, .json or .geojson, but not {path.name}")
         folder = absolute(path).parent
-        items = [item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles]
-        make: Callable[[list[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
+        items = (item(_rooted(tile, folder), "") if movable else item(tile, tile.root) for tile in self.tiles)
+        make: Callable[[Iterable[Item]], bytes] = _to_json if path.suffix in JSON_SUFFIXES else _to_parquet
         try:
             paths.write(path, make(items), flushed=True)
         except OSError as error:
@@ -317,11 +317,11 @@ def _unique(pairs: list[tuple[str, Any]]) -> Item:
     return found
 
 
-def _to_json(items: list[Item]) -> bytes:
-    return json.dumps({"type": "FeatureCollection", "features": items}, indent=1).encode()
+def _to_json(items: Iterable[Item]) -> bytes:
+    return json.dumps({"type": "FeatureCollection", "features": list(items)}, indent=1).encode()
 
 
-def _to_parquet(items: list[Item]) -> bytes:
+def _to_parquet(items: Iterable[Item]) -> bytes:
     return geoparquet.table_bytes(items, _schema())
 
 

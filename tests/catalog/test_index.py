@@ -1,5 +1,6 @@
 import json
 import shutil
+import tracemalloc
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -11,7 +12,7 @@ import pystac
 import pytest
 import shapely
 
-from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile
+from flexroad.catalog import LAYERS, Catalog, CatalogError, Grid, Layer, Tile, geoparquet
 from flexroad.catalog.area import Area
 
 
@@ -63,6 +64,36 @@ def test_catalog_round_trip_keeps_extents_and_nearby_layers(tmp_path, name):
     moved = Catalog.read(tmp_path / name).select(ids=["295500_5629250"]).tiles[0]
     assert moved.nearby == (replace(photo, files=("data/dop/b.tif",)),)
     assert moved.layers[0].extents == first.layers[0].extents
+
+
+def test_catalog_in_parts_is_the_same(tmp_path, monkeypatch):
+    """Objects are made of a part of the rows at a time."""
+    tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS[: k + 1])) for k in range(7))
+    Catalog(tiles).write(tmp_path / "a.parquet")
+    for rows in (1, 3, 7):
+        monkeypatch.setattr(geoparquet, "AT_ONCE", rows)
+        Catalog(tiles).write(tmp_path / "b.parquet")
+        assert (tmp_path / "b.parquet").read_bytes() == (tmp_path / "a.parquet").read_bytes()
+        assert Catalog.read(tmp_path / "b.parquet").tiles == tiles
+
+
+def test_objects_exist_of_a_part_of_the_rows_at_a_time(tmp_path, monkeypatch):
+    tiles = tuple(with_extents(tile(295500 + 250 * k, tmp_path, layers=LAYERS)) for k in range(300))
+    path = tmp_path / "a.parquet"
+    Catalog(tiles[:1]).write(path)
+
+    def largest_bytes(function):
+        tracemalloc.start()
+        function()
+        largest = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return largest
+
+    whole = [largest_bytes(lambda: Catalog(tiles).write(path)), largest_bytes(lambda: Catalog.read(path))]
+    monkeypatch.setattr(geoparquet, "AT_ONCE", 10)
+    parts = [largest_bytes(lambda: Catalog(tiles).write(path)), largest_bytes(lambda: Catalog.read(path))]
+    assert parts[0] < whole[0] / 2
+    assert parts[1] < whole[1] / 1.5
 
 
 def test_roads_beyond_the_tile_cover_it(tmp_path):
