@@ -100,12 +100,19 @@ def survey(folder: Path, side: int) -> None:
     write(folder / "road.tif", scene.reference_road.astype(np.uint8), cells)
 
 
-def write(path: Path, patch: NDArray[Any], cells: int) -> None:
+def write(
+    path: Path,
+    patch: NDArray[Any],
+    cells: int,
+    corner: tuple[float, float] = (300_000, 5_700_000),
+    cell_m: float = 1,
+) -> None:
+    """Write a raster of repeated copies of a patch; ``corner`` is its north-west."""
     repeat = math.ceil(cells / PATCH_M)
     data = np.tile(patch, (repeat, repeat))[:cells, :cells]
     data = data.astype(np.float32) if data.dtype == np.float64 else data
     layout = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
-    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
+    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(*corner, cell_m, cell_m)}
     with rasterio.open(
         path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **layout, **place
     ) as raster:
