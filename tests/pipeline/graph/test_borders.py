@@ -3,8 +3,9 @@
 import hashlib
 import json
 import os
+import re
 import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import asdict, replace
 from random import Random
 
@@ -23,6 +24,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, check_tiles
 from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
 from flexroad.pipeline.graph.stages import model_files, stage_module
+from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.lattice import Lattice
@@ -322,6 +324,23 @@ def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
     words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
     out = flexroad("run", "--config", "production", "--set", "fit.spacing_m=10", *words).expected(0).out
     assert "  border   40 to do" in out.splitlines()
+
+
+def test_dry_run_looks_up_shared_nodes_once(survey, flexroad, tmp_path, monkeypatch):
+    by_prepared(survey).write(survey / "catalog.json")
+    looked_up = Counter()
+
+    def has(store, node):
+        looked_up[node.fingerprint] += 1
+        return node.border is not None and node.border.border.kind == "corner"
+
+    monkeypatch.setattr(ArtefactStore, "has", has)
+    words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run", "-v")
+    out = flexroad("run", "--config", "nightly", "--set", "fit.spacing_m=10", *words).expected(0).out
+    assert "  border   16 stored, 24 to do" in out.splitlines()
+    # Each of nine tiles lists its own.
+    assert len(re.findall(r"^  border   \w+  stored ", out, re.MULTILINE)) == 9 * 4
+    assert set(looked_up.values()) == {1}
 
 
 def test_run_refuses_tiles_of_different_size(tmp_path, flexroad):

@@ -1,5 +1,6 @@
 """What would fail is named before the run, with counts and examples, and then does fail."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,15 @@ import pytest
 import rasterio
 
 from flexroad.catalog import LAYERS, Catalog
+from flexroad.catalog.headers import kept_rasters
+from flexroad.catalog.headers.open_raster import open_alone
+from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import faulty
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
+from tests.make_rasters import write
 
 FEW = "a DSM height in less than 25% of the cells (load.min_valid)"
 
@@ -74,3 +79,22 @@ def test_dry_run_and_check_say_what_would_fail(survey, flexroad, tmp_path):
     line = f"warning: 1 of 4 tiles would fail: {FEW}: {Catalog.read(survey).tiles[1].id}"
     assert said.out.splitlines()[-1] == line
     assert line in flexroad("catalog", "check", survey).expected(1).out.splitlines()
+
+
+def test_dsm_of_several_tiles_is_opened_once(tmp_path, monkeypatch):
+    for name in ("dsm", "dtm", "road_mask"):
+        write(tmp_path / f"{name}.tif", np.ones((250, 1000), np.float32), 295500)
+    catalog = Catalog(rasters.index(tmp_path, {name: f"{name}.tif" for name in ("dsm", "dtm")}).tiles)
+    assert len(catalog.tiles) == 4
+    os.utime(tmp_path / "dsm.tif", (1, 1))
+    opened = []
+
+    def counted(path):
+        opened.append(path.name)
+        return open_alone(path)
+
+    monkeypatch.setattr(kept_rasters, "open_alone", counted)
+    assert not [
+        f for f in expected_failures(catalog.tiles, load_config("paper"), ("dsm",)) if "height" in f.text
+    ]
+    assert opened == ["dsm.tif"]

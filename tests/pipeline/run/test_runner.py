@@ -16,6 +16,9 @@ from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
+from flexroad.pipeline.report.browser.relief import relief
+from flexroad.pipeline.report.content import gather
+from flexroad.pipeline.report.results import find_results
 from flexroad.pipeline.report.steps import edge_steps
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -465,6 +468,30 @@ def test_edge_steps_of_large_run_are_a_sample(finished):
     assert part.edges.set_index(pairs).equals(whole.edges.set_index(pairs).loc[chosen])
     assert part.note == "Of one tile in 2, against its neighbours in the east and north."
     assert list(whole.check.result) == ["tiles are fitted independently"]
+
+
+def test_report_checks_every_tile_once(finished, monkeypatch):
+    graph, checked = Pattern.graph, Counter()
+
+    def counted(pattern, tile, *arguments):
+        checked[tile.id] += 1
+        return graph(pattern, tile, *arguments)
+
+    monkeypatch.setattr(Pattern, "graph", counted)
+    content = gather(finished)
+    assert len(content.steps.edges) == 4
+    picture = relief(finished, finished.catalog.tiles, content.results)
+    assert list(picture.places) == [tile.id for tile in finished.catalog.tiles]
+    assert checked == dict.fromkeys(picture.places, 1)
+
+
+def test_relief_has_tiles_with_results_in_the_store(finished):
+    first, second, *others = finished.catalog.tiles
+    results = find_results(finished, [first, second])
+    assert set(results) == {first.id, second.id}
+    ArtefactStore(finished.store).remove("fit", results[first.id]["flexroad"][0])
+    assert list(relief(finished, finished.catalog.tiles, results).places) == [second.id]
+    assert relief(finished, others, results) is None
 
 
 def test_run_with_pipe_as_log_does_not_wait_for_a_reader(run):
