@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flexroad.catalog.errors import CatalogError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -47,9 +49,9 @@ def height_share(
         None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
     import numpy as np
-    from rasterio.errors import RasterioError
 
     from flexroad.catalog.headers.kept_rasters import kept_raster
+    from flexroad.catalog.headers.open_raster import ERRORS
     from flexroad.catalog.headers.rasters import quiet
 
     known = np.zeros(grid.shape, np.bool_)
@@ -61,7 +63,7 @@ def height_share(
             with quiet(), kept_raster(path, allowed) as raster:
                 if not _add(known, grid, raster, raster.crs.to_wkt() if raster.crs else crs):
                     return None
-        except (RasterioError, OSError):
+        except (*ERRORS, CatalogError):
             return None
     return float(known.mean())
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import rasterio
-from rasterio.errors import RasterioError
+from rasterio.errors import CRSError, RasterioError
 
 from flexroad.catalog.headers.refused import Refused, head, require_beside
 from flexroad.catalog.headers.vrt import sources
@@ -53,7 +53,7 @@ MARK = re.compile(rb"<[A-Za-z]{3}")
 ASCII_GRID = re.compile(rb"\s*(ncols|nrows|xll|yll|cellsize|dx|dy|nodata)", re.IGNORECASE)
 APPENDED = (".aux.xml", ".ovr", ".msk", ".aux")
 REPLACED = (".aux.xml", ".aux", ".prj", ".tab", ".wld")
-ERRORS = (RasterioError, OSError, UnicodeDecodeError)
+ERRORS = (RasterioError, CRSError, OSError, UnicodeDecodeError)
 """What rasterio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 MAX_DEPTH = 4
 """Largest depth of VRTs that name VRTs."""

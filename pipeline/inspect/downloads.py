@@ -116,10 +116,8 @@ def _named(path: Path, folder: Path) -> str:
 
 
 def _raster(path: Path, folder: Path) -> Download:
-    from rasterio.errors import RasterioError
-
     from flexroad.catalog.crs import in_plan, plan_unit, short
-    from flexroad.catalog.headers.open_raster import open_raster
+    from flexroad.catalog.headers.open_raster import ERRORS, open_raster
     from flexroad.catalog.headers.rasters import quiet
 
     try:
@@ -127,7 +125,7 @@ def _raster(path: Path, folder: Path) -> Download:
             bands, dtype, size = raster.count, raster.dtypes[0], f"{raster.width} x {raster.height}"
             crs = in_plan(raster.crs.to_wkt()) if raster.crs else None
             values = _values(raster)
-    except (RasterioError, OSError) as error:
+    except (*ERRORS, CatalogError) as error:
         return Download(path, "raster", question=f"it cannot be read as a raster: {error}")
     kind = _named(path, folder)
     about = f"{count(bands, 'band')} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"

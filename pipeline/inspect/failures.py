@@ -6,12 +6,10 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
-from rasterio.errors import RasterioError
-
-from flexroad.catalog import Layer, Tile
+from flexroad.catalog import CatalogError, Layer, Tile
 from flexroad.catalog.cover import height_share
 from flexroad.catalog.crs import in_plan, same, short
-from flexroad.catalog.headers.open_raster import open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import quiet, some
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
@@ -121,7 +119,7 @@ def _crs(path: Location, allowed: AllowedFolders | None) -> str | None:
     try:
         with quiet(), open_raster(path, allowed) as raster:
             return in_plan(raster.crs.to_wkt()) if raster.crs else None
-    except (RasterioError, OSError):
+    except (*ERRORS, CatalogError):
         return None
 
 
