@@ -24,6 +24,7 @@ from flexroad.catalog.headers.globbing import glob, is_folder
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.raster_faults import AGAIN, georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.undecodable import undecodable_ignored
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
@@ -66,8 +67,11 @@ class RasterFile:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Set GDAL's options for catalog and tasks; suppress warnings about files without a georeference."""
-    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings():
+    """Set GDAL's options for catalog and tasks; suppress what is printed about files that are damaged.
+
+    That is warnings about files without a georeference, and messages that are no text.
+    """
+    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings(), undecodable_ignored():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
 
