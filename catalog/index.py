@@ -88,6 +88,9 @@ class Catalog:
         is_json = path.suffix in JSON_SUFFIXES
         try:
             entries: Iterable[Any] = _from_json(data) if is_json else geoparquet.entries(data)
+        except ImportError:
+            # A fault of this installation, not of the file.
+            raise
         except Exception as error:
             # Damaged files raise any error in the readers of JSON and Parquet.
             reason = printable(" ".join(str(error).split()))[:200] or type(error).__name__

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import warnings
 from collections import defaultdict
@@ -235,6 +236,9 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
     except Refused as error:
         raise _Skip(f"it {error}") from error
     except ERRORS as error:
+        if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):
+            # A limit of this process: the file is not at fault.
+            raise
         why = getattr(error, "strerror", None)
         raise _Skip(f"it cannot be read: {why}" if why else "not a raster that GDAL can read") from error
     if transform.is_identity:

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.text import one_line
+from flexroad.pipeline.cli import limits
 from flexroad.pipeline.cli.catalogs import catalogs
 from flexroad.pipeline.cli.clean import clean
 from flexroad.pipeline.cli.command import Command
@@ -41,6 +43,7 @@ for command in (init, run, rerun, status, clean, report, query, export, view, ta
 
 def main() -> None:
     """Run the command line; a user error is printed as one line, with exit code 2."""
+    limits.raise_open_files()
     # Rasterio loads boto3 where it is installed, for a tenth of the time of a short command. It uses it only
     # for credentials, which GDAL reads by itself.
     sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]
@@ -55,8 +58,11 @@ def main() -> None:
         if isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt):
             echo("interrupted; repeat the command", err=True)
         raise
-    except OSError as error:
-        echo(f"error: {error}; check the path and the disk, then repeat the command", err=True)
+    except Exception as error:
+        reason = _reason(error)
+        if reason is None:
+            raise
+        echo(f"error: {reason}", err=True)
         sys.exit(2)
     finally:
         for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -67,8 +73,20 @@ def main() -> None:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def _reason(error: Exception) -> str | None:
+    """Return what to print of an error that comes from the machine or the installation; None of others."""
+    if reason := limits.memory_reason(error):
+        return reason
+    if isinstance(error, OSError):
+        return f"{error}; {limits.remedy(error)}, then repeat the command"
+    if isinstance(error, ImportError):
+        return f"a library cannot be loaded: {one_line(error)}; install flexroad and its libraries again"
+    return None
+
+
 @app.callback(invoke_without_command=True)
 def _root(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
 ) -> None:
     if version:
@@ -76,3 +94,8 @@ def _root(
 
         echo(importlib.metadata.version("flexroad"))
         raise typer.Exit
+    limits.check(context.invoked_subcommand)
+
+
+if __name__ == "__main__":
+    main()

@@ -14,6 +14,7 @@ import typer
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, report_outcome, warn
+from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 
@@ -299,7 +300,7 @@ def _run_tiles(
         return
     except OSError as error:
         outcome.exit_code = 1
-        outcome.text = f"{error}; free disk space or fix the cause, then run `flexroad rerun {folder}`"
+        outcome.text = f"{error}; {remedy(error)}, then run `flexroad rerun {folder}`"
         return
     finally:
         _write_map(run)
