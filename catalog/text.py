@@ -70,6 +70,12 @@ def reason(error: BaseException) -> str:
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}..."
 
 
+def access_reason(error: BaseException) -> str | None:
+    """Return why the system refuses to read a file, to follow its name; None if its content is at fault."""
+    words = getattr(error, "strerror", None)
+    return f"cannot be read: {words}" if words else None
+
+
 def write_reason(error: BaseException) -> str:
     """Return why a file could not be written: the system's words, or GDAL's, the cause of rasterio's."""
     return getattr(error, "strerror", None) or reason(error.__cause__ or error)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers import las_header
-from flexroad.catalog.text import one_line
+from flexroad.catalog.text import access_reason, one_line
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]
@@ -235,8 +235,10 @@ def _attempt(path: Path, read: Callable[[], T], when: str = "") -> T:
         # For a damaged file, laspy raises exceptions of many types, and lazrs one that is no `Exception`.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        if isinstance(error, OSError) and error.strerror:
-            raise CatalogError(f"{path} cannot be read{when}: {error.strerror}") from error
+        if isinstance(error, ImportError):
+            raise
+        if why := access_reason(error):
+            raise CatalogError(f"{path} {why}{when}") from error
         raise CatalogError(
             f"{path} cannot be read as a point cloud{when}: {one_line(error)}; download it again"
         ) from error

@@ -27,6 +27,7 @@ from flexroad.catalog.headers.raster_faults import AGAIN, georeference_fault, he
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.undecodable import undecodable_ignored
 from flexroad.catalog.storage.settings import gdal_options
+from flexroad.catalog.text import access_reason
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
 
@@ -192,7 +193,7 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[str
 def unlisted_lines(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[str]:
     """Return a line on each folder that cannot be listed."""
     return [
-        skip(f"folder {_name(root, folder)}", layer, f"it cannot be read: {error.strerror}")
+        skip(f"folder {_name(root, folder)}", layer, f"it {access_reason(error)}")
         for folder, error in unlisted
     ]
 
@@ -239,8 +240,8 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
         if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE):
             # A limit of this process: the file is not at fault.
             raise
-        why = getattr(error, "strerror", None)
-        raise _Skip(f"it cannot be read: {why}" if why else "not a raster that GDAL can read") from error
+        why = access_reason(error)
+        raise _Skip(f"it {why}" if why else "not a raster that GDAL can read") from error
     if transform.is_identity:
         raise _Skip("no georeference; give it a world file or `gdal_translate -a_ullr`")
     if fault:

@@ -16,7 +16,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.text import count, reason
+from flexroad.catalog.text import access_reason, count, reason
 from flexroad.catalog.tile import REACH_M, Layer, Tile
 
 MARGIN_M = 1.0
@@ -115,8 +115,8 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:
-        if why := getattr(error, "strerror", None):
-            raise CatalogError(f"--roads {path} cannot be read: {why}") from error
+        if why := access_reason(error):
+            raise CatalogError(f"--roads {path} {why}") from error
         raise CatalogError(f"--roads {path} is not a vector file: {reason(error)}") from error
     if found and not names:
         raise CatalogError(f"--roads {path} has no layer {sublayer!r}; it has {listed(found)}")

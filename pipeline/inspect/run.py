@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds
 from flexroad.catalog.storage.paths import exists, parse_location, read
-from flexroad.catalog.text import count, with_formula
+from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.assembled import assembled
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
@@ -136,6 +136,8 @@ class RunView:
             table = pd.read_csv(io.BytesIO(read(path)), dtype=str, keep_default_na=False)
             return table.map(with_formula)
         except (OSError, ValueError) as error:
+            if why := access_reason(error):
+                raise ConfigError(f"{path} {why}") from error
             raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexroad.catalog.storage.paths import Location, exists, read
 from flexroad.catalog.storage.staging import atomic_file
-from flexroad.catalog.text import no_formula
+from flexroad.catalog.text import access_reason, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.store.records import Failure, MetricsRow
 
@@ -183,6 +183,8 @@ def read_metrics(run: Location, name: str = METRICS) -> pd.DataFrame:
         # Tables of older versions lack the newer columns.
         return frame.reindex(columns=list(COLUMNS))
     except (OSError, ValueError, KeyError, TypeError, NotImplementedError) as error:
+        if why := access_reason(error):
+            raise ConfigError(f"{path} {why}") from error
         remedy = f"`flexroad rerun {run}` writes it again" if name == METRICS else "remove it"
         raise ConfigError(f"{path} is damaged: {error}; {remedy}") from error
 

@@ -58,9 +58,11 @@ def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
     try:
         with bounded():
             yield
-    except TaskError:
+    except (TaskError, ImportError):
         raise
     except Exception as error:  # Pillow raises many types for damaged files
+        if why := getattr(error, "strerror", None):
+            raise TaskError(f"{failure}: {why}", file=str(file)) from error
         raise TaskError(f"{failure}: {one_line(error)}; {remedy}", file=str(file)) from error
 
 

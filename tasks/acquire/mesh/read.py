@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import FARTHEST
+from flexroad.catalog.text import access_reason
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import bounded
 from flexroad.tasks.acquire.mesh import gltf
@@ -112,12 +113,14 @@ def _errors(path: Path, resolver: Beside) -> Iterator[None]:
     try:
         with bounded(), np.errstate(all="ignore"):
             yield
-    except TaskError:
+    except (TaskError, ImportError):
         raise
     # For a broken file, its readers raise exceptions of many types.
     except Exception as error:
         if resolver.refused is not None:
             raise resolver.refused from error
+        if why := access_reason(error):
+            raise TaskError(f"{path} {why}", file=str(path)) from error
         reason = " ".join(str(error).split())[:200]
         raise TaskError(
             f"{path} cannot be read as a mesh: {type(error).__name__}: {reason}; export it again",

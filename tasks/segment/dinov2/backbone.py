@@ -139,6 +139,8 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         model, info = model_class.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
+    except ImportError:
+        raise
     except Exception as error:  # transformers raises many types for damaged files
         raise TaskError(
             f"cannot read the weights in {folder}: {_one_line(error)}; {_remedy(name)}"

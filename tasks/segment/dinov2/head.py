@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from flexroad.catalog.text import access_reason
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, missing_extra
@@ -99,6 +100,8 @@ def read_head(path: Path) -> Head:
             shape = len(about.classes), about.layers * about.hidden_size
             return Head(_array(file, "weight", shape), _array(file, "bias", shape[:1]), about)
     except (SafetensorError, ValueError, OSError) as error:
+        if why := access_reason(error):
+            raise TaskError(f"{path} {why}", str(path)) from error
         raise TaskError(
             f"{path} is not a head for DINOv2, or is damaged ({_reason(error)}); {REMEDY}", str(path)
         ) from error
