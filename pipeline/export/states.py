@@ -1,7 +1,7 @@
 """The state of a run's tiles: checked once for all formats of an export, then compared by sizes and times.
 
-To check a tile makes its graph; to compare the sizes and times of its files takes a part of that time. What is
-kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
+To check a tile makes its graph; to compare the sizes and times of its files takes a part of that time. What
+is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 """
 
 from __future__ import annotations

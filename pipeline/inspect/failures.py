@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from flexroad.catalog import CatalogError, Layer, Tile
 from flexroad.catalog.cover import height_share
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import quiet, some
+from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.text import count
+from flexroad.catalog.text import access_reason, count
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.graph.layers import lacking, without_photo
@@ -68,7 +70,7 @@ def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Findi
 
 
 def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding]:
-    """Name the missing files, each with the number of tiles that it lies on."""
+    """Name the files that are missing or cannot be read, each with the number of tiles that it lies on."""
     files: Counter[Location] = Counter()
     for tile in tiles:
         for layer in (layer for layer in tile.all_layers if layer.name in layers):
@@ -76,11 +78,29 @@ def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding
             on_tile = layer.reaching(tile.grid.bounds)
             files.update(tile.paths(on_tile) if on_tile else ())
     stat = StatCache()
-    missing = [(path, number) for path, number in files.items() if stat(path) is None]
-    for path, number in missing[:MAX_SHOWN]:
-        yield Finding(f"missing: {path} ({count(number, 'tile')})", fault=True)
-    if len(missing) > MAX_SHOWN:
-        yield Finding(f"missing: {len(missing) - MAX_SHOWN} more files", fault=True)
+    by_reason: dict[str, list[str]] = defaultdict(list)
+    for path, number in files.items():
+        if reason := _no_access(path, stat):
+            by_reason[reason].append(f"{path} ({count(number, 'tile')})")
+    for reason, lines in by_reason.items():
+        for line in lines[:MAX_SHOWN]:
+            yield Finding(f"{reason}: {line}", fault=True)
+        if len(lines) > MAX_SHOWN:
+            yield Finding(f"{reason}: {len(lines) - MAX_SHOWN} more files", fault=True)
+
+
+def _no_access(path: Location, stat: StatCache) -> str | None:
+    """Return why a file is not there, or is not given to this user; None if it is."""
+    if isinstance(path, Path):
+        try:
+            head(path)
+        except FileNotFoundError:
+            return "missing"
+        except Refused:
+            return "not a regular file"
+        except OSError as error:
+            return access_reason(error) or str(error)
+    return "missing" if stat(path) is None else None
 
 
 def _unfit(tiles: Sequence[Tile], config: Config) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ from functools import partial
 from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import absolute, exists, flush_names, parse_location, stat
 from flexroad.catalog.storage.scratch import remove_abandoned
+from flexroad.catalog.text import access_reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, Jobs
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
@@ -159,12 +160,15 @@ def _all_incomplete(run: Run, graph: TileGraph) -> str:
     """Return the error message of a run in which each tile lacks a file."""
     path = own_files_missing(graph)[0]
     file = parse_location(path)
-    if stat(file):
-        remedy = "it cannot be read; make it readable"
-    elif exists(file):
-        remedy = "it is not a regular file; replace it by one"
-    else:
-        remedy = "is the disk with the survey mounted?"
+    try:
+        if stat(file):
+            remedy = "it cannot be read; make it readable"
+        elif exists(file):
+            remedy = "it is not a regular file; replace it by one"
+        else:
+            remedy = "is the disk with the survey mounted?"
+    except OSError as error:
+        remedy = f"it {access_reason(error)}; make it readable"
     return (
         f"each of the {len(run.catalog.usable)} tiles lacks a file, "
         f"for example tile {graph.tile.id}: {path}; {remedy}"

@@ -93,10 +93,11 @@ def read_near(request: Query, bounds: Bounds) -> Any:
 
     try:
         version = stat(request.path)
+        is_other = version is None and exists(request.path)
     except OSError as error:
         raise _error(request, f"cannot be read: {error.strerror}; run again") from error
     if version is None:
-        if exists(request.path):
+        if is_other:
             raise _error(request, "is not a regular file; replace it by one")
         raise _error(request, "cannot be opened (no such file); put it back, or build the catalog again")
     tables = []

@@ -3,6 +3,7 @@
 import errno
 import os
 import resource
+import shutil
 import subprocess
 import sys
 
@@ -99,6 +100,18 @@ def test_library_that_cannot_be_loaded_is_no_fault_of_the_catalog(made_survey, t
     )
     reason = "a library cannot be loaded: pyarrow requires NumPy 99; install flexroad and its libraries again"
     assert (done.returncode, done.stderr) == (2, f"error: {reason}\n")
+
+
+def test_run_of_a_survey_without_permission_says_so(made_survey, tmp_path):
+    survey = shutil.copytree(made_survey, tmp_path / "survey")
+    words = ("run", "--catalog", survey / "catalog.parquet", "--config", "paper", "--out", tmp_path / "run")
+    (survey / "dsm").chmod(0)
+    with permissions_enforced():
+        said = call(*words, "--executor", "serial")
+    (survey / "dsm").chmod(0o755)
+    (line,) = said.expected(2).errors
+    assert line.endswith("it cannot be read: Permission denied; make it readable")
+    assert f"{survey / 'dsm'}/" in line
 
 
 def test_folder_without_permission_is_named_with_its_remedy(tmp_path):

@@ -17,6 +17,7 @@ from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
 from tests.make_rasters import write
+from tests.permissions import permissions_enforced
 
 FEW = "a DSM height in less than 25% of the cells (load.min_valid)"
 
@@ -63,6 +64,25 @@ def test_expected_failures_name_count_and_examples_of_each_reason(survey):
     for tile in (two, three, four):
         with pytest.raises(TaskError):
             load(tile, Options())
+
+
+def test_expected_failures_tell_files_without_permission_from_missing_ones(survey):
+    tiles = Catalog.read(survey).tiles
+    closed, gone = own_file(tiles[0], "dsm"), own_file(tiles[1], "dsm")
+    closed.chmod(0)
+    gone.unlink()
+    folder = own_file(tiles[0], "dtm").parent
+    folder.chmod(0)
+    with permissions_enforced():
+        said = [
+            finding.text for finding in expected_failures(tiles, load_config("production"), ("dsm", "dtm"))
+        ]
+    folder.chmod(0o755)
+    assert f"cannot be read: Permission denied: {closed} (1 tile)" in said
+    assert f"missing: {gone} (1 tile)" in said
+    for tile in tiles:
+        assert f"cannot be read: Permission denied: {folder / f'{tile.id}.tif'} (1 tile)" in said
+    assert sum(text.startswith("missing") for text in said) == 1
 
 
 def test_expected_failures_follow_min_valid_of_the_configuration(survey, tmp_path):
