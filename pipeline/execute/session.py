@@ -20,7 +20,7 @@ from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
-from typing import Any, Generic
+from typing import Generic
 
 from dask.utils import format_bytes, key_split
 from distributed import Client, Future
@@ -250,7 +250,7 @@ class Session(Generic[J, R]):
 
     def _fetch(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
-            address, host, fault, proof, result = self._result(future, flight)
+            address, host, fault, proof, result = future.result()
         except KilledWorker as error:
             # The worker died after the job, before its result was transferred.
             yield from self._worker_died(flight, error)
@@ -266,22 +266,6 @@ class Session(Generic[J, R]):
             else:
                 self.done += 1
                 yield result
-
-    def _result(self, future: Future, flight: InFlight[J]) -> Any:
-        """Return the result of a job.
-
-        Raises
-        ------
-        CancelledError
-            If all workers that may run the job died before its result was transferred: Dask would wait for
-            one of them.
-        """
-        while True:
-            try:
-                return future.result(timeout=TICK_S)
-            except TimeoutError:
-                if flight.workers and self.client.nthreads().keys().isdisjoint(flight.workers):
-                    raise CancelledError from None
 
     def _cancelled(self, flight: InFlight[J]) -> None:
         """Quarantine a job without a result; raise an error if the scheduler is not connected any more."""

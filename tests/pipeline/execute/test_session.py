@@ -78,8 +78,6 @@ class Worker:
     dies: bool = False
     stays: int = 1000
     """Number of jobs after which it leaves, before the session knows."""
-    loses: bool = False
-    """Whether it dies after its first job, before the result is transferred."""
     done: int = 0
 
     def __post_init__(self):
@@ -108,17 +106,11 @@ class MadeProbe:
             raise OSError(f"{proof} is not accepted")
 
 
-LOST = object()
-"""The result of a job whose worker died before it was transferred: Dask waits for it."""
-
-
 class MadeFuture:
     def __init__(self, result=None, error=None):
         self.value, self.error, self.status = result, error, "error" if error else "finished"
 
-    def result(self, timeout):
-        if self.value is LOST:
-            raise TimeoutError
+    def result(self):
         return self.value
 
     def exception(self):
@@ -163,9 +155,6 @@ class WorkingClient(Client):
             self._replace(worker)
             return MadeFuture(error=KilledWorker("job", worker.state, 0))
         worker.done += answer[-1] is not None
-        if worker.loses and worker.done:
-            del self.there[worker.address]
-            return MadeFuture(LOST)
         return MadeFuture(answer)
 
     def _replace(self, worker):
@@ -280,11 +269,6 @@ def test_jobs_of_a_worker_that_left_before_they_started_go_to_another(working):
     join_when_none_is_left(session, Worker("other"))
     assert sorted(session.results()) == sorted(map(str, range(20)))
     assert good.done == 8
-
-
-def test_job_whose_result_was_lost_with_its_worker_is_done_by_another(working):
-    session, _ = working(Worker("bad", loses=True), Worker("good"))
-    assert sorted(session.results()) == sorted(map(str, range(20)))
 
 
 def test_workers_that_all_die_for_memory_end_the_session(working):
