@@ -20,7 +20,7 @@ from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
-from typing import Generic
+from typing import Any, Generic
 
 from dask.utils import format_bytes, key_split
 from distributed import Client, Future
@@ -250,7 +250,7 @@ class Session(Generic[J, R]):
 
     def _fetch(self, future: Future, flight: InFlight[J]) -> Iterator[R]:
         try:
-            address, host, fault, proof, result = future.result()
+            address, host, fault, proof, result = self._result(future)
         except KilledWorker as error:
             # The worker died after the job, before its result was transferred.
             yield from self._worker_died(flight, error)
@@ -266,6 +266,22 @@ class Session(Generic[J, R]):
             else:
                 self.done += 1
                 yield result
+
+    def _result(self, future: Future) -> Any:
+        """Return the result of a finished job.
+
+        Raises
+        ------
+        OSError
+            If its worker died before. Dask would wait for another one, also if no other may run the job.
+        """
+        while True:
+            try:
+                return future.result(TICK_S)
+            except TimeoutError:
+                # A worker that is there may take long to answer: a library may hold its interpreter.
+                if future.status != "finished":
+                    raise
 
     def _cancelled(self, flight: InFlight[J]) -> None:
         """Quarantine a job without a result; raise an error if the scheduler is not connected any more."""

@@ -110,7 +110,7 @@ class MadeFuture:
     def __init__(self, result=None, error=None):
         self.value, self.error, self.status = result, error, "error" if error else "finished"
 
-    def result(self):
+    def result(self, timeout):
         return self.value
 
     def exception(self):
@@ -269,6 +269,24 @@ def test_jobs_of_a_worker_that_left_before_they_started_go_to_another(working):
     join_when_none_is_left(session, Worker("other"))
     assert sorted(session.results()) == sorted(map(str, range(20)))
     assert good.done == 8
+
+
+@pytest.mark.parametrize("status", ["lost", "finished"])
+def test_result_that_is_not_fetched_in_time_is_lost_only_with_its_worker(status, working, monkeypatch):
+    """A worker holds its results, and may take long to answer."""
+    session, _ = working(Worker("good"))
+    late = []
+
+    def result(future, timeout):
+        if len(late) < 3:
+            late.append(future)
+            future.status = status
+            raise TimeoutError
+        return future.value
+
+    monkeypatch.setattr(MadeFuture, "result", result)
+    assert sorted(session.results()) == sorted(map(str, range(20)))
+    assert len({*map(id, late)}) == (3 if status == "lost" else 1)
 
 
 def test_workers_that_all_die_for_memory_end_the_session(working):
