@@ -87,9 +87,9 @@ def train(
     ] = None,
     allow: shared.Allow = None,
 ) -> None:
-    """Train the linear head of `segment: dinov2` on labelled tiles and validate it on others.
+    """Train the head of `segment: dinov2` on labelled tiles.
 
-    The files are MODEL, its report MODEL.html, and MODEL.json.
+    It is validated on other tiles. The files are MODEL, its report MODEL.html, and MODEL.json.
     """
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
