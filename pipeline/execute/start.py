@@ -38,7 +38,7 @@ def extra(kind: str) -> Any:
             f"cluster.kind {kind} needs {package}: pip install 'flexroad[{kind}]' ({error})"
         ) from error
     finally:
-        # The import of dask_jobqueue makes Ctrl-C end the program at once, with jobs left behind.
+        # The import of dask_jobqueue lets Ctrl-C exit with code 0.
         signal.signal(signal.SIGINT, interrupt)
 
 
