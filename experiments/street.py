@@ -1,10 +1,12 @@
 """A real street in 3D before and after: the picture at the top of the README.
 
-Before is the surface model with its trees, as a scan gives it; after is the surface of ``production``, fitted
-to it, the terrain model and the land cover. The data are the UMEP tutorial's rasters of the Barbican, London
-(doi:10.1016/j.envsoft.2017.09.020), unpacked from ``London_BNG.zip``.
+Before is the scan with its photograph; after is the mesh of ``production_vector``, whose roads were drawn by
+hand (``--set "segment.where=class = 'road' AND certainty <> 'low'"``). The data are a laser scan
+of Eugene, Oregon (Watershed Sciences, PDAL/data, CC BY 4.0). The photograph is made of the colours of its
+points, moved by 2 m onto its heights. Section "Autzen" of docs/acquisition.md has the command that makes the
+rasters.
 
-Usage: ``python experiments/street.py FOLDER OUT.webp`` (needs OpenGL)
+Usage: ``python experiments/street.py RUN PHOTO.tif OUT.webp`` (needs OpenGL)
 """
 
 from __future__ import annotations
@@ -15,64 +17,64 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 import rioxarray
-import xarray as xr
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 import flexroad
 
-FITTED = (532040.0, 181625.0, 532290.0, 181875.0)
-SHOWN = (532076.0, 181690.0, 532176.0, 181850.0)
-"""West, south, east and north (m, EPSG:27700): Aldersgate Street."""
-PAVED, TREE_M = 1, 2.0
-ROAD, LAND, TREE, SKY = "#5d646e", "#ddd3bd", "#7fa35b", "#ffffff"
-SIZE_PX, OVERSAMPLING, QUALITY = (720, 560), 2, 86
+TILE = "194250_259750"
+SHOWN = (194252.0, 259838.0, 194472.0, 259978.0)
+"""West, south, east and north (m, EPSG:2993): a street and the car parks beside it."""
+ROAD, LAND, SKY = "#5d646e", "#ddd3bd", "#ffffff"
+ROAD_CLASS = 11
+"""ASPRS class of road surface in the PLY."""
+SIZE_PX, OVERSAMPLING, QUALITY = (720, 400), 2, 86
 
 
-def read(path: Path) -> xr.DataArray:
-    raster = rioxarray.open_rasterio(path, masked=True).squeeze("band", drop=True)
-    return raster.rio.clip_box(*FITTED).astype("float64")
-
-
-def sheet(heights: xr.DataArray, kinds: np.ndarray) -> pv.StructuredGrid:
-    """Return the cells of a raster as one surface; kinds are 0 land, 1 road, 2 tree."""
-    part = heights.rio.clip_box(*SHOWN)
-    east, north = np.meshgrid(part.x.values - SHOWN[0], part.y.values - SHOWN[1])
-    grid = pv.StructuredGrid(east, north, part.values)
-    grid["colour"] = kinds.ravel(order="F")
+def scanned(tile, photo: Path) -> pv.StructuredGrid:
+    """Return the cells of the surface model with the colours of the photograph."""
+    part = tile.dsm.rio.clip_box(*SHOWN)
+    east, north = np.meshgrid(part.x.values, part.y.values)
+    pixels = rioxarray.open_rasterio(photo).sel(band=[1, 2, 3]).sel(x=part.x, y=part.y, method="nearest")
+    grid = pv.StructuredGrid(east - SHOWN[0], north - SHOWN[1], part.values)
+    grid["rgb"] = pixels.values.reshape(3, *east.shape).transpose(2, 1, 0).reshape(-1, 3).astype(np.uint8)
     return grid
 
 
-def draw(heights: xr.DataArray, colours: xr.DataArray, title: str) -> Image.Image:
-    palette = np.array([ImageColor.getrgb(name) for name in (LAND, ROAD, TREE)], np.uint8)
-    kinds = colours.rio.clip_box(*SHOWN).values.astype(int)
-    grid = sheet(heights, kinds)
-    grid["rgb"] = palette[kinds.ravel(order="F")]
+def meshed(path: Path) -> pv.PolyData:
+    """Return the part of a tile's PLY that is shown, with a colour per face."""
+    import trimesh
+
+    mesh = trimesh.load(path, process=False)
+    faces = mesh.metadata["_ply_raw"]["face"]["data"]
+    vertices = mesh.vertices - (SHOWN[0], SHOWN[1], 0)
+    inside = ((vertices[:, :2] >= 0) & (vertices[:, :2] <= np.subtract(SHOWN[2:], SHOWN[:2]))).all(axis=1)
+    kept = inside[mesh.faces].all(axis=1)
+    shown = pv.PolyData.from_regular_faces(vertices, mesh.faces[kept])
+    palette = np.array([ImageColor.getrgb(name) for name in (LAND, ROAD)], np.uint8)
+    shown.cell_data["rgb"] = palette[(np.ravel(faces["class"])[kept] == ROAD_CLASS).astype(int)]
+    return shown
+
+
+def draw(mesh: pv.DataSet, title: str, height: float) -> Image.Image:
     plotter = pv.Plotter(off_screen=True, window_size=[n * OVERSAMPLING for n in SIZE_PX], lighting="none")
     plotter.set_background(SKY)
-    plotter.add_mesh(grid, scalars="rgb", rgb=True, ambient=0.32, diffuse=0.75, smooth_shading=False)
-    middle = np.array([(SHOWN[2] - SHOWN[0]) / 2, (SHOWN[3] - SHOWN[1]) / 2 - 6, 14.0])
-    for at, light in (((-1, 1, 1.4), 0.95), ((1.2, -1, 1), 0.35)):
+    plotter.add_mesh(mesh, scalars="rgb", rgb=True, ambient=0.4, diffuse=0.7, smooth_shading=False)
+    middle = np.array([(SHOWN[2] - SHOWN[0]) / 2, (SHOWN[3] - SHOWN[1]) / 2, height])
+    for at, light in (((-1, 1, 1.4), 0.85), ((1.2, -1, 1), 0.35)):
         plotter.add_light(pv.Light(position=tuple(middle + 300 * np.array(at)), intensity=light))
-    plotter.camera_position = [tuple(middle + 212 * np.array([0.42, -0.86, 0.78])), tuple(middle), (0, 0, 1)]
-    plotter.camera.view_angle = 32
+    plotter.camera_position = [tuple(middle + 278 * np.array([-0.3, -0.8, 0.55])), tuple(middle), (0, 0, 1)]
+    plotter.camera.view_angle = 30
     image = Image.fromarray(plotter.screenshot(return_img=True)).resize(SIZE_PX, Image.Resampling.LANCZOS)
     plotter.close()
     ImageDraw.Draw(image).text((16, 12), title, "#22303c", ImageFont.load_default(22))
     return image
 
 
-def main(folder: Path, out: Path) -> None:
-    dsm, dtm = (read(folder / f"{name}_barb_1m_tif.tif") for name in ("dsm", "dem"))
-    trees, cover = read(folder / "cdsm_barb_1m_v2_float.tif"), read(folder / "landcover_barb_1m_v3.tif")
-    trees = trees.assign_coords(x=dsm.x, y=dsm.y).fillna(0)
-    paved = (cover == PAVED).assign_coords(x=dsm.x, y=dsm.y)
-    scanned = dsm.where(trees < TREE_M, dsm + trees).rio.write_crs("EPSG:27700")
-    road = paved.astype(float).rio.write_crs("EPSG:27700")
-    surface = flexroad.fit(scanned, dtm.rio.write_crs("EPSG:27700"), road.astype("uint8"))
-    east, north = np.meshgrid(dsm.x, dsm.y)
-    smooth = scanned.copy(data=surface.height(east, north))
-    before = draw(scanned, road.where(trees < TREE_M, 2), "before: the scan, 1 m")
-    after = draw(smooth, road, "after: road and terrain of FlexRoad")
+def main(run: Path, photo: Path, out: Path) -> None:
+    tile = flexroad.open_run(run).tile(TILE)
+    height = float(np.nanmedian(tile.surface.rio.clip_box(*SHOWN)))
+    before = draw(scanned(tile, photo), "before: the scan, with its photograph", height)
+    after = draw(meshed(run / "tiles" / TILE / f"{TILE}_flexroad.ply"), "after: road and terrain", height)
     both = Image.new("RGB", (2 * SIZE_PX[0], SIZE_PX[1]), SKY)
     both.paste(before, (0, 0))
     both.paste(after, (SIZE_PX[0], 0))
@@ -81,4 +83,4 @@ def main(folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*map(Path, sys.argv[1:4]))

@@ -1,4 +1,4 @@
-"""Documentation: the commands of docs/cli.md run, links have targets, named tests exist."""
+"""Documentation: the commands of README and docs/cli.md run, links have targets, named tests exist."""
 
 import re
 import shlex
@@ -31,6 +31,29 @@ def test_docs_cli_commands_run(tmp_path, monkeypatch):
         assert command == "flexroad"
         said = call(*words)
         assert said.code == 0, f"{line}\n{said.out}{said.err}"
+
+
+@pytest.mark.slow
+def test_readme_commands_and_code_run_in_empty_folder(tmp_path, monkeypatch):
+    """The survey is smaller than README's, whose tiles have 250 m."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "README.md").read_text()
+    section = text.partition("## Two minutes from nothing\n")[2].partition("\n## ")[0]
+    commands = re.findall(r"^flexroad (.*)$", section, flags=re.MULTILINE)
+    assert [line.split()[0] for line in commands] == ["catalog", "run", "report", "view"]
+    smaller = {"catalog": ["--tile-size", "60"], "run": ["--executor", "serial"]}
+    for line in commands:
+        words = shlex.split(line, comments=True)
+        said = call(*words, *smaller.get(words[0], []))
+        assert said.code == 0, f"{line}\n{said.out}{said.err}"
+    for path in ("survey/catalog.parquet", "runs/survey/report.html", "runs/survey/viewer/index.html"):
+        assert path in section
+        assert Path(path).is_file()
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    names: dict[str, object] = {}
+    exec(code, names)
+    assert Path("road.glb").is_file()
+    assert names["run"].tiles.state.tolist() == 4 * ["done"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -1,4 +1,4 @@
-"""The README's commands on real data give the README's tables."""
+"""The commands of docs/acquisition.md on rasters of two cities give its tables."""
 
 import shlex
 import zipfile
@@ -8,15 +8,15 @@ import pytest
 
 from tests.real.shown import flexroad, measured, table_after
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs" / "acquisition.md"
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", ["barbican", "gothenburg"])
-def test_commands_give_table_of_readme(name, real_data, tmp_path):
+def test_commands_give_table_of_page(name, real_data, tmp_path):
     for archive in ("London_BNG", "Goteborg_SWEREF99_1200"):
         zipfile.ZipFile(real_data / "umep" / f"{archive}.zip").extractall(tmp_path / "umep")
-    text = README.read_text()
+    text = PAGE.read_text()
     commands = [line for line in text.splitlines() if line.startswith("flexroad ") and name in line]
     assert len(commands) >= 2
     for line in commands[:2]:
