@@ -10,7 +10,7 @@ from tests.command_line import call
 from tests.make_backbone import save_backbone
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 NAMED_TEST = re.compile(r"`(test_\w+\.py)::(test_\w+)`")
 
 
