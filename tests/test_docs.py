@@ -62,6 +62,14 @@ def test_links_have_targets(page):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_development_names_existing_files():
+    text = (ROOT / "docs" / "development.md").read_text()
+    named = re.findall(r"(?<![\w./])(?:catalog|pipeline|tasks|tests)/[\w/]+\.py", text)
+    assert [name for name in named if "NAME" not in name and not (ROOT / name).exists()] == []
+    way = text.partition("## The way of one tile")[2].partition("\n## ")[0]
+    assert 30 <= len(re.findall(r"^ *\w+/\S+\.py ", way, flags=re.MULTILINE)) <= 35
+
+
 def test_operations_faults_name_existing_tests():
     text = (ROOT / "docs" / "operations.md").read_text()
     table = text.split("## Faults")[1].split("\n## ")[0]
