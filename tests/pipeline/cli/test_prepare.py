@@ -132,7 +132,7 @@ def test_prepare_into_folder_in_use_is_refused(cloud, tmp_path):
 
 
 def test_prepare_into_folder_of_killed_process_takes_over_its_lock(cloud, tmp_path):
-    (tmp_path / "lock.json").write_bytes(replace(Owner.me(), boot="before").data)
+    (tmp_path / "lock.json").write_bytes(replace(Owner.me(), pid=2**22 + 1).data)
     said = flexroad("prepare", "points", cloud, "-o", tmp_path, "--workers", 1)
     assert "note: took over the lock of pid" in said
     assert not (tmp_path / "lock.json").exists()
