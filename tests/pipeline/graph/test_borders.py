@@ -336,7 +336,7 @@ def test_dry_run_looks_up_shared_nodes_once(survey, flexroad, tmp_path, monkeypa
 
     monkeypatch.setattr(ArtefactStore, "has", has)
     words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run", "-v")
-    out = flexroad("run", "--config", "nightly", "--set", "fit.spacing_m=10", *words).expected(0).out
+    out = flexroad("run", "--config", "production", "--set", "fit.spacing_m=10", *words).expected(0).out
     assert "  border   16 stored, 24 to do" in out.splitlines()
     # Each of nine tiles lists its own.
     assert len(re.findall(r"^  border   \w+  stored ", out, re.MULTILINE)) == 9 * 4
