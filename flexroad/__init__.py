@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from flexroad.pipeline.benchmark.example import example
     from flexroad.pipeline.errors import ConfigError
     from flexroad.pipeline.inspect.fit import fit
+    from flexroad.pipeline.inspect.process import catalog_from, run
     from flexroad.pipeline.inspect.run import RunView, open_run
     from flexroad.pipeline.inspect.surface import Surface, open_surface
+    from flexroad.pipeline.run.observer import Observer
     from flexroad.tasks.errors import TaskError
 
     __version__: str
@@ -26,26 +28,32 @@ if TYPE_CHECKING:
 __all__ = [
     "CatalogError",
     "ConfigError",
+    "Observer",
     "RunView",
     "Surface",
     "TaskError",
     "__version__",
+    "catalog_from",
     "example",
     "fit",
     "open_run",
     "open_surface",
+    "run",
 ]
 
 _HOME = {
     "CatalogError": "catalog.errors",
     "ConfigError": "pipeline.errors",
+    "Observer": "pipeline.run.observer",
     "RunView": "pipeline.inspect.run",
     "Surface": "pipeline.inspect.surface",
     "TaskError": "tasks.errors",
+    "catalog_from": "pipeline.inspect.process",
     "example": "pipeline.benchmark.example",
     "fit": "pipeline.inspect.fit",
     "open_run": "pipeline.inspect.run",
     "open_surface": "pipeline.inspect.surface",
+    "run": "pipeline.inspect.process",
 }
 """The module of each public name, below this package."""
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,13 +15,12 @@ from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
-from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.errors import ClusterLost
+from flexroad.pipeline.run.observer import Observer
 
 if TYPE_CHECKING:
-    from flexroad.catalog import Catalog, Tile
-    from flexroad.catalog.storage.paths import Location
-    from flexroad.pipeline.config.models import Config
-    from flexroad.pipeline.execute import Executor
+    from flexroad.pipeline.monitor.progress import ProgressDisplay
+    from flexroad.pipeline.run.conductor import Prepared
     from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.run.summary import Summary
     from flexroad.pipeline.worker.tile import TileResult
@@ -92,49 +90,39 @@ def run(
 
     After an interruption, the same command resumes the run.
     """
-    from flexroad.catalog import Catalog
-    from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import parse_location
     from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.graph.graph import layers_read
+    from flexroad.pipeline.run.conductor import Selection, Workers, created
     from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
 
-    path, catalog_path = parse_location(out), parse_location(catalog)
+    path, source = parse_location(out), parse_location(catalog)
     root = parse_location(store) if store else None
-
-    def read_catalog(chosen: Config) -> tuple[Catalog, Catalog]:
-        """Return the whole catalog and its selected tiles."""
-        whole = Catalog.read(catalog_path, allow or ())
-        check_allowed(whole, layers_read(chosen))
-        selected = whole.select(tile or (), bbox, options.read_area(area, area_layer))
-        if not selected.tiles:
-            raise ConfigError(f"catalog {catalog} has no tiles")
-        return whole, selected
-
-    def of_run(whole: Catalog, selected: Catalog) -> Catalog:
-        """Return the tiles of the run, also those of earlier partial runs."""
-        return merged_catalog(path, whole, selected) if tile or bbox is not None or area else whole
-
     if dry_run:
         from flexroad.pipeline.cli.dry_run import plan
 
         chosen = load_config(config, settings or ())
-        whole, selected = read_catalog(chosen)
-        planned = Run.planned(path, chosen, of_run(whole, selected), root, checksum)
-        for line in plan(planned, selected.tiles, verbose, workers):
+        selection = Selection(tile or (), bbox, options.read_area(area, area_layer))
+        selected = selection.of(path, source, allow or (), chosen)
+        planned = Run.planned(path, chosen, selected.run, root, checksum)
+        for line in plan(planned, selected.tiles.tiles, verbose, workers):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         chosen = load_config(config, settings or ())
-        with _named(f"reading {catalog}"):
-            whole, selected = read_catalog(chosen)
-        with _locked(path, create=True) as died:
-            with _named(f"preparing {out}"):
-                opened = Run.create(path, chosen, of_run(whole, selected), root, checksum)
-            only = rerun_filter(opened, [tile.id for tile in selected.tiles], failed=False)
-            make_executor = partial(_executor, executor, died, workers, scheduler, chosen, dashboard, path)
-            _run_tiles(opened, make_executor, only, frozenset(), verify, outcome)
+        selection = Selection(tile or (), bbox, options.read_area(area, area_layer))
+        shown = Shown(outcome)
+        with created(
+            path,
+            source,
+            chosen,
+            selection,
+            store=root,
+            checksum=checksum,
+            allow=allow or (),
+            workers=Workers(executor, workers, scheduler, dashboard),
+            observer=shown,
+        ) as prepared:
+            _process(prepared, verify, shown)
     _exit(outcome)
 
 
@@ -170,131 +158,91 @@ def rerun(
 
     For changes of source files or of RUN/config.yaml, and for failed tiles.
     """
-    from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.paths import parse_location
-    from flexroad.pipeline.graph.borders import STAGE as BORDER
-    from flexroad.pipeline.graph.graph import layers_read
-    from flexroad.pipeline.graph.stages import STAGE_NAMES
-    from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.selection import rerun_filter
-    from flexroad.pipeline.run.workers import with_workers
+    from flexroad.pipeline.run.conductor import Workers, reopened
 
     location = parse_location(path)
     with report_outcome(location, on_failure, prometheus) as outcome:
-        steps = (*STAGE_NAMES, "export")
-        force = frozenset(steps[steps.index(from_stage) :]) if from_stage else frozenset()
-        # The control points of a border are part of the fit.
-        force |= {BORDER} if "fit" in force else frozenset()
-        with _locked(location) as died:
-            with _named(f"reading {path}"):
-                opened = with_workers(Run.open(location, allow or ()), settings or ())
-                check_allowed(opened.catalog, layers_read(opened.config))
-            only = rerun_filter(opened, tile or (), failed)
-            config = opened.config
-            make_executor = partial(
-                _executor, executor, died, workers, scheduler, config, dashboard, location
-            )
-            _run_tiles(opened, make_executor, only, force, verify, outcome)
+        shown = Shown(outcome)
+        with reopened(
+            location,
+            tile or (),
+            failed=failed,
+            from_stage=from_stage,
+            settings=settings or (),
+            allow=allow or (),
+            workers=Workers(executor, workers, scheduler, dashboard),
+            observer=shown,
+        ) as prepared:
+            _process(prepared, verify, shown)
     _exit(outcome)
 
 
-@contextlib.contextmanager
-def _named(work: str) -> Iterator[None]:
-    """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
-    from flexroad.pipeline.monitor.progress import FIRST_S, said_repeatedly
+class Shown(Observer):
+    """Shows the events of a run on standard error, and writes them for Prometheus; a context manager."""
 
-    def line(spent_s: float) -> str:
-        return f"{work}, {spent_s:.0f} s spent"
+    def __init__(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self.display: ProgressDisplay | None = None
+        """Progress of the tiles, from the first one on until the block ends."""
+        self._stack = contextlib.ExitStack()
 
-    with said_repeatedly(line, lambda text: echo(text, err=True), FIRST_S):
-        yield
+    def __enter__(self) -> Shown:
+        return self
 
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
 
-@contextlib.contextmanager
-def _locked(path: Location, create: bool = False) -> Iterator[bool]:
-    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty.
+    @contextlib.contextmanager
+    def working(self, work: str) -> Iterator[None]:
+        """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
+        from flexroad.pipeline.monitor.progress import FIRST_S, said_repeatedly
 
-    A folder with files of others is then refused, before anything is written.
+        def line(spent_s: float) -> str:
+            return f"{work}, {spent_s:.0f} s spent"
 
-    Yields whether the process that held the lock before has died: one of the tiles may have ended it.
-    """
-    from flexroad.catalog.storage.outputs import made_folder
-    from flexroad.pipeline.run.folder import check_folder, check_links
-    from flexroad.pipeline.run.lock import run_lock
+        with said_repeatedly(line, lambda text: echo(text, err=True), FIRST_S):
+            yield
 
-    taken_over: list[str] = []
+    def note(self, text: str) -> None:
+        """Print a note."""
+        warn(text, "note")
 
-    def notify(line: str) -> None:
-        taken_over.append(line)
-        warn(line, "note")
+    def warning(self, text: str) -> None:
+        """Print a warning."""
+        warn(text)
 
-    with contextlib.ExitStack() as stack:
-        if create:
-            check_folder(path)
-            if isinstance(path, Path):
-                try:
-                    stack.enter_context(made_folder(path))
-                except OSError as error:
-                    raise ConfigError(
-                        f"cannot write the run to {path}: {error}; choose another --out"
-                    ) from error
-        else:
-            check_links(path)
-        stack.enter_context(run_lock(path, notify))
-        yield bool(taken_over)
+    def start(self, tiles: int, selected: int) -> None:
+        """Show the progress."""
+        from rich.console import Console
 
+        from flexroad.pipeline.monitor.progress import ProgressDisplay
 
-def _executor(
-    name: str,
-    died: bool,
-    workers: int | None,
-    scheduler: str | None,
-    config: Config,
-    dashboard: bool,
-    path: Location,
-    say: Callable[[str], None],
-) -> Executor:
-    from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, SerialExecutor
+        self.display = self._stack.enter_context(ProgressDisplay(selected, Console(stderr=True)))
+        if self.outcome.textfile is not None:
+            self.outcome.textfile.total = tiles
 
-    if name == "serial":
-        return SerialExecutor()
-    cluster = config.cluster
-    logs = path.resolve() / "logs" if isinstance(path, Path) else None
-    parallel = DaskExecutor(workers, scheduler, cluster, dashboard, say, logs)
-    if name == "dask" or died or scheduler or dashboard or cluster.needs_workers:
-        return parallel
-    return AdaptiveExecutor(workers or cluster.workers, parallel, say)
+    def line(self, text: str) -> None:
+        """Print a line above the progress."""
+        if self.display:
+            self.display.say(text)
+
+    def tile(self, result: TileResult) -> None:
+        """Add a tile to the progress and to the file for Prometheus."""
+        if self.display:
+            self.display(result)
+        if self.outcome.textfile is not None:
+            self.outcome.textfile(result)
 
 
-def _run_tiles(
-    run: Run,
-    make_executor: Callable[[Callable[[str], None]], Executor],
-    only: Callable[[Tile], bool],
-    force: frozenset[str],
-    verify: bool,
-    outcome: Outcome,
-) -> None:
-    """Run the tiles and fill in the outcome."""
-    from rich.console import Console
+def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
+    """Process the tiles and fill in the outcome."""
+    from flexroad.pipeline.run.conductor import process
 
-    from flexroad.pipeline.monitor.progress import ProgressDisplay
-    from flexroad.pipeline.run.runner import run_tiles
-
-    folder = shlex.quote(str(run.path))
-    console = Console(stderr=True)
-    display = ProgressDisplay(sum(map(only, run.catalog.tiles)), console)
-    executor = make_executor(display.say)
-    if outcome.textfile is not None:
-        outcome.textfile.total = len(run.catalog.tiles)
-
-    def watch(result: TileResult) -> None:
-        display(result)
-        if outcome.textfile is not None:
-            outcome.textfile(result)
-
+    folder, outcome = shlex.quote(str(prepared.run.path)), shown.outcome
     try:
-        with display:
-            summary = outcome.summary = run_tiles(run, executor, only, force, watch, verify)
+        with shown:
+            summary = outcome.summary = process(prepared, verify)
     except ClusterLost as error:
         outcome.exit_code, outcome.text = 1, f"{error}; the same command goes on from here"
         return
@@ -302,11 +250,9 @@ def _run_tiles(
         outcome.exit_code = 1
         outcome.text = f"{error}; {remedy(error)}, then run `flexroad rerun {folder}`"
         return
-    finally:
-        _write_map(run)
     outcome.exit_code, outcome.text = summary.exit_code, format_summary(summary)
-    echo(f"{outcome.text}; results in {run.path}")
-    if set(display.status) == {"cached"}:
+    echo(f"{outcome.text}; results in {prepared.run.path}")
+    if shown.display and set(shown.display.status) == {"cached"}:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
     if summary.done and summary.without_roads == summary.done:
         warn(
@@ -325,16 +271,6 @@ def _echo_next(summary: Summary, folder: str) -> None:
         echo(f"{tiles} {have} no result of the present files and options; next: flexroad rerun {folder}")
     elif not summary.exit_code:
         echo(f"next: flexroad report {folder} --format html")
-
-
-def _write_map(run: Run) -> None:
-    """Write the map of tile states; only warn if that fails."""
-    from flexroad.pipeline.monitor.geojson import NAME, write_states
-
-    try:
-        write_states(run, run.path / NAME)
-    except OSError as error:
-        warn(f"cannot write the map of the tiles: {error}")
 
 
 def _exit(outcome: Outcome) -> None:
@@ -358,7 +294,7 @@ def status(
 
     opened = Run.open(parse_location(path), allow or ())
     if geojson is not None:
-        from flexroad.pipeline.monitor.geojson import write_states
+        from flexroad.pipeline.run.geojson import write_states
 
         write_states(opened, parse_location(geojson))
         echo(str(geojson))

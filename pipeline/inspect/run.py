@@ -20,6 +20,8 @@ from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
 from flexroad.pipeline.inspect.points import Answer, Ground
 from flexroad.pipeline.inspect.surface import Surface
 from flexroad.pipeline.inspect.tile import open_tile
+from flexroad.pipeline.run.conductor import Workers, process, reopened
+from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunView:
-    """A read-only view of a run, opened by `flexroad.open_run`.
+    """A view of a run, opened by `flexroad.open_run`; only `rerun` changes the run.
 
     Each access reads the current files of the run, also while the run is in progress.
     """
@@ -309,6 +311,60 @@ class RunView:
         0.0
         """
         return open_tile(self.run.path, tile_id, self.variant, self.allow)
+
+    def rerun(
+        self,
+        tiles: Sequence[str] = (),
+        *,
+        failed: bool = False,
+        from_stage: str | None = None,
+        workers: int | None = None,
+        observer: Observer | None = None,
+    ) -> RunView:
+        """Bring tiles up to date again, as ``flexroad rerun`` does.
+
+        Parameters
+        ----------
+        tiles : sequence of str
+            Ids of the tiles; none given: all, or the failed ones.
+        failed : bool
+            Whether the tiles that failed are processed.
+        from_stage : str, optional
+            Stage to compute again, with all later ones; ``export``: only the products are written again.
+        workers : int, optional
+            Most worker processes; 1: this process alone; None: as many as pay.
+        observer : Observer, optional
+            Takes the events of the run.
+
+        Returns
+        -------
+        RunView
+            The run as it is then.
+
+        Raises
+        ------
+        ConfigError, CatalogError, ClusterLost, OSError
+            As of `flexroad.run`.
+
+        Examples
+        --------
+        >>> import flexroad
+        >>> run = flexroad.open_run("runs/city")
+        >>> run.rerun(["499980_5599980"], from_stage="export", workers=1).tiles["state"].tolist()
+        ['done', 'pending']
+        """
+        held = reopened(
+            self.run.path,
+            tiles,
+            failed=failed,
+            from_stage=from_stage,
+            allow=self.allow,
+            workers=Workers("serial" if workers == 1 else "auto", workers),
+            observer=observer,
+        )
+        with held as prepared:
+            process(prepared)
+        return open_run(str(self.run.path), self.variant, self.allow)
 
     def _at(self, x: ArrayLike, y: ArrayLike) -> tuple[tuple[int, ...], Answer]:
         easting, northing = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))

@@ -30,6 +30,7 @@ MODULES = [
     "flexroad",
     "flexroad.pipeline.benchmark.example",
     "flexroad.pipeline.inspect.fit",
+    "flexroad.pipeline.inspect.process",
     "flexroad.pipeline.inspect.run",
     "flexroad.pipeline.inspect.surface",
 ]

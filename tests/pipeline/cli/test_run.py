@@ -219,7 +219,7 @@ def test_run_interrupted_notifies_and_failed_notification_only_warns(
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("flexroad.pipeline.run.runner.run_tiles", interrupted)
+    monkeypatch.setattr("flexroad.pipeline.run.conductor.run_tiles", interrupted)
     said = flexroad(*nightly, *notification.words, expect=130)
     assert "interrupted; the same command goes on from here" in said
     assert notification.received["exit_code"] == 130

@@ -1,0 +1,292 @@
+"""Bring a run up to date: read the catalog, hold the run's lock, choose the executor, process, write the map.
+
+::
+
+    with created(path, catalog, config) as prepared:     # or reopened(path)
+        summary = process(prepared)
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from flexroad.catalog import Bounds, Catalog, Tile
+from flexroad.catalog.allowlist import check_allowed
+from flexroad.catalog.area import Area
+from flexroad.catalog.storage.outputs import made_folder
+from flexroad.catalog.storage.paths import Location
+from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, SerialExecutor
+from flexroad.pipeline.graph.borders import STAGE as BORDER
+from flexroad.pipeline.graph.graph import layers_read
+from flexroad.pipeline.graph.stages import STAGE_NAMES
+from flexroad.pipeline.run.folder import check_folder, check_links
+from flexroad.pipeline.run.geojson import NAME as MAP
+from flexroad.pipeline.run.geojson import write_states
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.observer import Observer
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
+from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.run.workers import with_workers
+
+Kind = Literal["auto", "serial", "dask"]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where tiles are processed."""
+
+    executor: Kind = "auto"
+    """auto: worker processes if they pay; serial: this process; dask: workers."""
+    number: int | None = None
+    """Most worker processes; None: as the configuration says."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, whose workers are used; None: workers are started."""
+    dashboard: bool = False
+    """Whether Dask's dashboard is served."""
+
+
+AUTO = Workers()
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The tiles of a catalog that a run takes; all if nothing is given."""
+
+    tiles: Sequence[str] = ()
+    bbox: Bounds | None = None
+    area: Area | None = None
+
+    def of(self, path: Location, catalog: Location, allow: Sequence[Any], config: Config) -> Selected:
+        """Read a catalog and select tiles for the run at ``path``.
+
+        Raises
+        ------
+        CatalogError
+            If the catalog cannot be read, has no such tiles, or names files outside the allowed folders.
+        ConfigError
+            If no tile is selected.
+        """
+        whole = Catalog.read(catalog, allow)
+        check_allowed(whole, layers_read(config))
+        selected = whole.select(self.tiles, self.bbox, self.area)
+        if not selected.tiles:
+            raise ConfigError(f"catalog {catalog} has no tiles")
+        some = self.tiles or self.bbox is not None or self.area
+        return Selected(merged_catalog(path, whole, selected) if some else whole, selected)
+
+
+ALL = Selection()
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Tiles of a catalog."""
+
+    run: Catalog
+    """The tiles of the run, also those of earlier partial runs."""
+    tiles: Catalog
+    """The tiles to bring up to date."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that this process may write, until the block that gave it ends."""
+
+    run: Run
+    only: Callable[[Tile], bool]
+    """Whether a tile is to be brought up to date."""
+    executor: Executor
+    observer: Observer
+    force: frozenset[str] = field(default_factory=frozenset)
+    """Stages to compute even if their results are in the store."""
+
+
+@contextlib.contextmanager
+def created(
+    path: Location,
+    catalog: Location,
+    config: Config,
+    selection: Selection = ALL,
+    *,
+    store: Location | None = None,
+    checksum: bool = False,
+    allow: Sequence[Any] = (),
+    workers: Workers = AUTO,
+    observer: Observer | None = None,
+) -> Iterator[Prepared]:
+    """Hold a new or an existing run of a catalog while its tiles are brought up to date.
+
+    Parameters
+    ----------
+    path : Location
+        The run's folder: new, empty, or of a run, which is resumed.
+    catalog : Location
+        The catalog's file.
+    selection : Selection
+        Its tiles to process.
+    store : Location, optional
+        Folder of stage results that several runs share; by default a folder of the run.
+    checksum : bool
+        Whether changed sources are detected by their content, not by size and time.
+    allow : sequence
+        Folders besides the catalog's that its files may lie below.
+
+    Raises
+    ------
+    ConfigError
+        If the folder has other files or cannot be written, another process works on it, or no tile is
+        selected.
+    CatalogError
+        As of `Selection.of`.
+    """
+    observer = observer or Observer()
+    with observer.working(f"reading {catalog}"):
+        selected = selection.of(path, catalog, allow, config)
+    with _locked(path, observer, create=True) as died:
+        with observer.working(f"preparing {path}"):
+            run = Run.create(path, config, selected.run, store, checksum)
+        only = rerun_filter(run, [tile.id for tile in selected.tiles.tiles], failed=False)
+        yield Prepared(run, only, _executor(run, workers, died, observer), observer)
+
+
+@contextlib.contextmanager
+def reopened(
+    path: Location,
+    tiles: Sequence[str] = (),
+    *,
+    failed: bool = False,
+    from_stage: str | None = None,
+    settings: Sequence[str] = (),
+    allow: Sequence[Any] = (),
+    workers: Workers = AUTO,
+    observer: Observer | None = None,
+) -> Iterator[Prepared]:
+    """Hold an existing run while its tiles are brought up to date.
+
+    Parameters
+    ----------
+    path : Location
+        The run's folder.
+    tiles : sequence of str
+        Ids of the tiles to process; none given: all, or the failed ones.
+    failed : bool
+        Whether the tiles that failed are processed.
+    from_stage : str, optional
+        Stage that is computed again, with all later ones; ``export``: only the products are written again.
+    settings : sequence of str
+        Options of the workers: ``cluster.memory=8 GiB``.
+    allow : sequence
+        Folders besides the run's that its files may lie below.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is no run or another process works on it.
+    CatalogError
+        If its catalog is damaged, has no such tile, or names files outside the allowed folders.
+    """
+    observer = observer or Observer()
+    with _locked(path, observer) as died:
+        with observer.working(f"reading {path}"):
+            run = with_workers(Run.open(path, allow), settings)
+            check_allowed(run.catalog, layers_read(run.config))
+        only = rerun_filter(run, tiles, failed)
+        yield Prepared(run, only, _executor(run, workers, died, observer), observer, stages_from(from_stage))
+
+
+def process(prepared: Prepared, verify: bool = False) -> Summary:
+    """Bring the tiles of a run up to date, and write its tables, mosaics, collection and map.
+
+    A tile that fails is counted, and does not stop the others.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    verify : bool
+        See `run_tiles`.
+
+    Raises
+    ------
+    ConfigError
+        As of `run_tiles`, or if no worker can do the tiles.
+    ClusterLost
+        If the workers are lost; what was done before is kept.
+    OSError
+        If a file of the run cannot be written.
+    """
+    run, observer = prepared.run, prepared.observer
+    observer.start(len(run.catalog.tiles), sum(map(prepared.only, run.catalog.tiles)))
+    try:
+        summary = run_tiles(run, prepared.executor, prepared.only, prepared.force, observer.tile, verify)
+    finally:
+        _write_map(run, observer)
+    observer.end(summary)
+    return summary
+
+
+def stages_from(stage: str | None) -> frozenset[str]:
+    """Return a stage and all later ones; none if it is None."""
+    steps = (*STAGE_NAMES, "export")
+    force = frozenset(steps[steps.index(stage) :]) if stage else frozenset()
+    # The control points of a border are part of the fit.
+    return force | {BORDER} if "fit" in force else force
+
+
+@contextlib.contextmanager
+def _locked(path: Location, observer: Observer, create: bool = False) -> Iterator[bool]:
+    """Hold the lock of a run folder; with ``create`` a missing one is made, and removed if it stays empty.
+
+    A folder with other files is then refused, before anything is written.
+
+    Yields whether the process that held the lock before has died: one of the tiles may have ended it.
+    """
+    taken_over: list[str] = []
+
+    def notify(line: str) -> None:
+        taken_over.append(line)
+        observer.note(line)
+
+    with contextlib.ExitStack() as stack:
+        if create:
+            check_folder(path)
+            if isinstance(path, Path):
+                try:
+                    stack.enter_context(made_folder(path))
+                except OSError as error:
+                    raise ConfigError(
+                        f"cannot write the run to {path}: {error}; choose another --out"
+                    ) from error
+        else:
+            check_links(path)
+        stack.enter_context(run_lock(path, notify))
+        yield bool(taken_over)
+
+
+def _executor(run: Run, workers: Workers, died: bool, observer: Observer) -> Executor:
+    """Return the executor; ``died`` if the process that held the lock before has died."""
+    if workers.executor == "serial":
+        return SerialExecutor()
+    cluster = run.config.cluster
+    logs = run.path.resolve() / "logs" if isinstance(run.path, Path) else None
+    parallel = DaskExecutor(
+        workers.number, workers.scheduler, cluster, workers.dashboard, observer.line, logs
+    )
+    needed = workers.scheduler or workers.dashboard or cluster.needs_workers
+    if workers.executor == "dask" or died or needed:
+        return parallel
+    return AdaptiveExecutor(workers.number or cluster.workers, parallel, observer.line)
+
+
+def _write_map(run: Run, observer: Observer) -> None:
+    try:
+        write_states(run, run.path / MAP)
+    except OSError as error:
+        observer.warning(f"cannot write the map of the tiles: {error}")
