@@ -33,9 +33,9 @@ def unfounded(text: str, folder: Path) -> list[str]:
 
 def prose(folder: Path) -> dict[str, str]:
     """Return the texts that quote the tables: pages beside them, and marked parts of others."""
-    generated = ("tables.md", "figures.md")
-    texts = {page.name: page.read_text() for page in folder.glob("*.md") if page.name not in generated}
-    texts["docs/causes.md (quoted)"] = "".join(QUOTED.findall((ROOT / "docs" / "causes.md").read_text()))
+    others = ("tables.md", "figures.md", "causes.md")
+    texts = {page.name: page.read_text() for page in folder.glob("*.md") if page.name not in others}
+    texts["causes.md (quoted)"] = "".join(QUOTED.findall((folder / "causes.md").read_text()))
     return texts
 
 
@@ -49,7 +49,7 @@ def test_published_results_are_those_of_their_figures():
 
 def test_causes_counts_the_verdicts():
     """The sentences of causes.md that count claims and changes are those of the tables."""
-    causes, page = ((ROOT / "docs" / name).read_text() for name in ("causes.md", "results/tables.md"))
+    causes, page = ((RESULTS / name).read_text() for name in ("causes.md", "tables.md"))
     claims = re.search(r"The paper's \d+ claims about GeRoD: [^.]*\.", page)[0]
     changes = re.search(r"\d+ changes of L2 and MAD [^.]*\.", page)[0]
     for sentence in (claims, changes):
@@ -61,7 +61,7 @@ def test_causes_says_which_claims_about_dsc3d_hold():
     claims = [line for line in page.splitlines() if line.startswith("| DSC3D: ")]
     verdicts = [cell.strip() for line in claims for cell in line.split("|") if "held" in cell]
     assert verdicts == 2 * len(claims) * ["held"]
-    causes = " ".join((ROOT / "docs" / "causes.md").read_text().split())
+    causes = " ".join((RESULTS / "causes.md").read_text().split())
     assert (
         f"There all {len(claims)} claims hold, by the paper's circular reference and by the true one"
         in causes
@@ -88,7 +88,7 @@ def row(table: list[dict[str, str]], variant: str, *columns: str) -> str:
 
 
 def test_causes_has_the_first_table():
-    text = (ROOT / "docs" / "causes.md").read_text()
+    text = (RESULTS / "causes.md").read_text()
     l2, mad, triangles = (tables(f"Table I: {name}") for name in ("L2", "MAD", "T"))
     for error, angle, number in zip(l2, mad, triangles, strict=True):
         figures = [*error.items(), *angle.items(), *number.items()]
@@ -123,7 +123,7 @@ def test_readme_has_the_errors_against_the_truth():
 
 def test_causes_has_the_published_figures_of_the_calibrated_benchmark():
     """The last column of the tables of section 7: seed 1, as published."""
-    section = (ROOT / "docs" / "causes.md").read_text().partition("## 7.")[2]
+    section = (RESULTS / "causes.md").read_text().partition("## 7.")[2]
     quoted = [line.split("|")[-2].strip() for line in section.splitlines() if line.startswith("| ")]
     l2, mad, triangles = (tables(f"Table II: {name}") for name in ("L2", "MAD", "T"))
     baselines, smooth = tables("Table I: L2"), tables("Table I: MAD")
@@ -182,7 +182,7 @@ def test_causes_has_the_table_of_the_stored_readings():
     readings = experiment("readings")
     means = pd.read_csv(readings.RESULTS)
     assert set(means.reading) == {*readings.READINGS}
-    text = (ROOT / "docs" / "causes.md").read_text()
+    text = (RESULTS / "causes.md").read_text()
     assert readings.table(means) in text
     assert f"{means.tiles.iloc[0]} tiles of the benchmark" in text
 
@@ -191,7 +191,7 @@ def test_causes_has_the_table_of_the_stored_weights_of_the_loss():
     import pandas as pd
 
     lambdas = experiment("lambdas")
-    assert lambdas.table(pd.read_csv(lambdas.RESULTS)) in (ROOT / "docs" / "causes.md").read_text()
+    assert lambdas.table(pd.read_csv(lambdas.RESULTS)) in (RESULTS / "causes.md").read_text()
 
 
 def test_causes_has_the_table_of_the_stored_fits():
@@ -199,7 +199,7 @@ def test_causes_has_the_table_of_the_stored_fits():
 
     causes = experiment("causes")
     means = pd.read_csv(causes.RESULTS)
-    text = (ROOT / "docs" / "causes.md").read_text()
+    text = (RESULTS / "causes.md").read_text()
     assert causes.table(means) in text
     ours, squared = (
         means[means.fit == fit].set_index("roads") for fit in ("L1, from the DTM", "squared loss")
@@ -213,7 +213,7 @@ def test_causes_bound_follows_from_the_published_tables():
     """Target of the fit without ECSRC: RGT on roads, the DTM elsewhere; see section 1 of the page."""
     from flexroad.pipeline.reproduce.published import published
 
-    text = " ".join((ROOT / "docs" / "causes.md").read_text().split())
+    text = " ".join((RESULTS / "causes.md").read_text().split())
     road, terrain = published("rgt").l2_road_m, published("wo_nurbs").l2_terrain_m
     target = 0.18 * road + 0.82 * terrain
     without, full = (
@@ -271,7 +271,7 @@ def test_the_causes_quote_the_figures_by_quarter():
     import pandas as pd
 
     table = experiment("causes").by_spoilage(pd.read_parquet(RESULTS / FILE)).grid_55
-    text = (ROOT / "docs" / "causes.md").read_text().replace("\n", " ")
+    text = (RESULTS / "causes.md").read_text().replace("\n", " ")
     for classes in ("segmented", "reference"):
         *three, last = [f"{change:+.0%}" for change in table[classes]]
         assert f"{', '.join(three)} and {last}" in text, classes
