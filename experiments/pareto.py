@@ -3,7 +3,7 @@
 The fit uses the roads that the paper's filter keeps, or those of a perfect filter: segmented cells within
 0.3 m of the truth. Options are chosen on every other tile of the benchmark and reported on the rest. The real
 places (FLEXROAD_REAL_DATA) have their canopies added to the DSM; their DTM is the truth with noise of 0.1 m
-and a level shift under each building. An argument is the path for the figure of docs/fit.md.
+and a level shift under each building. An argument is the path for the figure of docs/archive/fit.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Errors at kerbs, walls and hump bridges on made tiles: no steps, `fit.steps`, and `sample.breaklines`.
 
-``PYTHONPATH=. python tests/bench/bench_steps.py`` prints the table of docs/fit.md.
+``PYTHONPATH=. python tests/bench/bench_steps.py`` prints the table of docs/archive/fit.md.
 """
 
 from __future__ import annotations
