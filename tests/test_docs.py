@@ -70,12 +70,11 @@ def test_development_names_existing_files():
     assert 30 <= len(re.findall(r"^ *\w+/\S+\.py ", way, flags=re.MULTILINE)) <= 35
 
 
-def test_operations_faults_name_existing_tests():
-    text = (ROOT / "docs" / "operations.md").read_text()
-    table = text.split("## Faults")[1].split("\n## ")[0]
+def test_faults_name_existing_tests():
+    table, inputs = ((ROOT / "docs" / name).read_text() for name in ("faults.md", "archive/inputs.md"))
     rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
     assert len(rows) > 15
     assert [row for row in rows if not NAMED_TEST.search(row)] == []
-    for file, test in NAMED_TEST.findall(text):
+    for file, test in NAMED_TEST.findall(table + inputs):
         exists = any(f"def {test}(" in path.read_text() for path in (ROOT / "tests").rglob(file))
         assert exists, f"no {file} has {test}"

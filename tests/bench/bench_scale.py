@@ -41,7 +41,7 @@ from flexroad.tasks.synthetic import SceneOptions, make_scene
 from tests.made_result import done
 
 TILES = 1000
-"""Default number of tiles; docs/operations.md uses 10,000."""
+"""Default number of tiles; docs/archive/speed.md uses 10,000."""
 TILE_M = 20
 PATCH_M = 400
 """Size of the made scene of which the rasters are repeated copies."""
