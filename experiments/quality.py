@@ -1,7 +1,7 @@
 """Compare the error estimate with the true road L2, and check that deliberate faults are flagged.
 
-``PYTHONPATH=. python experiments/quality.py 48 1`` for 48 tiles of seed 1, as in docs/quality.md; without
-arguments 12 tiles are used.
+``PYTHONPATH=. python experiments/quality.py 48 1`` for 48 tiles of seed 1, as in docs/archive/quality.md;
+without arguments 12 tiles are used.
 """
 
 import sys
