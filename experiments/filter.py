@@ -1,8 +1,8 @@
 """Compare the filters: the share of each kind of cell that they keep, and the surface fitted to these cells.
 
 ``PYTHONPATH=. python experiments/filter.py 24`` gives the tables of docs/archive/filter.md; without a number
-2 tiles of the benchmark are used. A second argument is a path: the figure of that page is drawn there instead. The
-default options of `tasks.filter.planar` were chosen on seeds 5 to 7; seed 1 is used here. If
+2 tiles of the benchmark are used. A second argument is a path: the figure of docs/filter.md is drawn there.
+The default options of `tasks.filter.planar` were chosen on seeds 5 to 7; seed 1 is used here. If
 FLEXROAD_REAL_DATA is set, two real towns follow, with their canopies added to the DSM.
 
 A cell is sound if the DSM shows the ground, with noise, or is within `SOUND_M` of it.

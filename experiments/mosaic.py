@@ -1,8 +1,8 @@
 """Tiles that share their borders against tiles fitted alone, and against one fit of all tiles together.
 
 ``PYTHONPATH=. python experiments/mosaic.py 1 2 3`` gives the tables of docs/archive/mosaic.md. The arguments
-are seeds; each one makes a block of 3 x 3 tiles of 250 m: urban for seed 1, suburban for 2, rural for 3, and so
-on. Each block is computed once more without data within `VOID_M` of one of its inner corners. If
+are seeds; each one makes a block of 3 x 3 tiles of 250 m: urban for seed 1, suburban for 2, rural for 3, and
+so on. Each block is computed once more without data within `VOID_M` of one of its inner corners. If
 FLEXROAD_REAL_DATA is set, tiles of 150 m of the Barbican follow. Stages and options are those of
 configs/production.yaml. Each tile is fitted in three ways:
 

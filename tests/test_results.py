@@ -33,7 +33,7 @@ def unfounded(text: str, folder: Path) -> list[str]:
 
 def prose(folder: Path) -> dict[str, str]:
     """Return the texts that quote the tables: pages beside them, and marked parts of others."""
-    others = ("tables.md", "figures.md", "causes.md")
+    others = ("tables.md", "figures.md", "causes.md", "real_data.md")
     texts = {page.name: page.read_text() for page in folder.glob("*.md") if page.name not in others}
     texts["causes.md (quoted)"] = "".join(QUOTED.findall((folder / "causes.md").read_text()))
     return texts
@@ -158,6 +158,19 @@ def test_causes_has_the_published_figures_of_the_calibrated_benchmark():
         row(scenes["MAD"], "FlexRoad", *circular[2:]),
     ]
     assert [figure for figure in expected if figure not in quoted] == []
+
+
+def test_acquisition_has_the_errors_on_real_data():
+    """Tiles, L2 on roads by three methods, and L2 of FlexRoad on terrain of each data set."""
+    shown = (ROOT / "docs" / "acquisition.md").read_text().partition("## Real data")[2]
+    text = (RESULTS / "real_data.md").read_text()
+    figures = r"\| (plane|rgt|flexroad) \| (\d+) \| (\S+) \| (\S+) \|"
+    rows = re.findall(figures, text)
+    sets = [rows[first : first + 3] for first in range(0, len(rows), 3)]
+    expected = [" | ".join((plane[1], plane[2], grid[2], ours[2], ours[3])) for plane, grid, ours in sets]
+    quoted = re.findall(r"^\| [^|]+ \| (\d.*) \|$", shown, flags=re.MULTILINE)
+    assert len(expected) == 7
+    assert quoted == expected
 
 
 def test_fit_says_by_how_much_production_is_more_accurate():

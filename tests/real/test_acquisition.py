@@ -1,4 +1,4 @@
-"""docs/acquisition.md on real data: its commands give its tables, and independent heights agree.
+"""docs/results/real_data.md: its commands give its tables, and independent heights agree.
 
 Roads along centre lines, as docs/export.md shows them, are exported from the same scan.
 """
@@ -22,7 +22,7 @@ from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE, EXPORTS = (DOCS / "acquisition.md").read_text(), (DOCS / "export.md").read_text()
+PAGE, EXPORTS = (DOCS / "results" / "real_data.md").read_text(), (DOCS / "export.md").read_text()
 SETS = ("autzen", "ign", "stbarth", "brighton", "deepscenario")
 ROADS = Path(__file__).parent / "roads"
 FOOT = 0.3048

@@ -1,4 +1,4 @@
-"""The commands of docs/acquisition.md on rasters of two cities give its tables."""
+"""The commands of docs/results/real_data.md on rasters of two cities give its tables."""
 
 import shlex
 import zipfile
@@ -8,7 +8,7 @@ import pytest
 
 from tests.real.shown import flexroad, measured, table_after
 
-PAGE = Path(__file__).parents[2] / "docs" / "acquisition.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "real_data.md"
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
