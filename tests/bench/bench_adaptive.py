@@ -1,9 +1,10 @@
 """Adaptive meshes against dynamic ones: triangles, distance from the surface, smoothness and time.
 
-``PYTHONPATH=. python tests/bench/bench_adaptive.py [PLACE ...]`` prints the table of docs/archive/sampling.md.
-Places are those of bench_heldback.py; real ones need FLEXROAD_REAL_DATA. Each tile's fitted surface is sampled by
-every method. Distances are those of a mesh from the surface that it samples, on a lattice of `CELL_M`, and a
-place has the means over its tiles. Cells on the outline of roads are left out: they are partly road.
+``PYTHONPATH=. python tests/bench/bench_adaptive.py [PLACE ...]`` prints the table of
+docs/archive/sampling.md. Places are those of bench_heldback.py; real ones need FLEXROAD_REAL_DATA. Each
+tile's fitted surface is sampled by every method. Distances are those of a mesh from the surface that it
+samples, on a lattice of `CELL_M`, and a place has the means over its tiles. Cells on the outline of roads
+are left out: they are partly road.
 """
 
 from __future__ import annotations
