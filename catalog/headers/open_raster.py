@@ -130,6 +130,21 @@ def files_of(path: Path, depth: int = MAX_DEPTH) -> Iterator[Path]:
             yield from files_of(Path(name), depth - 1)
 
 
+def has_own_blocks(path: Path, depth: int = MAX_DEPTH) -> bool:
+    """Return whether each block of a raster can be read by itself: of a GeoTIFF, or a VRT of GeoTIFFs.
+
+    Text grids and pictures are decoded from their beginning, and GDAL does not return from reading a row of
+    an ASCII grid behind a damaged one.
+    """
+    try:
+        driver = _driver(path)
+        if driver != "VRT":
+            return driver == "GTiff"
+        return depth > 0 and all(has_own_blocks(Path(name), depth - 1) for name in sources(path))
+    except OSError:
+        return False
+
+
 @contextmanager
 def _remote(path: Any) -> Iterator[Any]:
     driver = SUFFIXES.get(path.suffix.lower())

@@ -19,7 +19,7 @@ from rasterio.warp import reproject
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
-from flexroad.catalog.headers.open_raster import ERRORS, files_of, open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, files_of, has_own_blocks, open_raster
 from flexroad.catalog.headers.raster_faults import heights_fault
 from flexroad.catalog.headers.refused import Refused, read_through
 from flexroad.catalog.storage.paths import Location, is_remote
@@ -158,6 +158,8 @@ def read_window(
     try:
         return read_raster(path, name, read, allowed, kept_raster, missing)
     except DamagedCells as error:
+        if not (isinstance(path, Path) and has_own_blocks(path)):
+            raise
         window = read_raster(path, name, partial(read, damaged=True), allowed, kept_raster, missing)
         if window is None or window.unreadable is None or window.unreadable.all():
             raise

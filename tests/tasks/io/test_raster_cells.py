@@ -1,5 +1,8 @@
 """Of a raster with a damaged block all other cells are read."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from affine import Affine
@@ -63,3 +66,20 @@ def test_file_without_any_readable_cell_is_an_error(tmp_path):
         damage(path, row, 0)
     with pytest.raises(Unreadable, match="dsm.tif cannot be read: .*; fetch it again"):
         read(path, Grid(UTM, WEST, NORTH, 1.0, COLS, ROWS))
+
+
+def test_ascii_grid_with_a_damaged_row_is_an_error(tmp_path):
+    """GDAL does not return from reading a row behind the damaged one."""
+    path = write(tmp_path / "dsm.asc", HEIGHTS, WEST, NORTH, driver="AAIGrid")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 300] = b"7" * 300
+    path.write_bytes(data)
+    code = (
+        "import sys; from pathlib import Path; from rasterio.enums import Resampling\n"
+        "from flexroad.catalog import Grid; from flexroad.tasks.io.raster import Unreadable, read_window\n"
+        f"path, grid = Path(sys.argv[1]), Grid({UTM!r}, {WEST}, {NORTH}, 1.0, {COLS}, {ROWS})\n"
+        f"try: read_window(path, path.name, grid, grid, {UTM!r}, Resampling.average, heights=True)\n"
+        "except Unreadable as error: print(error)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, timeout=60)
+    assert "dsm.asc cannot be read: " in ended.stdout, ended.stderr
