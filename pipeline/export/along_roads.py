@@ -26,7 +26,8 @@ from flexroad.pipeline.export.pieces import (
     write_whole,
 )
 from flexroad.pipeline.export.road_report import report, row, with_line
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
 from flexroad.tasks.roads import height_grid as grids

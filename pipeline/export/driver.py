@@ -112,7 +112,7 @@ def _written(
 
 def _head(source: Source, options: Options) -> dict[str, Any]:
     """Return the entries of the manifest that all formats share."""
-    results = sha256("".join(f"{state.nodes['sample']}\n" for state in source.states).encode())
+    results = sha256("".join(f"{snapshot.nodes['sample']}\n" for snapshot in source.snapshots).encode())
     return {
         "flexroad": version("flexroad"),
         "run": str(source.run.path),

@@ -26,8 +26,9 @@ from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.photo import Photographed
 from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.graph.borders import has_borders
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
 from flexroad.tasks.export import road_lines as line_file

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.source import FinishedTile
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tasks.types import Bools, Floats, Surface
 
@@ -29,7 +29,7 @@ class GroundTile:
     @classmethod
     def of(cls, tile: FinishedTile) -> GroundTile:
         """Return that of a tile."""
-        return cls(tile.id, tile.state.nodes["assess"], tile)
+        return cls(tile.id, tile.snapshot.nodes["assess"], tile)
 
     @property
     def grid(self) -> Grid:

@@ -13,7 +13,8 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Piece, figures, write_pieces
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import heightfield
 from flexroad.tasks.export.heightfield import HeightField

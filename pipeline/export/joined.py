@@ -19,7 +19,8 @@ from flexroad.catalog.storage.paths import Location, listing, read, remove, stat
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import MARKERS, Piece, figures, write_pieces
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 
 PARTS = ".parts"
 
@@ -85,8 +86,8 @@ def write_joined(
 def _key(source: Source, name: str, version: int, options: Any) -> str:
     """Return what a file is made of, in one word."""
     made_of = sha256(f"{name} {version} {options}".encode())
-    for tile, state in zip(source.tiles, source.states, strict=True):
-        made_of.update(f" {tile.id} {state.nodes['sample']}".encode())
+    for tile, snapshot in zip(source.tiles, source.snapshots, strict=True):
+        made_of.update(f" {tile.id} {snapshot.nodes['sample']}".encode())
     return made_of.hexdigest()
 
 

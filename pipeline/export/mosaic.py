@@ -28,7 +28,8 @@ from flexroad.catalog.text import reason
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.mosaic import MOST_CELLS, common_grid
 from flexroad.tasks.export import cog
 from flexroad.tasks.types import Floats

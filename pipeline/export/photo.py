@@ -10,7 +10,8 @@ import numpy as np
 
 from flexroad.catalog import Tile
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.source import FinishedTile, OfTile, layer_state
+from flexroad.pipeline.export.source import OfTile, layer_state
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.texture import TileTexture, tile_texture
 from flexroad.tasks.export.glb import Texture

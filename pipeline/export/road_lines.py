@@ -22,7 +22,8 @@ from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import MARKERS, Piece, Row, write_whole
 from flexroad.pipeline.export.road_report import NO_ROAD, totals, with_line
-from flexroad.pipeline.export.source import FinishedTile, Source
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import road_lines
 from flexroad.tasks.export.road_lines import RoadLine
 from flexroad.tasks.roads import reference_line as lines

@@ -18,7 +18,8 @@ from flexroad.pipeline.export.coarse import LEVELS, Branch, Place, branch_piece
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.photo import aerial_of, texture_of
 from flexroad.pipeline.export.pieces import Piece, Row, write_pieces
-from flexroad.pipeline.export.source import FinishedTile, OfTile, Source, layer_state
+from flexroad.pipeline.export.source import OfTile, Source, layer_state
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.pipeline.worker.texture import TileTexture
@@ -51,7 +52,7 @@ class Leaf(OfTile):
     def fingerprint(self) -> str:
         """Name of its files by what they are made of."""
         photo = layer_state(self.tile.tile, "dop") if self.photo else ""
-        return f"{self.tile.fingerprint} {self.tile.state.fingerprint} {self.own} {photo}"
+        return f"{self.tile.fingerprint} {self.tile.snapshot.fingerprint} {self.own} {photo}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,8 @@ from flexroad.catalog.storage.paths import Location, absolute, exists, read, rem
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import write_pieces
-from flexroad.pipeline.export.source import FinishedTile
-from flexroad.pipeline.export.states import RunPlace, tile_states
 from flexroad.pipeline.export.viewer_tile import Look, Shown, piece
+from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.folder import check_links
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
@@ -175,9 +174,9 @@ def _claim(out: Location, run: Run) -> None:
 
 def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[Shown]:
     place = RunPlace.of(run)
-    for tile, state in tile_states(run, done, variant):
-        if state:
-            yield Shown(FinishedTile(tile, variant, state, place))
+    for tile, snapshot in snapshots(run, done, variant):
+        if snapshot:
+            yield Shown(FinishedTile(tile, variant, snapshot, place))
 
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:

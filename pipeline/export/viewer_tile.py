@@ -51,7 +51,7 @@ class Shown(OfTile):
     def fingerprint(self) -> str:
         """Name of its script by what it is made of."""
         layers = (layer_state(self.tile.tile, name) for name in ("dop", "roads"))
-        return " ".join((self.tile.state.nodes["assess"], *layers))
+        return " ".join((self.tile.snapshot.nodes["assess"], *layers))
 
 
 def piece(item: Shown, look: Look) -> Piece:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
@@ -10,12 +11,10 @@ from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.grid import overlap
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.inspect.surface import Surface
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks import sample
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 
@@ -35,25 +34,18 @@ def assembled(run: Run, variant: str, bounds: Bounds | None) -> Surface:
             "one. The heights of single tiles are in open_run(...).height"
         )
     tiles = [tile for tile in run.catalog.usable if bounds is None or overlap(tile.grid.bounds, bounds)]
-    done = [status.graph for status in peek_statuses(run, tiles) if status.done]
+    done = [status for status in peek_statuses(run, tiles) if status.done]
     if not done:
         raise ConfigError(
             f"{run.path} has no finished tile in {bounds or 'its catalog'}; see `flexroad status`"
         )
-    whole = _joined([graph.tile for graph in done], [_surface(run, graph, variant) for graph in done])
+    surfaces = [FinishedTile.of(run, status, variant).surface for status in done]
+    whole = _joined([status.graph.tile for status in done], cast("list[NurbsSurface]", surfaces))
     west, south, east, north = whole.bounds
     if bounds is not None:
         west, south = max(west, bounds[0]), max(south, bounds[1])
         east, north = min(east, bounds[2]), min(north, bounds[3])
     return Surface(whole, whole.crs, (west, south, east, north), None, None, sample.Options(), "")
-
-
-def _surface(run: Run, graph: TileGraph, variant: str) -> NurbsSurface:
-    try:
-        surface: NurbsSurface = Evaluator(graph, ArtefactStore(run.store))(graph.variants[variant]["fit"])
-    except StageError as error:
-        raise ConfigError(f"tile {graph.tile.id}: {error}") from error
-    return surface
 
 
 def _joined(tiles: Sequence[Tile], surfaces: Sequence[NurbsSurface]) -> NurbsSurface:

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely import STRtree, box, points
 
-from flexroad.catalog.storage.paths import Location, parse_location
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.run.finished import FinishedTile, RunPlace, open_variant
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 
@@ -72,10 +70,7 @@ class Ground:
         ConfigError
             If the folder is no run, has no such variant, or no tile is done.
         """
-        run = Run.open(parse_location(path), allow)
-        variant = variant or run.config.export.variants[0]
-        if variant not in run.config.chains:
-            raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
+        run, variant = open_variant(path, variant, allow)
         ground = cls(run, variant, earlier)
         if not any(map(ground._finished, peek_statuses(run, run.catalog.tiles))):
             raise ConfigError(f"{path} has no finished tile; see `flexroad status {path}`")
@@ -97,7 +92,7 @@ class Ground:
         earlier = []
         for status, selected in self._owners(easting, northing):
             graph = status.graph
-            found = self._tile(graph) if status.done else self._last(graph.tile.id)
+            found = self._current(status) if status.done else self._last(graph.tile.id)
             if found is None:
                 continue
             surface, road = found
@@ -133,14 +128,9 @@ class Ground:
 
     def _last(self, tile_id: str) -> tuple[Surface, RoadMask] | None:
         """Return what a tile had when it was last finished, None if the store no longer has it."""
-        store, nodes = ArtefactStore(self.run.store), self.run.folder(tile_id).nodes(self.variant)
-        fit, segment = (store.find(stage, nodes.get(stage, "")) for stage in ("fit", "segment"))
-        return (fit.value, segment.value) if fit and segment else None
+        nodes = self.run.folder(tile_id).nodes(self.variant)
+        return RunPlace.of(self.run).stored(nodes.get("fit", ""), nodes.get("segment", ""))
 
-    def _tile(self, graph: TileGraph) -> tuple[Surface, RoadMask]:
-        evaluate = Evaluator(graph, ArtefactStore(self.run.store))
-        nodes = graph.variants[self.variant]
-        try:
-            return evaluate(nodes["fit"]), evaluate(nodes["segment"])
-        except StageError as error:
-            raise ConfigError(f"tile {graph.tile.id}: {error}") from error
+    def _current(self, status: TileStatus) -> tuple[Surface, RoadMask]:
+        tile = FinishedTile.of(self.run, status, self.variant)
+        return tile.surface, tile.road

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flexroad.catalog import Bounds
-from flexroad.catalog.storage.paths import exists, parse_location, read
+from flexroad.catalog.storage.paths import exists, read
 from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.inspect.assembled import assembled
 from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
 from flexroad.pipeline.inspect.points import Answer, Ground
 from flexroad.pipeline.inspect.surface import Surface
-from flexroad.pipeline.inspect.tile import open_tile
+from flexroad.pipeline.inspect.tile import tile_dataset
 from flexroad.pipeline.run.conductor import Workers, process, reopened
+from flexroad.pipeline.run.finished import open_variant
 from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
@@ -310,7 +311,7 @@ class RunView:
         >>> float(abs(tile.surface - tile.reference).where(tile.road).mean().round(1))
         0.0
         """
-        return open_tile(self.run.path, tile_id, self.variant, self.allow)
+        return tile_dataset(self.run, tile_id, self.variant)
 
     def rerun(
         self,
@@ -400,8 +401,4 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     config production, variant flexroad
     2 tiles: 1 done, 1 pending
     """
-    run = Run.open(parse_location(path), allow)
-    variant = variant or run.config.export.variants[0]
-    if variant not in run.config.chains:
-        raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
-    return RunView(run, variant, tuple(allow))
+    return RunView(*open_variant(path, variant, allow), tuple(allow))

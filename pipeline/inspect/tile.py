@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexroad.catalog.storage.paths import Location, parse_location
-from flexroad.pipeline.errors import ConfigError
+from flexroad.catalog.storage.paths import Location
+from flexroad.pipeline.run.finished import FinishedTile, open_variant
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,23 +53,19 @@ def open_tile(
     CatalogError
         If the catalog has no such tile, or names a file outside the allowed folders.
     """
+    opened, variant = open_variant(run, variant, allow)
+    return tile_dataset(opened, tile_id, variant)
+
+
+def tile_dataset(run: Run, tile_id: str, variant: str) -> xr.Dataset:
+    """Return what `open_tile` returns, of an opened run."""
     import rioxarray  # noqa: F401 (gives datasets their .rio)
     import xarray as xr
 
-    opened = Run.open(parse_location(run), allow)
-    variant = variant or opened.config.export.variants[0]
-    if variant not in opened.config.chains:
-        raise ConfigError(f"{run} has no variant {variant!r}; it has {', '.join(opened.config.chains)}")
-    (tile,) = opened.catalog.select([tile_id]).tiles
-    (status,) = peek_statuses(opened, [tile])
-    evaluate = Evaluator(status.graph, ArtefactStore(opened.store))
-    nodes = status.graph.variants[variant]
-    try:
-        data, road, clusters, surface = (
-            evaluate(nodes[stage]) for stage in ("load", "segment", "ecsrc", "fit")
-        )
-    except StageError as error:
-        raise ConfigError(f"tile {tile_id}: {error}") from error
+    (tile,) = run.catalog.select([tile_id]).tiles
+    (status,) = peek_statuses(run, [tile])
+    results = FinishedTile.of(run, status, variant)
+    data, road, clusters, surface = results.data, results.road, results.clusters, results.surface
     core, window = data.core, data.grid.window(data.core)
     rasters = {name: getattr(data, name) for name in ("dsm", "dtm", "reference", "reference_road")}
     rasters |= {"road": road.mask, "road_filtered": clusters.mask}

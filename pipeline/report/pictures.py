@@ -8,21 +8,19 @@ from dataclasses import replace
 
 from PIL import Image
 
-from flexroad.pipeline.graph.graph import TileGraph
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import Content
 from flexroad.pipeline.report.estimate_picture import estimate_picture
 from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
 from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.quality.assess import Options
 from flexroad.tasks.quality.compared import compare
 from flexroad.tasks.quality.places import places
-from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, Surface, TileData
+from flexroad.tasks.types import Mesh
 
 MOST = 24
 """Largest number of tiles of which all are shown; of larger runs only the worst are shown."""
@@ -53,14 +51,14 @@ def tile_pictures(
     tiles = {tile.id: tile for tile in run.catalog.tiles}
     statuses = peek_statuses(run, [tiles[tile_id] for tile_id in tile_ids if tile_id in tiles])
     for status in track(statuses, "drawing tiles", len(tile_ids)):
-        graph = status.graph
-        evaluate = Evaluator(graph, ArtefactStore(run.store))
+        tile = FinishedTile.of(run, status, variant)
         try:
-            meshes[graph.tile.id] = evaluate(graph.variants[variant]["sample"])
-            maps[graph.tile.id] = _maps(graph, variant, evaluate)
-        except StageError as error:
+            meshes[tile.id] = tile.mesh
+            maps[tile.id] = _maps(tile)
+        except ConfigError as error:
             # For example if source files were deleted after the run; the tables do not need them.
-            maps[graph.tile.id] = TilePictures(graph.tile.id, (), (f"No pictures: {error}",))
+            reason = str(error).removeprefix(f"{tile.label}: ")
+            maps[tile.id] = TilePictures(tile.id, (), (f"No pictures: {reason}",))
     views = render_meshes(meshes)
     return [_finished(pictures, views.get(tile_id)) for tile_id, pictures in maps.items()]
 
@@ -83,30 +81,25 @@ def webp(picture: bytes, width_px: int | None = None, quality: int = QUALITY) ->
     return buffer.getvalue()
 
 
-def _maps(graph: TileGraph, variant: str, evaluate: Evaluator) -> TilePictures:
-    nodes = graph.variants[variant]
-    data: TileData = evaluate(nodes["load"])
-    road: RoadMask = evaluate(nodes["segment"])
-    clusters: RoadClusters = evaluate(nodes["ecsrc"])
-    surface: Surface = evaluate(nodes["fit"])
-    mesh: Mesh = evaluate(nodes["sample"])
-    quality: Quality = evaluate(nodes["assess"])
+def _maps(tile: FinishedTile) -> TilePictures:
+    data, road, clusters, mesh, quality = tile.data, tile.road, tile.clusters, tile.mesh, tile.quality
     core, window = data.core, data.grid.window(data.core)
     dsm, raw, kept = data.dsm[window], road.mask[window], clusters.mask[window]
     truth = (data.dtm if data.reference is None else data.reference)[window]
     against = "DTM" if data.reference is None else "reference"
-    options = Options.model_validate(graph.nodes[nodes["assess"]].options.model_dump())
-    cells = compare(data, road, clusters, surface, options.agree_m)
-    at = {flag: place for flag, place in places(cells, core, options).items() if flag in quality.flags}
+    cells = compare(data, road, clusters, tile.surface, tile.assessment.agree_m)
+    at = {
+        flag: place for flag, place in places(cells, core, tile.assessment).items() if flag in quality.flags
+    }
     return TilePictures(
-        graph.tile.id,
+        tile.id,
         (
             ("Error estimate along the road", estimate_picture(dsm, cells.estimate, raw, core, at)),
             ("DSM", hillshade(dsm, core)),
             ("Road mask: before and after the filter", filter_picture(dsm, raw, kept, core)),
             ("Support of the surface along the road", support_picture(dsm, quality.support, raw, core)),
             (
-                f"{variant} minus {against}",
+                f"{tile.variant} minus {against}",
                 error_map(drape(mesh, core) + mesh.origin[2] - truth, core, road=raw),
             ),
         ),

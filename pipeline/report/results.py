@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from flexroad.catalog import Tile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.tasks.types import RoadMask, Surface
 
 Results = dict[str, dict[str, tuple[str, str]]]
 """Finished tile -> exported variant -> fingerprints of its surface and of its road mask: not graphs, of which
@@ -29,9 +27,3 @@ def find_results(run: Run, tiles: Iterable[Tile]) -> Results:
     for status in peek_statuses(run, tiles):
         add_results(results, status)
     return results
-
-
-def stored(store: ArtefactStore, fingerprints: tuple[str, str]) -> tuple[Surface, RoadMask] | None:
-    """Return surface and road mask of a tile, None if one of them is not in the store."""
-    surface, road = store.find("fit", fingerprints[0]), store.find("segment", fingerprints[1])
-    return (surface[0], road[0]) if surface and road else None

@@ -16,10 +16,10 @@ import pandas as pd
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.report.results import Results, find_results, stored
+from flexroad.pipeline.report.results import Results, find_results
+from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
-from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 MEAN, LARGEST, ON_ROAD, ANGLE = "mean step (m)", "largest step (m)", "on road, mean (m)", "largest angle (°)"
@@ -105,11 +105,11 @@ def _pairs(tiles: Sequence[Tile], every: int) -> Iterator[tuple[Tile, Tile]]:
 def _rows(
     run: Run, pairs: Iterable[tuple[Tile, Tile]], done: Results, variant: str
 ) -> Iterator[tuple[str, str, str, float, float, float, float]]:
-    store = ArtefactStore(run.store)
+    place = RunPlace.of(run)
 
     @lru_cache(KEPT)
     def results(tile_id: str) -> tuple[Surface, RoadMask] | None:
-        return stored(store, done[tile_id][variant])
+        return place.stored(*done[tile_id][variant])
 
     for tile, other in pairs:
         if tile.id not in done or other.id not in done:

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.export.source import FinishedTile, select
+from flexroad.pipeline.export.source import select
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks import sample
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape

@@ -14,10 +14,10 @@ from PIL import Image
 
 from flexroad.catalog import Tile
 from flexroad.pipeline.report.render import SUN_ALTITUDE_DEG, SUN_AZIMUTH_DEG
-from flexroad.pipeline.report.results import Results, stored
+from flexroad.pipeline.report.results import Results
+from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
-from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 PIXELS = 2_000_000
@@ -67,10 +67,10 @@ def relief(run: Run, tiles: Iterable[Tile], results: Results, track: Track = unt
     side = min(max(math.isqrt(PIXELS // len(tiles)), SIDE_PX[0]), SIDE_PX[1])
     columns = math.isqrt(len(tiles) - 1) + 1
     picture = np.zeros((side * math.ceil(len(tiles) / columns), side * columns, 2), np.uint8)
-    store, variant = ArtefactStore(run.store), run.config.export.variants[0]
+    place, variant = RunPlace.of(run), run.config.export.variants[0]
     places: dict[str, int] = {}
     for tile in track(tiles, "drawing the map", len(tiles)):
-        if tile.id not in results or not (found := stored(store, results[tile.id][variant])):
+        if tile.id not in results or not (found := place.stored(*results[tile.id][variant])):
             continue
         row, column = divmod(len(places), columns)
         square = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]

@@ -10,13 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.reproduce.figures.layout import PATH, STRATA, FigureFile, new_figure
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
-from flexroad.tasks.types import TileData
 
 NAME = "dataset"
 BINS = 12
@@ -37,13 +34,10 @@ def statistics(run: Run, full: str, done: Table) -> Table:
     wanted = set(table.tile_id)
     ranges: dict[str, float] = {}
     for status in peek_statuses(run, [tile for tile in run.catalog.tiles if tile.id in wanted]):
-        graph = status.graph
-        try:
-            data: TileData = Evaluator(graph, ArtefactStore(run.store))(graph.variants[full]["load"])
-        except StageError as error:
-            raise ConfigError(f"tile {graph.tile.id}: {error}") from error
+        tile = FinishedTile.of(run, status, full)
+        data = tile.data
         dsm = data.dsm[data.grid.window(data.core)]
-        ranges[graph.tile.id] = float(np.nanmax(dsm) - np.nanmin(dsm))
+        ranges[tile.id] = float(np.nanmax(dsm) - np.nanmin(dsm))
     table["road_percent"] = 100 * table.pop("road_fraction")
     table["height_range_m"] = table.tile_id.map(ranges)
     return table.reset_index(drop=True)

@@ -10,15 +10,13 @@ import pandas as pd
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.reproduce.figures.roles import Roles
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, Mesh, Metrics
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,35 +84,31 @@ def read_tile_view(run: Run, tile_id: str, roles: Roles) -> TileView:
         if variant not in graph.variants:
             raise ConfigError(f"{run.path} has no variant {variant!r}; it has {', '.join(graph.variants)}")
     try:
-        return _view(graph, Evaluator(graph, ArtefactStore(run.store)), roles)
-    except StageError as error:
-        raise ConfigError(f"tile {tile_id}: {error}; choose another tile with --tile") from error
+        return _view(FinishedTile.of(run, status, roles.full), roles)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; choose another tile with --tile") from error
 
 
-def _view(graph: TileGraph, evaluate: Evaluator, roles: Roles) -> TileView:
-    nodes = graph.variants[roles.full]
-    data: TileData = evaluate(nodes["load"])
-    road: RoadMask = evaluate(nodes["segment"])
-    clusters: RoadClusters = evaluate(nodes["ecsrc"])
+def _view(tile: FinishedTile, roles: Roles) -> TileView:
+    data, road, clusters = tile.data, tile.road, tile.clusters
     core, window = data.core, data.grid.window(data.core)
     street = clusters.mask if data.reference_road is None else data.reference_road
     return TileView(
-        graph.tile.id,
-        graph.tile.stratum,
+        tile.id,
+        tile.tile.stratum,
         core,
         data.dsm[window],
         (data.dtm if data.reference is None else data.reference)[window],
         "the DTM" if data.reference is None else "the reference surface",
         street[window] & ~road.outside[window],
         (road.mask & ~clusters.mask)[window],
-        {variant: _result(graph, evaluate, variant, core) for variant in roles.names},
+        {variant: _result(tile.in_variant(variant), core) for variant in roles.names},
     )
 
 
-def _result(graph: TileGraph, evaluate: Evaluator, variant: str, core: Grid) -> Result:
-    mesh: Mesh = evaluate(graph.variants[variant]["sample"])
-    metrics: Metrics = evaluate(graph.variants[variant]["evaluate"])
-    return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), metrics)
+def _result(tile: FinishedTile, core: Grid) -> Result:
+    mesh = tile.mesh
+    return Result(mesh, drape(mesh, core) + mesh.origin[2], mean_angles(mesh), tile.metrics)
 
 
 def missing_roles(methods: Iterable[tuple[str, str | None]]) -> str:

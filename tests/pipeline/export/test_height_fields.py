@@ -105,6 +105,6 @@ def test_tile_without_heights_is_named(town, tmp_path, monkeypatch):
         def lattice(self, eastings, northings):
             return np.full((len(northings), len(eastings)), np.nan)
 
-    monkeypatch.setattr("flexroad.pipeline.export.source.FinishedTile.surface", Nothing())
+    monkeypatch.setattr("flexroad.pipeline.run.finished.FinishedTile.surface", Nothing())
     with pytest.raises(ConfigError, match=f"tile {source.tiles[0].id}: the surface has no height"):
         export(source, tmp_path, ["heightfield"], Options(), SerialExecutor())

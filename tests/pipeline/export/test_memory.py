@@ -11,7 +11,7 @@ import pytest
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.source import Source, select
-from flexroad.pipeline.export.states import FileStates
+from flexroad.pipeline.run.finished import FileStates
 
 from .conftest import OPTIONS
 
@@ -31,10 +31,11 @@ SPREAD_M = {"3dtiles": 1000.0}
 def many(city, number: int, spread_m: float = 0.0) -> Source:
     """The first tile of a run under many ids, all with its results."""
     whole = select(city.path, city.done[:1])
-    (tile,), (state,), files = whole.tiles, whole.states, FileStates(whole.run)
+    (tile,), (snapshot,), files = whole.tiles, whole.snapshots, FileStates(whole.run)
     grids = (replace(tile.grid, west=tile.grid.west + k * spread_m) for k in range(number))
     tiles = tuple(replace(tile, id=f"{k:04}", grid=grid) for k, grid in enumerate(grids))
-    return replace(whole, tiles=tiles, states=tuple(replace(state, files=files(one)) for one in tiles))
+    snapshots = tuple(replace(snapshot, files=files(one)) for one in tiles)
+    return replace(whole, tiles=tiles, snapshots=snapshots)
 
 
 def peak_bytes(source: Source, name: str, out) -> int:

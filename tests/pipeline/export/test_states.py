@@ -7,9 +7,10 @@ import pytest
 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export import source, states
+from flexroad.pipeline.export import source
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.graph.graph import Pattern
+from flexroad.pipeline.run import finished
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 
@@ -36,8 +37,8 @@ def test_graphs_are_made_once_for_all_passes(made_city, monkeypatch):
 
 def test_results_are_those_of_the_tile_graph(made_city):
     for tile in select(made_city.path).finished():
-        assert tile.graph.variants["flexroad"] == tile.state.nodes
-        assert tile.graph.fingerprint == tile.state.fingerprint
+        assert tile.graph.variants["flexroad"] == tile.snapshot.nodes
+        assert tile.graph.fingerprint == tile.snapshot.fingerprint
 
 
 def test_tile_whose_source_changed_is_no_longer_finished(own_city):
@@ -57,7 +58,7 @@ def test_tile_without_source_files_is_still_finished(own_city):
     chosen = select(own_city.path)
     source_file(own_city, own_city.done[0]).unlink()
     first, _ = chosen.finished()
-    assert first.graph.fingerprint == first.state.fingerprint
+    assert first.graph.fingerprint == first.snapshot.fingerprint
     assert len(first.mesh.faces)
 
 
@@ -116,7 +117,7 @@ def damage_store(city, damage):
 def test_files_of_a_tile_are_looked_up_before_its_state(own_city, monkeypatch):
     """A change between the two is noticed in the next pass."""
     file = source_file(own_city, own_city.done[0])
-    peek = states.peek_statuses
+    peek = finished.peek_statuses
 
     def then_changed(run, tiles):
         for number, status in enumerate(peek(run, tiles)):
@@ -124,9 +125,9 @@ def test_files_of_a_tile_are_looked_up_before_its_state(own_city, monkeypatch):
                 os.utime(file, ns=(1, 1))
             yield status
 
-    monkeypatch.setattr(states, "peek_statuses", then_changed)
+    monkeypatch.setattr(finished, "peek_statuses", then_changed)
     chosen = select(own_city.path)
-    monkeypatch.setattr(states, "peek_statuses", peek)
+    monkeypatch.setattr(finished, "peek_statuses", peek)
     with pytest.raises(ConfigError, match="no longer finished"):
         list(chosen.finished())
 

@@ -1,0 +1,320 @@
+"""The results of finished tiles: the one reader of what a run has stored.
+
+The state of tiles is checked once, for all formats of an export, then compared by sizes and times of files.
+To check a tile makes its graph; to compare the sizes and times of its files takes a part of that time. What
+is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog import Tile
+from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.storage.paths import Location, parse_location, read, stat
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing
+from flexroad.pipeline.graph.products import product_layers
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
+from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.artefacts import ArtefactStore
+from flexroad.pipeline.store.products import TileProducts
+from flexroad.pipeline.store.records import DONE, MarkerStat, from_item
+from flexroad.pipeline.worker.evaluator import Evaluator, StageError
+from flexroad.tasks.quality import assess
+from flexroad.tasks.types import (
+    Floats,
+    Mesh,
+    Metrics,
+    Quality,
+    RoadClusters,
+    RoadMask,
+    Surface,
+    TileData,
+)
+
+COMPUTED_AGAIN = "it was computed again while it was exported; export again"
+
+
+def open_variant(
+    path: Location | str, variant: str | None = None, allow: Sequence[str | Path] = ()
+) -> tuple[Run, str]:
+    """Open a run, and return it with the variant whose results are used; by default the first one exported.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is no run (`Run.open`), or has no such variant.
+    CatalogError
+        If its catalog is damaged.
+    """
+    run = Run.open(path, allow)
+    variant = variant or run.config.export.variants[0]
+    if variant not in run.config.chains:
+        raise ConfigError(f"{path} has no variant {variant!r}; it has {', '.join(run.config.chains)}")
+    return run, variant
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A tile as it was when its state was checked."""
+
+    fingerprint: str
+    """Fingerprint of all requested results."""
+    nodes: dict[str, str]
+    """Fingerprint of each stage of the variant whose results are read."""
+    marker: MarkerStat | None
+    """Name, size and version of its marker; None if it had none."""
+    files: bytes = b""
+    """Hash of the sizes and times of all its files (`FileStates`); empty if they are not to be compared."""
+
+    @classmethod
+    def of(cls, status: TileStatus, variant: str, files: bytes = b"") -> Snapshot:
+        """Return that of a tile whose state has just been checked."""
+        graph, record = status.graph, status.last_record
+        return cls(graph.fingerprint, graph.variants[variant], record.marker if record else None, files)
+
+
+class FileStates:
+    """Sizes and times of the files that the state of a tile depends on, in one pass over tiles."""
+
+    def __init__(self, run: Run) -> None:
+        self._folders, self._stat_file = Folders(run.path), run.stat_cache()
+        self._layers = run.pattern.reads.union(product_layers(run.pattern.export))
+        self._models = [(str(file), stat(file)) for step in run.pattern.steps for file in step.files]
+
+    def __call__(self, tile: Tile) -> bytes:
+        """Return a hash of the names, sizes and times of a tile's results, sources and models."""
+        sources = []
+        for layer in tile.all_layers:
+            if layer.name in self._layers:
+                try:
+                    sources += [(str(path), self._stat_file(path)) for path in tile.paths(layer)]
+                except CatalogError as error:
+                    # A layer with files that may not be read is looked up only if the tile needs them.
+                    sources.append((str(error), None))
+        products = sorted(self._folders(tile.id).items())
+        return blake2b(repr((products, sources, self._models)).encode(), digest_size=16).digest()
+
+
+def snapshots(run: Run, tiles: Iterable[Tile], variant: str) -> Iterator[tuple[Tile, Snapshot | None]]:
+    """Yield each tile as it is now, with None if it is not finished; checks its sources and its products."""
+    files, seen = FileStates(run), b""
+
+    def looked_at() -> Iterator[Tile]:
+        nonlocal seen
+        for tile in tiles:
+            # Before its state is checked: a later change is noticed then.
+            seen = files(tile)
+            yield tile
+
+    for status in peek_statuses(run, looked_at()):
+        finished = status.done and status.last_record and status.last_record.marker
+        yield status.graph.around, Snapshot.of(status, variant, seen) if finished else None
+
+
+@dataclass(frozen=True)
+class RunPlace:
+    """What workers need to read results of a run."""
+
+    path: str
+    store: str
+    pattern: Pattern
+    checksum: bool
+
+    @classmethod
+    def of(cls, run: Run) -> RunPlace:
+        """Return that of a run."""
+        return cls(str(run.path), str(run.store), run.pattern, run.checksum)
+
+    @cached_property
+    def artefacts(self) -> ArtefactStore:
+        """The run's store of stage results."""
+        return ArtefactStore(parse_location(self.store))
+
+    def stored(self, fit: str, segment: str) -> tuple[Surface, RoadMask] | None:
+        """Return surface and road mask by their fingerprints, None if one of them is not in the store."""
+        surface, road = self.artefacts.find("fit", fit), self.artefacts.find("segment", segment)
+        return (surface.value, road.value) if surface and road else None
+
+    def marker(self, tile_id: str) -> MarkerStat | None:
+        """Return name, size and version of the marker of a finished tile, None if there is none."""
+        file = stat(self._folder(tile_id).file(DONE))
+        return (DONE, file.size, file.version) if file else None
+
+    def graph(self, tile: Tile, snapshot: Snapshot) -> TileGraph:
+        """Return the graph of a finished tile; sources that no longer exist count as recorded.
+
+        Raises
+        ------
+        ConfigError
+            If the tile has another graph now.
+        """
+        graph = self.pattern.graph(tile, self.checksum)
+        if graph.fingerprint != snapshot.fingerprint and any_file_missing(graph):
+            graph = self.pattern.graph(tile, self.checksum, stat, self._recorded(tile.id))
+        if graph.fingerprint != snapshot.fingerprint:
+            raise ConfigError(
+                f"its sources have changed; run `flexroad rerun {self.path}`, then export again"
+            )
+        return graph
+
+    def _recorded(self, tile_id: str) -> list[object]:
+        try:
+            content = checked_json.loads(read(self._folder(tile_id).file(DONE)))
+            return from_item(content, None).sources
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return []
+
+    def _folder(self, tile_id: str) -> TileProducts:
+        return TileProducts.of(parse_location(self.path), tile_id)
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedTile:
+    """One tile of a run in one variant; its results are read from the store when they are used.
+
+    Results that are missing or damaged there are computed and not stored.
+    """
+
+    tile: Tile
+    variant: str
+    snapshot: Snapshot
+    place: RunPlace
+    evaluator: Evaluator | None = None
+    """Reads and computes the results where the graph is known (`of`); None: it is made when it is needed."""
+
+    @classmethod
+    def of(cls, run: Run, status: TileStatus, variant: str) -> FinishedTile:
+        """Return a tile whose state has just been checked; all results of an unfinished one are computed."""
+        place = RunPlace.of(run)
+        evaluator = Evaluator(status.graph, place.artefacts)
+        return cls(status.graph.around, variant, Snapshot.of(status, variant), place, evaluator)
+
+    def in_variant(self, variant: str) -> FinishedTile:
+        """Return the tile in another variant; what both have in common is read or computed once."""
+        snapshot = replace(self.snapshot, nodes=self.graph.variants[variant])
+        return replace(self, variant=variant, snapshot=snapshot, evaluator=self._evaluator)
+
+    @property
+    def id(self) -> str:
+        """Id of the tile."""
+        return self.tile.id
+
+    @property
+    def label(self) -> str:
+        """Name of the tile in messages."""
+        return f"tile {self.id}"
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of the mesh by what it was made of."""
+        return self.snapshot.nodes["sample"]
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh of road and terrain."""
+        mesh: Mesh = self._result("sample")
+        return mesh
+
+    @property
+    def metrics(self) -> Metrics:
+        """The errors of the mesh."""
+        metrics: Metrics = self._result("evaluate")
+        return metrics
+
+    @property
+    def surface(self) -> Surface:
+        """The fitted surface."""
+        surface: Surface = self._result("fit")
+        return surface
+
+    @property
+    def road(self) -> RoadMask:
+        """The road mask before the filter, with the cells beyond the survey."""
+        road: RoadMask = self._result("segment")
+        return road
+
+    @property
+    def clusters(self) -> RoadClusters:
+        """The road after the filter."""
+        clusters: RoadClusters = self._result("ecsrc")
+        return clusters
+
+    @property
+    def quality(self) -> Quality:
+        """Figures and support of the surface."""
+        quality: Quality = self._result("assess")
+        return quality
+
+    @property
+    def data(self) -> TileData:
+        """The rasters; read from the source files."""
+        data: TileData = self._result("load")
+        return data
+
+    @property
+    def assessment(self) -> assess.Options:
+        """The options of `quality`."""
+        options = self.graph.nodes[self.snapshot.nodes["assess"]].options
+        assert isinstance(options, assess.Options)
+        return options
+
+    @property
+    def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
+        """Estimated error (m) and support of each cell of the core; needs the source files."""
+        return assess.cell_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
+
+    @cached_property
+    def graph(self) -> TileGraph:
+        """The graph of the tile, made again from the files that it had when it was finished.
+
+        Raises
+        ------
+        ConfigError
+            If the tile has another graph now.
+        """
+        return self.evaluator.graph if self.evaluator else self.place.graph(self.tile, self.snapshot)
+
+    def check_unchanged(self) -> None:
+        """Check that the run has not written the tile again since its state was checked.
+
+        Raises
+        ------
+        ConfigError
+            If it has.
+        """
+        if self.place.marker(self.id) != self.snapshot.marker:
+            raise ConfigError(f"{self.label}: {COMPUTED_AGAIN}")
+
+    @cached_property
+    def _results(self) -> dict[str, Any]:
+        return {}
+
+    @cached_property
+    def _evaluator(self) -> Evaluator:
+        return self.evaluator or Evaluator(self.graph, self.place.artefacts)
+
+    def _result(self, stage: str) -> Any:
+        """Return the result of a stage: from the store, or computed if it is missing or damaged there."""
+        name = self.snapshot.nodes[stage]
+        if stage not in self._results:
+            # An evaluator searches the store itself; without one, a stored result needs no graph.
+            stored = None if self.evaluator else self.place.artefacts.find(stage, name)
+            self._results[stage] = self._computed(name) if stored is None else stored.value
+        return self._results[stage]
+
+    def _computed(self, name: str) -> Any:
+        try:
+            return self._evaluator(name)
+        except StageError as error:
+            raise ConfigError(f"{self.label}: {error}") from error
