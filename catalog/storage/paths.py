@@ -20,6 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, TypeAlias
+from uuid import uuid4
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.outputs import atomic_path, flush_path
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 Location: TypeAlias = "Path | UPath"
 
+PROBE = ".probe-"
+"""Start of the names of files that only try a folder; 32 hexadecimal digits follow."""
 ROUNDS = 3
 """Attempts of s3fs when an answer breaks off in the middle; botocore does not retry these."""
 # Path("s3://bucket") drops a slash.
@@ -345,6 +348,19 @@ def remove(where: Location) -> None:
         return
     with named(where), contextlib.suppress(FileNotFoundError):
         where.fs.rm_file(where.path)
+
+
+def check_writable(folder: Location) -> None:
+    """Check that files can be written in ``folder``.
+
+    Raises
+    ------
+    OSError
+        If not; with the reason and the path.
+    """
+    probe = folder / f"{PROBE}{uuid4().hex}"
+    write(probe, b"")
+    remove(probe)
 
 
 def _scan(folder: Path, prefix: str) -> Iterator[tuple[str, FileStat]]:

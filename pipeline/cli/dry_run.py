@@ -14,9 +14,9 @@ from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.pipeline.inspect.reasons import Kind, reason
+from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
-from flexroad.pipeline.store.artefacts import ArtefactStore
 
 STORED, TO_DO, DONE = "stored", "to do", "done"
 
@@ -41,7 +41,7 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
     workers : int, optional
         Largest number of worker processes; by default that of the configuration.
     """
-    artefacts, totals, reasons = ArtefactStore(run.store), Counter[tuple[str, str]](), Counter[Kind]()
+    place, totals, reasons = RunPlace.of(run), Counter[tuple[str, str]](), Counter[Kind]()
     todo: list[Tile] = []
     times: list[float] = []
     counted: set[str] = set()
@@ -54,9 +54,7 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
         if status.last_record and status.last_record.state == "done":
             times.append(status.last_record.seconds)
         todo += [] if done else [graph.tile]
-        states = {
-            name: DONE if done else _state(node, artefacts, borders) for name, node in graph.nodes.items()
-        }
+        states = {name: DONE if done else _state(node, place, borders) for name, node in graph.nodes.items()}
         for name, node in graph.nodes.items():
             if name not in counted:
                 totals[node.stage, states[name]] += 1
@@ -77,9 +75,9 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
         yield f"warning: {finding.text}"
 
 
-def _state(node: Node, artefacts: ArtefactStore, borders: dict[str, str]) -> str:
+def _state(node: Node, place: RunPlace, borders: dict[str, str]) -> str:
     """Return whether a node is stored; corners and edges are looked up once, and added to ``borders``."""
-    state = borders.get(node.fingerprint) or (STORED if node.stored and artefacts.has(node) else TO_DO)
+    state = borders.get(node.fingerprint) or (STORED if node.stored and place.artefacts.has(node) else TO_DO)
     if node.border:
         borders[node.fingerprint] = state
     return state

@@ -75,9 +75,9 @@ def _log(line: str) -> None:
 def _held(out: Path) -> Iterator[None]:
     """Make the output folder, check that it can be written, and hold its lock; no empty one is left."""
     from flexroad.catalog.storage.outputs import made_folder
+    from flexroad.catalog.storage.paths import check_writable
     from flexroad.pipeline.prepare.output import check_replaced, disk_errors
     from flexroad.pipeline.run.lock import run_lock
-    from flexroad.pipeline.store.artefacts import check_writable
 
     check_replaced(out)
     with contextlib.ExitStack() as stack:

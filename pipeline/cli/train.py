@@ -94,10 +94,10 @@ def train(
     from flexroad.catalog import Catalog
     from flexroad.catalog.allowlist import check_allowed
     from flexroad.catalog.storage.outputs import output_file
+    from flexroad.catalog.storage.paths import check_writable
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.errors import ConfigError
     from flexroad.pipeline.report.training import summary, verdict, write_model
-    from flexroad.pipeline.store.artefacts import check_writable
     from flexroad.pipeline.training.train import TrainOptions, train
     from flexroad.tasks.errors import TaskError
 

@@ -8,11 +8,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flexroad.catalog.storage.outputs import output_file
-from flexroad.catalog.storage.paths import Location, absolute, exists, listing, read, visible_entry, write
+from flexroad.catalog.storage.paths import (
+    PROBE,
+    Location,
+    absolute,
+    check_writable,
+    exists,
+    listing,
+    read,
+    visible_entry,
+    write,
+)
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.artefacts import PROBE, check_writable
 
 MANIFEST = "export.json"
 BEGUN = ".flexroad-export"

@@ -33,6 +33,7 @@ from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
     Location,
     absolute,
+    check_writable,
     exists,
     flush_names,
     is_remote,
@@ -55,7 +56,6 @@ from flexroad.pipeline.run.seal import seal, sealed
 from flexroad.pipeline.run.store_users import register
 from flexroad.pipeline.run.summary import read_summary
 from flexroad.pipeline.store import checked_json
-from flexroad.pipeline.store.artefacts import check_writable
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.tile import TileJob
 

@@ -11,7 +11,6 @@ a bucket by one request. A reader therefore reads a complete file or none, even 
 
 from __future__ import annotations
 
-import uuid
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -24,8 +23,6 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.graph import Node
 from flexroad.pipeline.store import codec
 
-PROBE = ".probe-"
-"""Start of the names of files that only try a folder; 32 hexadecimal digits follow."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -64,16 +61,3 @@ class ArtefactStore:
     def _path(self, stage: str, fingerprint: str) -> Location:
         """Return the file of an artefact; OSError if it lies behind a link that leads out of the store."""
         return contained(self.root / stage / fingerprint[:2] / f"{fingerprint}.npz", self.root)
-
-
-def check_writable(folder: Location) -> None:
-    """Check that files can be written in ``folder``.
-
-    Raises
-    ------
-    OSError
-        If not; with the reason and the path.
-    """
-    probe = folder / f"{PROBE}{uuid.uuid4().hex}"
-    paths.write(probe, b"")
-    paths.remove(probe)

@@ -10,8 +10,7 @@ from pathlib import PurePath
 from types import TracebackType
 
 from flexroad.catalog.storage import paths
-from flexroad.catalog.storage.paths import FileStat, parse_location
-from flexroad.pipeline.store.artefacts import PROBE
+from flexroad.catalog.storage.paths import PROBE, FileStat, parse_location
 from flexroad.pipeline.worker.tile import TileJob
 
 MOUNT = "mount it there under the same path"

@@ -6,6 +6,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.inspect.points import Ground
+from flexroad.pipeline.inspect.run import open_run
 from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -30,3 +31,16 @@ def test_open_tile_returns_inputs_masks_and_surface(survey, quick_config, tmp_pa
         open_tile(run.path, tile.id, "x")
     with pytest.raises(CatalogError, match="did you mean"):
         open_tile(run.path, "1_1")
+
+
+def test_tile_of_an_opened_run_does_not_open_the_run_again(survey, quick_config, tmp_path, monkeypatch):
+    run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
+    tile = run.catalog.tiles[0]
+    run_tiles(run, SerialExecutor(), only=lambda other: other == tile)
+    view, expected = open_run(run.path), open_tile(run.path, tile.id)
+
+    def opened(*arguments):
+        raise AssertionError("the run is opened again")
+
+    monkeypatch.setattr(Run, "open", opened)
+    assert view.tile(tile.id).identical(expected)
