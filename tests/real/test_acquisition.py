@@ -1,6 +1,6 @@
 """docs/results/real_data.md: its commands give its tables, and independent heights agree.
 
-Roads along centre lines, as docs/export.md shows them, are exported from the same scan.
+Roads along centre lines are exported from the same scan.
 """
 
 import csv
@@ -21,8 +21,7 @@ from tests.read_opendrive import quality_issues
 from tests.real.opendrive import reference_lines
 from tests.real.shown import flexroad, measured, table_after
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGE, EXPORTS = (DOCS / "results" / "real_data.md").read_text(), (DOCS / "export.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "results" / "real_data.md").read_text()
 SETS = ("autzen", "ign", "stbarth", "brighton", "deepscenario")
 ROADS = Path(__file__).parent / "roads"
 FOOT = 0.3048
@@ -126,8 +125,8 @@ def test_deepscenario_roads_agree_with_map_and_vehicles(folder, source):
 
 @pytest.fixture(scope="module")
 def along_roads(folder) -> tuple[list[str], list[str]]:
-    """Lines that the commands of docs/export.md print on Autzen, and those that the page shows."""
-    (block,) = re.findall(r"```console\n(\$ flexroad run [^`]*runs/autzen_roads[^`]*)```", EXPORTS)
+    """Lines that the commands of the page print on Autzen, and those that the page shows."""
+    (block,) = re.findall(r"```console\n(\$ flexroad run [^`]*runs/autzen_roads[^`]*)```", PAGE)
     lines = block.splitlines()
     for command in (line[2:] for line in lines if line[0] == "$"):
         said = flexroad(shlex.split(command)[1:], folder)
