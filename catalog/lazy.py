@@ -1,0 +1,79 @@
+"""Libraries that are imported when they are first used, so that short commands start fast.
+
+>>> rasterio = lazy("rasterio")
+>>> rasterio.features.rasterize
+<function rasterize at ...>
+
+Python's own ``LazyLoader``, which the library ``lazy_loader`` uses, puts an unfinished module into
+``sys.modules``. Before Python 3.11.8 two threads that use it at once fail. It also imports the parents of a
+submodule at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+
+class LazyModule:
+    """A module that is imported when one of its names is first asked for.
+
+    A name that the module does not have is looked for among its submodules. Whatever is set or deleted is set
+    or deleted in the module itself.
+    """
+
+    __slots__ = ("_module", "_name")
+    _name: str
+    _module: ModuleType | None
+
+    def __init__(self, name: str) -> None:
+        object.__setattr__(self, "_name", name)
+        object.__setattr__(self, "_module", None)
+
+    def _loaded(self) -> ModuleType:
+        if self._module is None:
+            object.__setattr__(self, "_module", importlib.import_module(self._name))
+        assert self._module is not None
+        return self._module
+
+    def __getattr__(self, name: str) -> Any:
+        # Tools that look through the names of a file ask for these; an answer is not worth an import.
+        if name.startswith("__") and name != "__version__":
+            raise AttributeError(f"{name!r} does not import module {self._name!r}")
+        module = self._loaded()
+        try:
+            return getattr(module, name)
+        except AttributeError as error:
+            submodule = f"{module.__name__}.{name}"
+            try:
+                return importlib.import_module(submodule)
+            except ModuleNotFoundError as missing:
+                if missing.name != submodule:
+                    raise
+                raise error from None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self._loaded(), name, value)
+
+    def __delattr__(self, name: str) -> None:
+        delattr(self._loaded(), name)
+
+    def __reduce__(self) -> tuple[type[LazyModule], tuple[str]]:
+        return LazyModule, (self._name,)
+
+
+def lazy(name: str) -> Any:
+    """Return a library that is imported when one of its names is first asked for.
+
+    Parameters
+    ----------
+    name : str
+        Name of the library or of a module in it, as ``rasterio`` or ``matplotlib.figure``.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        At its first use, if the library is not installed.
+    """
+    return LazyModule(name)
