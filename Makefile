@@ -45,12 +45,12 @@ LITERAL_SURVEY := $(if $(GEROD_ROOT),$(SURVEY),runs/synthetic-$(LITERAL_TILES)-$
 RESULTS ?= $(REPRODUCED)/results
 # The published dataset lies elsewhere than its catalog.
 ABLATE = $(BIN)/flexroad run $(if $(GEROD_ROOT),--allow $(GEROD_ROOT)) --store $(REPRODUCED)/store
-# DSC3D cannot be had as rasters: five made scenes stand in for it, by the paper's reference and by the truth.
+# DSC3D cannot be had as rasters: five synthetic scenes stand in for it, by the paper's reference and by the truth.
 STANDIN := runs/standin-$(SEED)
 SCENES := $(STANDIN)/scenes/catalog.parquet
 STAND_IN = $(BIN)/flexroad run --config dsc3d --store $(STANDIN)/store
 
-reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figures beside ours, on made tiles (TILES=24 SEED=1) or GEROD_ROOT=...
+reproduce: $(SURVEY) $(SCENES) $(LITERAL_SURVEY) ## The paper's tables and figures beside ours, on synthetic tiles (TILES=24 SEED=1) or GEROD_ROOT=...
 	$(ABLATE) --catalog $(SURVEY) --config ablation --out $(REPRODUCED)/segmented
 	$(if $(TRUE),$(ABLATE) --catalog $(TRUE_SURVEY) --config ablation_true --out $(TRUE))
 	$(ABLATE) --catalog $(LITERAL_SURVEY) --config literal --out $(LITERAL)
@@ -93,7 +93,7 @@ viewer: ## Build the browser viewer into viewer/dist and test its parts (needs n
 	node viewer/build.js
 	node --test viewer/tests/
 
-# Programs of others that check exports; FLEXROAD_VALIDATORS=.validators makes the tests use them.
+# Third-party programs that check exports; FLEXROAD_VALIDATORS=.validators makes the tests use them.
 VALIDATORS := .validators
 VALIDATED_BY := $(addprefix tests/validators/,requirements.txt package.json package-lock.json)
 

@@ -83,7 +83,7 @@ def _values(path: Path) -> tuple[set[float], bool]:
 
 
 def _windows(raster: Any) -> Iterator[Window]:
-    """Yield the whole of a small raster, or squares spread over a large one."""
+    """Yield all of a small raster, or squares spread over a large one."""
     from rasterio.windows import Window
 
     if max(raster.shape) <= SIDE:

@@ -153,7 +153,7 @@ def cut(
     if not any(file.crs == grid_crs for file in dsm):
         notes.append(f"the tiles have cells of {next(iter(grids.values())).cell:g} m")
     near = {name: _near(grids, files) for name, files in placed.items()}
-    # Of the whole layer, so that all tiles describe it in the same way.
+    # Of the complete layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
     others = {name: any(not same(p.file.crs, grid_crs) for p in files) for name, files in placed.items()}
     values = dict.fromkeys(MASKS, road_values)

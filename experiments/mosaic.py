@@ -45,7 +45,7 @@ STAGES = BorderStages.of(CHAIN)
 MARGIN_M = 100.0
 """Ground around the block (m): what its borders are computed from."""
 TILE_M, SIDE = 250, 3
-"""Side of the made tiles (m), and of their block (tiles)."""
+"""Side of the synthetic tiles (m), and of their block (tiles)."""
 STRATA = ("urban", "suburban", "rural")
 VOID_M = 70.0
 """Radius of the void around a corner (m); its middle is farther from all ground than a halo of 50 m."""
@@ -151,7 +151,7 @@ def alone(data: TileData, clusters: RoadClusters) -> Surface:
 
 
 def together(world: TileData, tile: Grid) -> Surface:
-    """Return one surface of the whole block with its margin, on the lattice of the tiles."""
+    """Return one surface of the complete block with its margin, on the lattice of the tiles."""
     _, clusters = filtered(replace(world, core=world.grid))
     points = smoothing_spline._lattice(tile.shape[::-1], tile.cell, STAGES.fit)
     options = STAGES.fit.model_copy(update={"spacing_m": points.unit_m[0], "stop_tolerance": 1e-8})

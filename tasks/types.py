@@ -176,7 +176,7 @@ class Metrics:
     mad_road_deg: float
     mad_terrain_deg: float
     triangles: int
-    """Faces of the whole mesh."""
+    """Faces of the complete mesh."""
     road_fraction: float
     """Share of the core's reference cells that are road by the evaluation mask."""
     completeness: float

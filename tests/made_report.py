@@ -1,4 +1,4 @@
-"""Runs and contents of reports with made figures, without computing a tile."""
+"""Runs and contents of reports with invented figures, without computing a tile."""
 
 import dataclasses
 
@@ -70,7 +70,7 @@ def made_content(run, rows, states=None) -> Content:
     done = frame[frame.status == "done"]
     empty = pd.DataFrame()
     return Content(
-        title=f"FlexRoad: made over {len(states)} tiles",
+        title=f"FlexRoad: invented over {len(states)} tiles",
         state="",
         counts=Summary(
             len(states),
@@ -106,7 +106,7 @@ def made_content(run, rows, states=None) -> Content:
 
 
 def many_rows(ids, seed=0):
-    """Return rows with made figures: some tiles flagged, some failed, every figure filled in."""
+    """Return rows with invented figures: some tiles flagged, some failed, every figure filled in."""
     rng = np.random.default_rng(seed)
     for i, name in enumerate(ids):
         if i % 97 == 5:

@@ -1,4 +1,4 @@
-"""A small made city, and centre lines on it, for tests of exports along roads."""
+"""A small synthetic city, and centre lines on it, for tests of exports along roads."""
 
 from pathlib import Path
 

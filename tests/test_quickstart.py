@@ -1,4 +1,4 @@
-"""Each quick start: its commands, on made data, end with a map, meshes that open, and a report."""
+"""Each quick start: its commands, on synthetic data, end with a map, meshes that open, and a report."""
 
 import re
 import shlex

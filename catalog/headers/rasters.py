@@ -221,7 +221,7 @@ def _there(folder: Path) -> str:
 
 
 def _name(root: Path, path: Path) -> str:
-    """Return the path relative to the folder if it lies below it, else the whole path."""
+    """Return the path relative to the folder if it lies below it, else the complete path."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 

@@ -168,7 +168,7 @@ def with_roads(
     ]
     if len(far) == len(files):
         raise CatalogError(far[0])
-    # A CRS is that of the whole layer, so that all tiles describe the layer in the same way.
+    # A CRS is that of the complete layer, so that all tiles describe the layer in the same way.
     bare = None if all(file.has_crs for file in files) else crs
     with_layer = tuple(
         _with_layer(tile, list(compress(files, chosen)), extents[tile.grid.crs][chosen], bare)

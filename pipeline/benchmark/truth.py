@@ -1,4 +1,4 @@
-"""The second catalog of made data: the same layers, with the true heights and roads as reference."""
+"""The second catalog of synthetic data: the same layers, with the true heights and roads as reference."""
 
 from __future__ import annotations
 

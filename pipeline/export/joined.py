@@ -1,4 +1,4 @@
-"""Formats with one file for the whole run: workers encode the part of each tile, and the parts are joined.
+"""Formats with one file for the complete run: workers encode the part of each tile, and the parts are joined.
 
 Parts are files ``.parts/ID``, so that an interrupted export goes on where it stopped. Together they are about
 as large as the file itself. So they are removed when it is written, and a file ``.FORMAT.json`` beside the

@@ -15,7 +15,7 @@ class Options:
     datum: Datum | None = None
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
     compress: bool = False
-    """Whether text formats of the whole run are compressed with gzip."""
+    """Whether text formats of the complete run are compressed with gzip."""
     resolution_m: float | None = None
     """Cell size of rasters over the run (m); None: that of the run."""
     nodes: Literal["power", "unreal"] = "power"
@@ -29,4 +29,4 @@ class Options:
     left_hand: bool = False
     """Whether traffic keeps left."""
     formats: frozenset[str] = frozenset()
-    """Names of the formats that are written together: some refer to files of others."""
+    """Names of the formats that are written together: some refer to files of other formats."""

@@ -1,4 +1,4 @@
-"""The folder of an export: outside the run, written by one export at a time; files of others stay."""
+"""The folder of an export: outside the run, written by one export at a time; existing files stay."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[st
     Raises
     ------
     ConfigError
-        If the folder is the run, its store or inside one of them, has files of others that would be replaced,
+        If the folder is the run, its store or inside one of them, has existing files that would be replaced,
         or another process writes there.
     OSError
         If it, or its manifest, cannot be written.

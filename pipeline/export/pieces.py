@@ -28,7 +28,7 @@ from flexroad.tasks.errors import TaskError
 MARKERS = ".pieces"
 """Folder of the markers."""
 Row = dict[str, Any]
-"""What the files of the whole run need of a tile, as JSON values."""
+"""What the files of the complete run need of a tile, as JSON values."""
 
 
 @dataclass(frozen=True)

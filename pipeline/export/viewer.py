@@ -1,6 +1,6 @@
 """A run as a folder that a browser opens without a server: page, scripts, and one script per tile.
 
-The page is written last, and an earlier one is removed first: a folder with a page is whole.
+The page is written last, and an earlier one is removed first: a folder with a page is complete.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def write_viewer(
     Raises
     ------
     ConfigError
-        If the folder is of the run or has files of others, no tile can be shown, tiles have different CRSs,
+        If the folder is of the run or has other files, no tile can be shown, tiles have different CRSs,
         or a tile's results cannot be read.
     CatalogError
         If an id is not in the run, or no tile touches the box.
@@ -146,7 +146,7 @@ def _claim(out: Location, run: Run) -> None:
     Raises
     ------
     ConfigError
-        If the folder is the run, its store or one of their folders, has files of others or links that lead
+        If the folder is the run, its store or one of their folders, has other files or links that lead
         out of it, or is the viewer of another run.
     """
     for place in (run.path, run.store, run.path / "tiles"):

@@ -105,7 +105,7 @@ class TileGraph:
 
     @property
     def readable(self) -> Tile:
-        """The tile with only the layers that its stages read: files of others may lie anywhere."""
+        """The tile with only the layers that its stages read: those of other layers may lie anywhere."""
         reads = self._stage_reads
         return replace(self.tile, layers=tuple(layer for layer in self.tile.layers if layer.name in reads))
 
@@ -177,7 +177,7 @@ class Pattern:
 
     @cached_property
     def reads(self) -> frozenset[str]:
-        """Names of the source layers that any stage reads; the files of others are not even looked up."""
+        """Names of the source layers that any stage reads; files of other layers are not even looked up."""
         return frozenset(layer for step in self.steps for layer in step.reads)
 
     def graph(

@@ -59,7 +59,7 @@ class Mosaic:
     """A raster divided into blocks by all tile edges; each block lies in at most one finished tile."""
 
     grid: Grid
-    """The cells of the whole raster."""
+    """The cells of the complete raster."""
     heights: tuple[int, ...]
     """Number of cell rows of each row of blocks."""
     widths: tuple[int, ...]

@@ -109,7 +109,7 @@ def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
             )
             return _wait(process, text, policy, _program(command))
     except (OSError, ValueError) as error:
-        # The message of an error may have the whole command.
+        # The message of an error may have the complete command.
         reason = (isinstance(error, OSError) and error.strerror) or type(error).__name__
         return f"{_program(command)} cannot be run: {reason}"
 

@@ -121,7 +121,7 @@ def _check_memory(jobs: Sequence[BlockJob]) -> None:
 
 
 def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
-    """Return the cells of a block that are part of the whole grid, or None if there are none."""
+    """Return the cells of a block that are part of the complete grid, or None if there are none."""
     left, right = (round((index[0] * edge + d - whole.west) / whole.cell) for d in (0, edge))
     top, bottom = (round((whole.north - index[1] * edge - d) / whole.cell) for d in (edge, 0))
     left, right = max(left, 0), min(right, whole.width)

@@ -60,7 +60,7 @@ def prepared_grid(
     photo : bool
         Whether there is an orthophoto.
     per_cell : int
-        Memory of the steps that hold the whole area (bytes per cell).
+        Memory of the steps that hold the complete area (bytes per cell).
 
     Raises
     ------

@@ -154,7 +154,7 @@ def publish_mesh(
 
 
 def _whole(mesh_options: MeshOptions, common: PrepareOptions) -> int:
-    """Return the memory of the steps that hold the whole area (bytes per cell)."""
+    """Return the memory of the steps that hold the complete area (bytes per cell)."""
     needed = REFERENCE_BYTES if common.roads is not None else 0
     return max(needed, REFINE_BYTES) if mesh_options.refine else needed
 

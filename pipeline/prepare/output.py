@@ -1,4 +1,4 @@
-"""The output folder of a ``prepare`` command: its files, which replace no files of others, and its errors."""
+"""The output folder of a ``prepare`` command: its files, which replace no existing files, and its errors."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def render_meshes(
         Red, green and blue at the vertices of each mesh, ``(V, 3)``; by default road and terrain have one
         colour each.
     within : Bounds, optional
-        The part to draw (m, in the meshes' CRS); by default the whole mesh.
+        The part to draw (m, in the meshes' CRS); by default the complete mesh.
     size_px : tuple of int, optional
         Width and height of a picture.
 

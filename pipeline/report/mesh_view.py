@@ -70,7 +70,7 @@ def draw(
         Width and height of the picture.
     """
     whole = pv.PolyData.from_regular_faces(vertices * [1, 1, EXAGGERATION], faces)
-    # Normals are computed on the whole mesh, so that there is no seam between road and terrain.
+    # Normals are computed on the complete mesh, so that there is no seam between road and terrain.
     whole.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False, inplace=True)
     whole.cell_data["road"] = road
     if colours is not None:

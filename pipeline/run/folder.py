@@ -13,7 +13,7 @@ from flexroad.pipeline.store.records import DONE, FAILED
 
 STORE = "store"
 RECORD = "run.json"
-"""The first file of a run: a folder that has it is a run, also if it is not whole."""
+"""The first file of a run: a folder that has it is a run, also if it is not complete."""
 
 
 def check_links(path: Location, below: bool = False) -> None:
@@ -46,7 +46,7 @@ def check_links(path: Location, below: bool = False) -> None:
 
 
 def check_folder(path: Location) -> None:
-    """Check that a run may be written to a folder, so that no files of others are replaced.
+    """Check that a run may be written to a folder, so that no existing files are replaced.
 
     Raises
     ------

@@ -130,7 +130,7 @@ class Run:
         Raises
         ------
         ConfigError
-            If the folder has files of others (`check_folder`), no tile can be used, its store was not given
+            If the folder has other files (`check_folder`), no tile can be used, its store was not given
             by this user, or `check_inputs` raises.
         """
         check_folder(path)

@@ -24,7 +24,7 @@ class StageCost:
     bytes: int = 0
     """Bytes written to the store or as products."""
     peak_mb: float = 0.0
-    """Peak memory of the whole process during the stage (MB)."""
+    """Peak memory of the process during the stage (MB)."""
     computed: int = 0
     """Number of nodes computed."""
     reused: int = 0

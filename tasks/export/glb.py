@@ -5,7 +5,7 @@ and the parent node moves the tile to its place in the run. Origin and CRS are i
 An orthophoto is embedded as one JPEG image that both nodes share.
 
 The file is put together here: trimesh takes four times as long for the same arrays, most of it to compare
-them with each other, and as long as a whole tile to be imported.
+them with each other, and as long as a complete tile to be imported.
 """
 
 from __future__ import annotations

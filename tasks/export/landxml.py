@@ -334,7 +334,7 @@ class _Surface:
         self.low, self.high = min(self.low, low), max(self.high, high)
 
     def copy_to(self, file: IO[bytes]) -> None:
-        """Write the whole surface, if it has a face."""
+        """Write the complete surface, if it has a face."""
         if not self.faces:
             return
         start = SURFACE.format(

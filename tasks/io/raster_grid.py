@@ -53,7 +53,7 @@ class RasterGrid:
         return east, north
 
     def fits(self, grid: Grid) -> bool:
-        """Return whether cells coincide to within `LATTICE_TOLERANCE` over the whole grid."""
+        """Return whether cells coincide to within `LATTICE_TOLERANCE` over the complete grid."""
         if self.crs:
             return False
         west, north, east, south = self._in_cells(grid)

@@ -34,7 +34,7 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
     -------
     dict of str to tuple
         Easting and northing (m) by flag, whether it is raised or not. Flags without a place are absent: those
-        of the whole tile (``weights``, ``no-road``) and those of which the tile has no cell.
+        of the complete tile (``weights``, ``no-road``) and those of which the tile has no cell.
     """
     road, agree_m = cells.on_road, options.agree_m
     scores = {

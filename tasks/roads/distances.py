@@ -1,7 +1,7 @@
 """Distances from cells to the nearest cell of a mask, computed only where they are wanted.
 
 A search from a cell goes row by row away from it and ends where no row can be nearer. Gaps in rasters are
-mostly narrow, so it is much faster than a distance transform of the whole raster, and as exact.
+mostly narrow, so it is much faster than a distance transform of the complete raster, and as exact.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ STEP_M = 25.0
 REACH_M = 37.5
 """Cells up to this far from a place in easting and northing count (m)."""
 MIN_CELLS = 50
-"""With fewer open cells around, a place has the offset of the whole ground."""
+"""With fewer open cells around, a place has the offset of all ground."""
 
 
 def with_road_heights(data: TileData, clusters: RoadClusters) -> TileData:

@@ -15,7 +15,7 @@ from flexroad.tasks.synthetic.noise import generator
 from flexroad.tasks.synthetic.options import SceneOptions
 
 STRATA = {"urban": 168, "suburban": 23, "rural": 49}
-"""Tiles of the whole benchmark, as in the paper."""
+"""Tiles of the complete benchmark, as in the paper."""
 TILES = sum(STRATA.values())
 SIZE_M = 250
 APART_M = 3000

@@ -146,7 +146,7 @@ class Plan:
     stream_share: float
     """Fraction of the gaps between lines with a stream."""
     stratum: str | None = None
-    """The stratum of the whole world, or None for a mix of districts."""
+    """The stratum of the complete world, or None for a mix of districts."""
     turn_deg: float | None = None
     """Direction of the lattice (degrees); None if drawn from the seed."""
     sunken_share: float = 0.0

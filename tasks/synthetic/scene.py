@@ -85,7 +85,7 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     seed : int
         Seed of the world, 0 or more.
     stratum : str, optional
-        Stratum of the whole world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
+        Stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
     options : SceneOptions
         Contents of the world.
 

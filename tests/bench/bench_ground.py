@@ -1,9 +1,9 @@
-"""Ground filters compared with CSF and PDAL's PMF and SMRF, with default options, on real and made clouds.
+"""Ground filters beside CSF and PDAL's PMF and SMRF, with default options, on real and synthetic clouds.
 
 Real clouds are read from the folder FLEXROAD_REAL_DATA, PDAL is used if it is on the path; both are optional.
 Ground is class 2. Noise (class 7) is removed first. Class 1 (unclassified) is filtered but not scored; all
-other classes are objects. Made clouds are the cells of the benchmark's surface models: bridges are objects,
-plants and mixed echoes within 0.3 m of the ground are not scored.
+other classes are objects. Synthetic clouds are the cells of the benchmark's surface models: bridges are
+objects, plants and mixed echoes within 0.3 m of the ground are not scored.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def choice() -> None:
     places = gerod.survey(TILES, CHOSEN_ON)
     tiles = [place for name in gerod.STRATA for place in [p for p in places if p[2] == name][:PER_STRATUM]]
     scenes = [make_scene(grid, CHOSEN_ON, name, options) for _, grid, name, options in tiles]
-    print(f"\nmean |TIN of the ground - truth| (m) of {len(scenes)} made tiles, seed {CHOSEN_ON}")
+    print(f"\nmean |TIN of the ground - truth| (m) of {len(scenes)} synthetic tiles, seed {CHOSEN_ON}")
     print(f"{'filter':8}{'slope':>6} {'confidence':>10} {'all':>7} {'roads':>7}  decks accepted")
     for slope, confidence in ((0.2, 1.65), (0.3, 1.65), (0.35, 1.65), (0.4, 1.65), (0.5, 1.65), (0.35, 3.0)):
         row(

@@ -1,10 +1,10 @@
-"""Errors at points and cells withheld from DSM and DTM: both configurations, real places and made scans.
+"""Errors at points and cells withheld from DSM and DTM: both configurations, real places and synthetic scans.
 
 Squares of 5 m (`SIDE_M`) are taken out of the points or cells of a place, the place is prepared and run, and
 the surface is compared with what was taken out. Points count if they are ground: by their class or, without
 classes, within 0.3 m of the terrain model of all points. Of Autzen, the ground points of another
 classification are withheld and compared, too. They lie 4 cm below the plane through all points around them,
-which is a second truth. Made scans have a scanner's noise, and are compared with the true surface.
+which is a second truth. Synthetic scans have a scanner's noise, and are compared with the true surface.
 
 The error estimates of the road's squares are compared with their errors: how many squares have a mean error
 within the 90% interval, and how many of the worst tenth are among the tenth with the largest estimate.
@@ -13,7 +13,7 @@ Small places have few such squares, so they are run with several draws of them (
 
 Usage: ``python tests/bench/bench_heldback.py [PLACE ...] [--set NAME=OPTION=VALUE ...] [--draw NUMBER]``;
 each NAME is a further configuration, production with options: ``--set soft=fit.bending_m3=20``. Another
-number of the first draw gives other squares and other made scenes. Real places need FLEXROAD_REAL_DATA.
+number of the first draw gives other squares and other synthetic scenes. Real places need FLEXROAD_REAL_DATA.
 Intervals are 95% intervals of a bootstrap over the squares, those of MAD and T over the tiles.
 """
 
@@ -232,7 +232,7 @@ def town(archive: Path, crs: str, patterns: dict[str, str], folder: Path, draw: 
 
 
 def made(stratum: str, folder: Path, draw: int) -> Place:
-    """Withhold points of a made scan of two by two tiles, a scene for each draw; truth is its surface."""
+    """Withhold points of a synthetic scan of two by two tiles, one for each draw; truth is its surface."""
     whole = Grid("EPSG:25832", 500000, 5600500, 1.0, 500, 500)
     options = SceneOptions(dsm_noise_m=(0.0, 0.0))
     scene = make_scene(whole, draw, stratum, options)

@@ -79,7 +79,7 @@ def main() -> None:
 
 
 def made_case() -> Case:
-    """Return a made tile of 250 m after production's filter."""
+    """Return a synthetic tile of 250 m after production's filter."""
     chain = load_config("production").chains["flexroad"]
     with tempfile.TemporaryDirectory() as folder:
         tile = Catalog.read(write_scenes(Path(folder), 1, seed=SEED)).tiles[0]

@@ -44,7 +44,7 @@ TILES = 1000
 """Default number of tiles; docs/archive/speed.md uses 10,000."""
 TILE_M = 20
 PATCH_M = 400
-"""Size of the made scene of which the rasters are repeated copies."""
+"""Size of the synthetic scene of which the rasters are repeated copies."""
 SLEEP_S = 0.3
 """Time of a tile with configs/production.yaml."""
 SLEEPERS = 4
@@ -90,7 +90,7 @@ LAYERS = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
 
 
 def survey(folder: Path, side: int) -> None:
-    """Write three rasters of ``side`` x ``side`` tiles: repeated copies of one made scene."""
+    """Write three rasters of ``side`` x ``side`` tiles: repeated copies of one synthetic scene."""
     grid = Grid("EPSG:25832", 300_000, 5_700_000, 1.0, PATCH_M, PATCH_M)
     # Dense streets, so that every tile has one.
     scene = make_scene(grid, 7, options=SceneOptions(block_m=20))

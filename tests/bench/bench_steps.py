@@ -1,4 +1,4 @@
-"""Errors at kerbs, walls and hump bridges on made tiles: no steps, `fit.steps`, and `sample.breaklines`.
+"""Errors at kerbs, walls and hump bridges on synthetic tiles: no steps, `fit.steps`, and `sample.breaklines`.
 
 ``PYTHONPATH=. python tests/bench/bench_steps.py`` prints the table of docs/archive/fit.md.
 """

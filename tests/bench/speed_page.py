@@ -136,7 +136,7 @@ def curves(folder: Path) -> Curves:
 
 
 def run_s(folder: Path, config: Any, catalog: Catalog, tiles: int) -> float:
-    """Return the CPU time of a whole run of some tiles, without the start of Python (s): lowest of two."""
+    """Return the CPU time of a complete run of some tiles, without the start of Python (s): lowest of two."""
     part = Catalog(catalog.tiles[:tiles])
 
     def one(name: str) -> float:

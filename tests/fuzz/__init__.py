@@ -1,6 +1,6 @@
 """Fuzzing: damaged and hostile files give a result or one line, never a traceback, a hang or a wrong figure.
 
-``python -m tests.fuzz`` damages made files of each target for some time and prints what came of it. Tests of
+``python -m tests.fuzz`` damages valid files of each target for some time and prints what came of it. Tests of
 single readers use `check` with a fixed number of files.
 """
 

@@ -1,4 +1,4 @@
-"""Programs of others that check exports: installed by ``make validators``, in an environment of their own.
+"""Third-party programs that check exports: installed by ``make validators``, in an environment of their own.
 
 The tests run them as processes. ``FLEXROAD_VALIDATORS`` names their folder; without it, those tests are
 skipped. ``requirements.txt`` has the Python packages, ``package.json`` those of Node.

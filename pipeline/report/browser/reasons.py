@@ -82,7 +82,7 @@ class Reason:
     words: str
     """What is wrong, with the value and the limit."""
     place: Place | None
-    """Where to look (easting, northing, m); None if it concerns the whole tile or is not known."""
+    """Where to look (easting, northing, m); None if it concerns the complete tile or is not known."""
     remedy: str
 
     @property

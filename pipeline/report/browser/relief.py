@@ -21,7 +21,7 @@ from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.types import Floats, RoadMask, Surface
 
 PIXELS = 2_000_000
-"""Pixels of the whole picture."""
+"""Pixels of the complete picture."""
 SIDE_PX = (6, 320)
 """Smallest and largest side of the part of one tile."""
 QUALITY = 62

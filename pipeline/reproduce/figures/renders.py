@@ -25,7 +25,7 @@ NAME = "ablation_renders"
 SIZE_PX = (760, 540)
 UNKNOWN = "#d0d0d0"
 CLOSE_M = 120.0
-"""Side of the square that is drawn (m); on a whole tile the details would be too small."""
+"""Side of the square that is drawn (m); on a complete tile the details would be too small."""
 
 
 def make_figure(view: TileView, roles: Roles) -> FigureFile:
@@ -34,7 +34,7 @@ def make_figure(view: TileView, roles: Roles) -> FigureFile:
     caption = (
         f"{view}: meshes without NURBS, without ECSRC and of the full pipeline, coloured by their vertical "
         f"distance to {view.against} as in the error maps. The square of {CLOSE_M:g} m is the one in which "
-        "ECSRC drops the largest area of the road mask; on the whole tile it drops "
+        "ECSRC drops the largest area of the road mask; on the complete tile it drops "
         f"{view.dropped.sum() * view.grid.cell**2:,.0f} m²."
     )
     columns = {label: variant for label, variant in methods if variant is not None}

@@ -21,7 +21,7 @@ def flexroad(*words, expect: int = 0) -> str:
 
 @pytest.fixture(scope="module")
 def words(made_survey, tmp_path_factory) -> list:
-    """The words of a run command over the whole survey, without --out and --executor."""
+    """The words of a run command over the complete survey, without --out and --executor."""
     config = tmp_path_factory.mktemp("cli") / "quick.yaml"
     config.write_text(
         "fit: {control_points: [12, 12], iterations: 30}\n"
@@ -35,7 +35,7 @@ def words(made_survey, tmp_path_factory) -> list:
 
 @pytest.fixture(scope="module")
 def finished(words, tmp_path_factory) -> Path:
-    """A finished run of the whole survey, made by the command line."""
+    """A finished run of the complete survey, made by the command line."""
     out = tmp_path_factory.mktemp("cli") / "run"
     said = flexroad(*words, "--out", out, "--executor", "serial")
     assert "4 tiles: 4 done (0 cached), 0 failed, 0 pending" in said

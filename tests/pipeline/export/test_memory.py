@@ -40,7 +40,7 @@ def many(city, number: int, spread_m: float = 0.0) -> Source:
 
 def peak_bytes(source: Source, name: str, out) -> int:
     gc.collect()
-    # Without the objects of the whole program, cycles of a tile are collected as soon as there are some.
+    # Without the objects of the program, cycles of a tile are collected as soon as there are some.
     gc.freeze()
     tracemalloc.start()
     try:

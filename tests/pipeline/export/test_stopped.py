@@ -98,7 +98,7 @@ def test_full_disk_gives_one_line_and_nothing_half_written(made_city, whole, tmp
             assert "No space left on device" in line
             assert not (out / "export.json").exists()
         for file, content in contents(out / name).items():
-            assert content == whole_files[file], f"{file} is not whole after operation {number}"
+            assert content == whole_files[file], f"{file} is not complete after operation {number}"
         goes_on(made_city, name, out, folder)
 
 

@@ -259,7 +259,7 @@ def test_damaged_record_is_reported_with_the_remedy(city, tmp_path):
 
 
 def far_and_near(folder, place):
-    """Nodes of 13 made tiles of 250 m: 8 in one km, 3 in the next, one 3 km north, one 40 km away."""
+    """Nodes of 13 synthetic tiles of 250 m: 8 in one km, 3 in the next, one 3 km north, one 40 km away."""
     rng = np.random.default_rng(4)
     corners = [(i * 250, j * 250) for i in range(4) for j in range(2)]
     corners += [(1000, 0), (1250, 0), (1000, 250), (500, 3250), (40_000, 0)]

@@ -1,4 +1,4 @@
-"""The viewer's folder is whole or has no page, and has what the run has."""
+"""The viewer's folder is complete or has no page, and has what the run has."""
 
 import base64
 import http.client

@@ -49,7 +49,7 @@ def picture(png):
 
 
 def made(folder, ids, states, errors=None):
-    """A viewer's folder of made tiles of 100 m, without their scripts."""
+    """A viewer's folder of synthetic tiles of 100 m, without their scripts."""
     number = len(ids)
     side = int(np.ceil(np.sqrt(number)))
     tiles = {

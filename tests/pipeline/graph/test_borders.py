@@ -119,7 +119,7 @@ def test_changed_file_changes_only_what_it_reaches(catalog_of, survey):
     changed = {part for part in parts if parts[part] != new_parts[part]}
     inner = {500250.0, 500500.0}, {5600250.0, 5600500.0}
     corners = {("corner", (east, north)) for east in inner[0] for north in inner[1]}
-    # Of the middle tile's 4 edges the whole ground, and of 8 edges the ends reach it.
+    # Of the middle tile's 4 edges all ground, and of 8 edges the ends reach it.
     eastward = {("east", (east, north)) for east in (500000.0, 500250.0, 500500.0) for north in inner[1]}
     northward = {("north", (east, north)) for east in inner[0] for north in (5600000.0, 5600250.0, 5600500.0)}
     assert changed == corners | eastward | northward

@@ -1,4 +1,4 @@
-"""Files of others in an output folder are not replaced, and errors of the disk name the right remedy."""
+"""Existing files in an output folder are not replaced, and errors of the disk name the right remedy."""
 
 import errno
 import os

@@ -85,7 +85,7 @@ def test_click_and_arrow_keys_select_tiles_and_markup_is_text(small):
     assert "the surface bends more than a road can (0.31 1/m, limit 0.2 1/m)" in details
     assert link.startswith("view/index.html#tile=%3Cscript%3E")
     assert error == f"load: TaskError: {EVIL} is missing"
-    assert ends == ["FlexRoad: made over 4 tiles", ""]
+    assert ends == ["FlexRoad: invented over 4 tiles", ""]
 
 
 def test_address_and_list_select_tiles(small):

@@ -78,7 +78,7 @@ def runs_in_log(out: Path) -> int:
 
 
 def check_next(words: list, out: Path, undisturbed: Path) -> None:
-    """The next run is whole, and keeps tiles that were finished."""
+    """The next run is complete, and keeps tiles that were finished."""
     if (out / "lock.json").exists():
         # The process that could not remove its lock would have ended by then.
         ended = replace(Owner.me(), pid=2**22 + 1)

@@ -79,7 +79,7 @@ def joined(surfaces):
 
 
 def fit_together(world):
-    """Return the control heights of one precise fit of the whole world, on the same lattice."""
+    """Return the control heights of one precise fit of the complete world, on the same lattice."""
     data = world
     options = OPTIONS.model_copy(update={"stop_tolerance": 1e-8})
     lattice = smoothing_spline._lattice((250, 250), 1.0, options)

@@ -1,4 +1,4 @@
-"""Heights that roads are fitted to, and the fit on made scans with a scanner's noise."""
+"""Heights that roads are fitted to, and the fit on synthetic scans with a scanner's noise."""
 
 from dataclasses import replace
 
