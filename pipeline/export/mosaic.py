@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.storage.staging import atomic_file
@@ -33,6 +34,8 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.mosaic import MOST_CELLS, common_grid
 from flexroad.tasks.export import cog
 from flexroad.tasks.types import Floats
+
+rasterio = lazy("rasterio")
 
 VERSION = 1
 DRAFTS = ".drafts"
@@ -131,14 +134,10 @@ def _gdal(target: Location, **limits: Any) -> Iterator[None]:
     OSError
         If GDAL has an error; names the target.
     """
-    import rasterio
-    from rasterio._err import CPLE_BaseError
-    from rasterio.errors import RasterioError
-
     try:
         with rasterio.Env(**limits):
             yield
-    except (RasterioError, CPLE_BaseError) as error:
+    except (rasterio.errors.RasterioError, rasterio._err.CPLE_BaseError) as error:
         raise OSError(errno.EIO, reason(error.__cause__ or error), str(target)) from error
 
 
@@ -167,8 +166,6 @@ def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
 
 def _draft(folder: Path, layer: Layer, grid: Grid, source: Source) -> Any:
     """Open a raster without compression for the values of a layer."""
-    import rasterio
-
     heights = layer.bands[0] is cog.HEIGHT and source.vertical
     raster = rasterio.open(
         folder / layer.name,
@@ -198,8 +195,6 @@ def _draft(folder: Path, layer: Layer, grid: Grid, source: Source) -> Any:
 
 def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
     """Write the cells of a tile into the drafts."""
-    from rasterio.windows import Window
-
     surface, road, core = tile.surface, tile.road, tile.tile.grid
     kept, support = tile.clusters.mask, tile.quality.support
     for part, column, line in _parts(grid, core.bounds):
@@ -215,7 +210,7 @@ def _add(rasters: Sequence[Any], grid: Grid, tile: FinishedTile) -> None:
             kept[_cells(road.grid, eastings, northings)].astype(np.uint8)[None],
             support[_cells(core, eastings, northings)][None],
         )
-        window = Window(column, line, part.width, part.height)
+        window = rasterio.windows.Window(column, line, part.width, part.height)
         for raster, new in zip(rasters, values, strict=True):
             # Where tiles overlap, a later one does not hide an earlier one by nodata.
             nodata = np.isnan(new) if np.isnan(raster.nodata) else new == raster.nodata
@@ -262,10 +257,7 @@ def _finish(draft: Path, path: Path, layer: Layer) -> None:
 
     GDAL does not report blocks that it cannot write when it closes a file: only reading them shows it.
     """
-    import rasterio
-    from rasterio.shutil import copy
-
-    copy(
+    rasterio.shutil.copy(
         draft,
         path,
         driver="COG",

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexroad.catalog import Tile
+from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.source import OfTile, layer_state
 from flexroad.pipeline.run.finished import FinishedTile
@@ -16,6 +17,8 @@ from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.texture import TileTexture, tile_texture
 from flexroad.tasks.export.glb import Texture
 from flexroad.tasks.meshing.aerial import Aerial
+
+Image = lazy("PIL.Image")
 
 
 def check_photos(tiles: Iterable[Tile]) -> None:
@@ -62,8 +65,6 @@ def texture_of(tile: FinishedTile) -> TileTexture:
 
 def aerial_of(texture: Texture, pixel_m: float) -> Aerial:
     """Return a texture as pixels: means of its own, of which at least two fit into ``pixel_m`` (m)."""
-    from PIL import Image
-
     west, south, east, north = texture.bounds
     image = Image.open(io.BytesIO(texture.jpeg))
     dx, dy = (east - west) / image.width, (north - south) / image.height

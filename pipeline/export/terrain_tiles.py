@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any
@@ -17,6 +18,7 @@ import numpy as np
 
 from flexroad.catalog.crs import bounds_in, name, scales, transformer
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
@@ -27,6 +29,8 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import terrarium
 from flexroad.tasks.export.terrarium import SIZE
 from flexroad.tasks.types import Floats
+
+pmtiles = lazy("pmtiles")
 
 VERSION = terrarium.VERSION
 INSTALL = "pip install 'flexroad[export]'"
@@ -100,10 +104,9 @@ def load_writer() -> Any:
         If its library is not installed.
     """
     try:
-        from pmtiles.writer import Writer
+        return import_module("pmtiles.writer").Writer
     except ImportError as error:
         raise ConfigError(f"pmtiles needs the library pmtiles; install it with {INSTALL}") from error
-    return Writer
 
 
 def _add(canvas: Canvas, zoom: int, tile: FinishedTile) -> float:
@@ -148,15 +151,13 @@ def _add_overviews(canvas: Canvas, zoom: int) -> None:
 
 def _write(archive: Any, canvas: Canvas, source: Source, bounds: Bounds, no_height: float) -> None:
     """Write the images of all map tiles in the order of their ids, and what they are."""
-    from pmtiles.tile import Compression, TileType, zxy_to_tileid
-
-    for number, tile in sorted((zxy_to_tileid(*tile), tile) for tile in canvas.places):
+    for number, tile in sorted((pmtiles.tile.zxy_to_tileid(*tile), tile) for tile in canvas.places):
         archive.write_tile(number, terrarium.encode_png(canvas.read(tile), no_height))
     west, south, east, north = bounds_in("EPSG:4326", terrarium.CRS, bounds)
     levels = [zoom for zoom, _, _ in canvas.places]
     header = {
-        "tile_type": TileType.PNG,
-        "tile_compression": Compression.NONE,
+        "tile_type": pmtiles.tile.TileType.PNG,
+        "tile_compression": pmtiles.tile.Compression.NONE,
         "min_lon_e7": round(west * 1e7),
         "min_lat_e7": round(south * 1e7),
         "max_lon_e7": round(east * 1e7),

@@ -10,6 +10,7 @@ import numpy as np
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import transformer
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.export.pieces import Piece
 from flexroad.pipeline.export.source import OfTile, layer_state
@@ -23,6 +24,8 @@ from flexroad.tasks.roads.rasterise import Options as RoadOptions
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats
+
+shapely = lazy("shapely")
 
 WGS84 = "EPSG:4326"
 QUALITY = 82
@@ -113,8 +116,6 @@ def _photo(tile: Tile, largest_px: int, notes: list[str]) -> glb.Texture | None:
 
 def _lines(tile: Tile, options: RoadOptions, notes: list[str]) -> tuple[CentreLine, ...]:
     """Return the centre lines of the catalog on a tile, cut at its edges."""
-    import shapely
-
     layer = tile.layer("roads")
     source = layer and layer_source(replace(tile, layers=(layer,)), layer.name)
     if not source:

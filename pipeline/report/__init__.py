@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 from urllib.parse import quote
+
+import pandas as pd
 
 from flexroad.catalog.storage.paths import Location, exists, is_remote, write
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.browser.page import html_page
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.pages import csv_page, markdown_page
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.store.tables import PREVIOUS, read_metrics
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Format = Literal["md", "csv", "html"]
 VIEWER, PAGE = "viewer", "index.html"
@@ -55,8 +55,6 @@ def write_report(
     before = _before(run, compared) if form == "html" else None
     content = gather(run, track)
     if form == "html":
-        from flexroad.pipeline.report.browser.page import html_page
-
         text = html_page(run, content, address, before, track)
     else:
         text = {"md": markdown_page, "csv": csv_page}[form](content)

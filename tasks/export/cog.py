@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.crs import compound
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
+
+rasterio = lazy("rasterio")
 
 VERSION = 4
 NAME_HEIGHT = "_height.tif"
@@ -117,8 +120,6 @@ def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
 
 
 def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:
-    from rasterio.io import MemoryFile
-
     if values.shape != grid.shape:
         raise TaskError(f"{band.name} of {values.shape} cells does not fit a grid of {grid.shape}")
     profile = {
@@ -134,7 +135,7 @@ def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: A
         "nodata": band.nodata,
         "blocksize": _block(grid),
     }
-    with MemoryFile() as file:
+    with rasterio.io.MemoryFile() as file:
         with file.open(**profile, **options) as raster:
             raster.write(values, 1)
             describe(raster, 1, band)

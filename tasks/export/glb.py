@@ -20,10 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.meshing.normals import mesh_normals, vertex_normals
 from flexroad.tasks.meshing.parts import part, texture_coordinates
 from flexroad.tasks.meshing.relief import Sheet
 from flexroad.tasks.types import Floats, Mesh, Orthophoto, Surface
+
+Image = lazy("PIL.Image")
 
 VERSION = 3
 NAME = ".glb"
@@ -69,8 +72,6 @@ def texture(photo: Orthophoto, quality: int) -> Texture:
 
 def jpeg(colour: NDArray[np.uint8], quality: int) -> bytes:
     """Return an image, ``(h, w, 3)``, as JPEG."""
-    from PIL import Image
-
     encoded = io.BytesIO()
     Image.fromarray(colour).save(encoded, "JPEG", quality=quality)
     return encoded.getvalue()

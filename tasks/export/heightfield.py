@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.types import Floats, Surface
+
+Image = lazy("PIL.Image")
 
 VERSION = 2
 NAME_PNG = "_heightfield.png"
@@ -146,8 +149,6 @@ def sampled(
 
 def encode_png(field: HeightField) -> bytes:
     """Return a field as PNG, 16-bit grey; row 0 is in the north."""
-    from PIL import Image
-
     encoded = io.BytesIO()
     Image.fromarray(field.values).save(encoded, "PNG")
     return encoded.getvalue()

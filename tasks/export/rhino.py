@@ -8,6 +8,7 @@ whole-metre origin in plan; z is the height. Origin and CRS are in the document'
 from __future__ import annotations
 
 import base64
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -79,10 +80,9 @@ def load_rhino3dm() -> Any:
         If it is not installed.
     """
     try:
-        import rhino3dm
+        return import_module("rhino3dm")
     except ImportError as error:
         raise TaskError(f"3DM files need rhino3dm: {INSTALL}") from error
-    return rhino3dm
 
 
 def _texts(place: Georeference) -> dict[str, str]:

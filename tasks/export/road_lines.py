@@ -12,10 +12,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.vector_date import vector_date
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Floats
+
+pyogrio = lazy("pyogrio")
 
 VERSION = 1
 NAME = "_roads.gpkg"
@@ -105,11 +108,10 @@ def _column(values: list[Any]) -> NDArray[Any]:
 def _table(
     path: Path, layer: str, lines: NDArray[np.object_], columns: Mapping[str, Any], crs: str, new: bool
 ) -> None:
-    from pyogrio import raw
-    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, GeometryError
-
+    kinds = pyogrio.errors
+    unwritable = kinds.DataLayerError, kinds.DataSourceError, kinds.FeatureError, kinds.GeometryError
     try:
-        raw.write(
+        pyogrio.raw.write(
             path,
             geometry=shapely.to_wkb(lines, output_dimension=3),
             field_data=list(columns.values()),
@@ -121,5 +123,10 @@ def _table(
             append=not new,
             nan_as_null=True,
         )
-    except (DataLayerError, DataSourceError, FeatureError, GeometryError) as error:
+    except (
+        errors.DataLayerError,
+        errors.DataSourceError,
+        errors.FeatureError,
+        errors.GeometryError,
+    ) as error:
         raise TaskError(f"{path} cannot be written: {error}; check the disk") from error

@@ -12,7 +12,10 @@ import math
 import numpy as np
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Floats
+
+Image = lazy("PIL.Image")
 
 VERSION = 1
 NAME = ".pmtiles"
@@ -29,8 +32,6 @@ MAX_ZOOM = 24
 
 def encode_png(heights: Floats, no_height: float) -> bytes:
     """Return heights, ``(SIZE, SIZE)``, m, as PNG; pixels without one get ``no_height`` (m)."""
-    from PIL import Image
-
     steps = np.rint((np.where(np.isnan(heights), no_height, heights) + OFFSET_M) / STEP_M).astype(np.uint32)
     colours = np.stack([steps >> 16, steps >> 8 & 255, steps & 255], axis=-1).astype(np.uint8)
     encoded = io.BytesIO()

@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats
+
+Image = lazy("PIL.Image")
 
 VERSION = 2
 NAME_TILE, NAME_RUN, NAME_PICTURES = ".js", "run.js", "pictures.js"
@@ -110,8 +113,6 @@ def picture(height: Floats, road: Bools, cell: float) -> bytes:
     cell : float
         Size of a cell (m).
     """
-    from PIL import Image
-
     by_south, by_east = np.gradient(height, cell) if min(height.shape) > 1 else np.zeros((2, *height.shape))
     east, north, up = np.array(SUN) / np.linalg.norm(SUN)
     light = (-by_east * east + by_south * north + up) / np.sqrt(1 + by_east**2 + by_south**2)

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.report import quality
 from flexroad.pipeline.report.browser.compare import Comparison, compare
@@ -36,6 +37,8 @@ from flexroad.pipeline.report.pictures import tile_pictures
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.quality.assess import FLAGS, Options
+
+pyproj = lazy("pyproj")
 
 HERE = Path(__file__).parent
 SCRIPTS = ("colours.js", "map.js", "tables.js", "page.js")
@@ -205,12 +208,9 @@ def _script() -> str:
 
 def _crs_name(crs: str) -> str:
     """Return code and name of a CRS for the line below the map."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
     try:
-        name = CRS.from_user_input(crs).name
-    except CRSError:
+        name = pyproj.CRS.from_user_input(crs).name
+    except pyproj.exceptions.CRSError:
         return printable(crs)
     return printable(f"{crs} ({name})" if len(crs) < 20 else name)
 

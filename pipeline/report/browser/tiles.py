@@ -14,9 +14,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from flexroad.catalog import Tile
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import printable
 from flexroad.pipeline.report.content import Content
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD
+
+pyproj = lazy("pyproj")
 
 DIGITS = 4
 """Significant digits of the figures on the page."""
@@ -120,9 +123,6 @@ def _state(state: str, flags: Any) -> str:
 
 
 def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
-
     bounds = np.full((len(tiles), 4), np.nan)
     for i, tile in enumerate(tiles):
         if tile.fault:
@@ -130,9 +130,9 @@ def _bounds(tiles: Sequence[Tile], crs: str) -> NDArray[np.float64]:
         bounds[i] = tile.grid.bounds
         if tile.grid.crs != crs:
             try:
-                other = Transformer.from_crs(tile.grid.crs, crs, always_xy=True)
+                other = pyproj.Transformer.from_crs(tile.grid.crs, crs, always_xy=True)
                 bounds[i] = other.transform_bounds(*tile.grid.bounds)
-            except ProjError:
+            except pyproj.exceptions.ProjError:
                 bounds[i] = np.nan
     bounds[~np.isfinite(bounds).all(axis=1)] = np.nan
     return bounds
