@@ -34,7 +34,7 @@ HEADINGS = (
 
 def _address(value: str | None) -> str | None:
     """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
-    from flexroad.pipeline.execute.clusters import check_address
+    from flexroad.pipeline.execute.dask import check_address
 
     if value is not None:
         try:

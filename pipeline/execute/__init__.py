@@ -8,8 +8,7 @@ processes (``docs/decisions.md`` has the measurement against one task per stage)
 
 from flexroad.pipeline.execute.adaptive import AdaptiveExecutor, Jobs
 from flexroad.pipeline.execute.dask import DaskExecutor
-from flexroad.pipeline.execute.executor import Executor
-from flexroad.pipeline.execute.serial import SerialExecutor
+from flexroad.pipeline.execute.executor import Executor, SerialExecutor
 
 __all__ = [
     "AdaptiveExecutor",

@@ -4,26 +4,44 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import logging
-import re
+import time
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import dask
+from distributed import Client, LocalCluster
+from distributed.security import Security
+from distributed.utils import silence_logging_cmgr
+
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.settings import certificates, environment, settings, web_address
-from flexroad.pipeline.execute.start import extra, one_line, opened, start_workers
+from flexroad.pipeline.execute.slurm import slurm
+from flexroad.pipeline.execute.start import (
+    bytes_of_worker,
+    certificates,
+    environment,
+    extra,
+    one_line,
+    opened,
+    settings,
+    start_workers,
+    web_address,
+    workers_here,
+)
 
 GRACE_S = 10.0
 """How long a running scheduler may have no workers (s): a nanny may be replacing one."""
-ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}")
-"""Address of a scheduler."""
+ANSWER_S = 10.0
+"""How long a scheduler may take to answer (s)."""
 
 
 @dataclass(frozen=True)
@@ -42,21 +60,6 @@ class ClusterTarget:
     """What to do if no worker comes."""
     given_up: Callable[[], bool] = lambda: False
     """Returns whether no worker will come."""
-
-
-def check_address(address: str) -> None:
-    """Check that a text is the address of a scheduler.
-
-    Raises
-    ------
-    ConfigError
-        If it is not.
-    """
-    if not ADDRESS.fullmatch(address):
-        raise ConfigError(
-            f"{address!r} is no address of a Dask scheduler; give its host and port, as tcp://host:8786 or "
-            "tls://host:8786"
-        )
 
 
 @contextlib.contextmanager
@@ -78,15 +81,11 @@ def open_cluster(
         If a package or program is not installed, or the cluster cannot be started.
     """
     if scheduler:
-        check_address(scheduler)
         _check_certificates(scheduler)
         yield ClusterTarget(scheduler, f"the Dask scheduler at {scheduler}", GRACE_S, cluster.patience_s)
         return
     if workers:
         cluster = cluster.model_copy(update={"workers": workers})
-    import dask
-    import distributed  # noqa: F401 (its defaults would end with the settings if they came later)
-
     with contextlib.ExitStack() as stack:
         # Set until the cluster ends, so that workers that replace dead ones get the settings too.
         stack.enter_context(dask.config.set(settings(cluster, dashboard)))
@@ -94,9 +93,6 @@ def open_cluster(
             started = stack.enter_context(local(cluster, dashboard))
             yield ClusterTarget(started, "the local cluster", 0, cluster.patience_s)
         elif cluster.kind == "slurm":
-            # It imports Dask.
-            from flexroad.pipeline.execute.slurm import slurm
-
             jobs = stack.enter_context(slurm(cluster, dashboard, logs, say))
             yield ClusterTarget(
                 jobs.cluster,
@@ -125,8 +121,6 @@ def _check_certificates(scheduler: str) -> None:
     ConfigError
         If it has none, or cannot load them.
     """
-    from distributed.security import Security
-
     names = "distributed.comm.tls.ca-file, distributed.comm.tls.client.cert and .key"
     try:
         missing = Security().get_connection_args("client")["ssl_context"] is None
@@ -152,10 +146,6 @@ def local(cluster: Cluster, dashboard: bool) -> Iterator[Any]:
     ConfigError
         If the processes cannot be started.
     """
-    from distributed import LocalCluster
-
-    from flexroad.pipeline.execute.memory import bytes_of_worker, workers_here
-
     workers = workers_here(cluster)
     with ScratchFolder() as scratch, contextlib.ExitStack() as stack:
         make = partial(
@@ -234,3 +224,50 @@ def kubernetes_options(cluster: Cluster) -> dict[str, Any]:
         # If the client is killed, the cluster ends by itself after this many seconds.
         "idle_timeout": 900,
     }
+
+
+@contextlib.contextmanager
+def connected(target: ClusterTarget, dashboard: bool, say: Callable[[str], None]) -> Iterator[Client]:
+    """Connect to a cluster and wait for its first worker; say the address of the dashboard if it is wanted.
+
+    Raises
+    ------
+    ConfigError
+        If the scheduler does not answer, or no worker comes.
+    """
+    make = partial(Client, target.target, timeout=ANSWER_S, set_as_default=False)
+    with contextlib.ExitStack() as stack:
+        try:
+            client = stack.enter_context(opened(make))
+        except OSError as error:
+            raise ConfigError(f"{target.name} does not answer: {error}") from error
+        if dashboard:
+            say(_dashboard(client))
+        if not _any_worker(client, target):
+            raise ConfigError(f"{target.name} has no workers; {target.remedy}")
+        yield client
+
+
+def _any_worker(client: Client, target: ClusterTarget) -> bool:
+    end = time.monotonic() + target.start_s
+    with contextlib.suppress(OSError):
+        while not client.nthreads():
+            if time.monotonic() > end or target.given_up():
+                return False
+            time.sleep(0.2)
+        return True
+    return False
+
+
+def _dashboard(client: Client) -> str:
+    if importlib.util.find_spec("bokeh") is None:
+        return "no dashboard: it needs bokeh (pip install 'flexroad[dashboard]')"
+    return f"dashboard: {client.dashboard_link}"
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Silence Dask's messages on lost workers, schedulers and versions: FlexRoad reports these itself."""
+    with silence_logging_cmgr(logging.CRITICAL), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module="distributed")
+        yield

@@ -1,4 +1,4 @@
-"""The interface of all executors."""
+"""The interface of all executors, and the one without workers."""
 
 from __future__ import annotations
 
@@ -71,3 +71,18 @@ class Executor(Protocol):
         ClusterLost
             If the scheduler is gone, or all workers are gone for too long; results yielded before are valid.
         """
+
+
+class SerialExecutor:
+    """Runs one job after the other in this process."""
+
+    def map(
+        self,
+        function: Callable[[J], R],
+        jobs: Iterable[J],
+        lost: Callable[[J, str], R],
+        probe: Probe | None = None,
+    ) -> Generator[R, None, None]:
+        """Yield results in the order of the jobs; ``probe`` is not needed: there is no worker."""
+        for job in jobs:
+            yield function(job)

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
+
+dask = lazy("dask")
 Reader = Callable[[Any], NDArray[Any]]
 
 
@@ -39,8 +42,6 @@ def lazy_raster(
     -------
     dask.array.Array, (sum(heights), sum(widths))
     """
-    import dask.array
-
     block = partial(_block, read, dict(sources), tuple(heights), tuple(widths), np.dtype(dtype), fill)
     return dask.array.map_blocks(
         block, chunks=(tuple(heights), tuple(widths)), dtype=dtype, meta=np.empty((0, 0), dtype)

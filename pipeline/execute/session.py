@@ -29,10 +29,8 @@ from distributed.scheduler import KilledWorker, NoValidWorkerError, NoWorkerErro
 
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ClusterLost, ConfigError
-from flexroad.pipeline.execute.admission import Admission
 from flexroad.pipeline.execute.executor import J, Probe, R
-from flexroad.pipeline.execute.scheduler import task_function
-from flexroad.pipeline.execute.workers import work
+from flexroad.pipeline.execute.workers import Admission, task_function, work
 
 FORGET_KEYS_EVERY = 1000
 """Number of jobs after which Dask's cache of key names is cleared: it has 0.4 KB for each job."""

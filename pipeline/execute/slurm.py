@@ -23,8 +23,14 @@ from tornado.ioloop import PeriodicCallback
 from flexroad.catalog.text import count
 from flexroad.pipeline.config.cluster import DEFAULT_MEMORY_BYTES, Cluster
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.settings import certificates, environment, web_address
-from flexroad.pipeline.execute.start import extra, opened, start_workers
+from flexroad.pipeline.execute.start import (
+    certificates,
+    environment,
+    extra,
+    opened,
+    start_workers,
+    web_address,
+)
 
 CHECK_S = 15.0
 """Interval between questions to SLURM about the jobs (s)."""
@@ -153,7 +159,7 @@ def slurm(
         folder = stack.enter_context(_shared_folder(logs))
         security = stack.enter_context(_certificates(cluster, folder))
         options = slurm_options(cluster, dashboard, folder) | {"security": security}
-        make = partial(jobqueue.SLURMCluster, job_cls=_job_class(), **options)
+        make = partial(jobqueue.SLURMCluster, job_cls=_job_class(jobqueue), **options)
         jobs = SlurmJobs(stack.enter_context(opened(make)), folder, say)
         jobs.start(-(-(cluster.workers or 1) // cluster.per_job))
         stack.enter_context(jobs.watched())
@@ -240,11 +246,10 @@ def _certificates(cluster: Cluster, folder: Path) -> Iterator[Security | None]:
         shutil.rmtree(private, ignore_errors=True)
 
 
-def _job_class() -> Any:
+def _job_class(jobqueue: Any) -> Any:
     """Return the class of a job: Dask asserts at the end that jobs are closed; dask-jobqueue's never are."""
-    from dask_jobqueue.slurm import SLURMJob
 
-    class Job(SLURMJob):  # type: ignore[misc]
+    class Job(jobqueue.slurm.SLURMJob):  # type: ignore[misc]
         async def close(self) -> None:
             await super().close()
             self.status = Status.closed

@@ -1,4 +1,7 @@
-"""Setup and check of a worker before its first tile; runs in the worker processes."""
+"""Workers of a Dask cluster: their setup, their check before the first tile, and which of them may do jobs.
+
+What is sent to the scheduler is pickled by value, so that the scheduler needs no flexroad.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,10 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import socket
 import sys
+import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib.resources import files
@@ -16,10 +22,12 @@ from pathlib import Path
 from threading import Lock, local
 from typing import Any
 
-from distributed import WorkerPlugin
+from distributed import Client, SchedulerPlugin, WorkerPlugin, get_worker
 from distributed.protocol.pickle import dumps, loads
+from threadpoolctl import threadpool_limits
 
 from flexroad.pipeline import ONE_THREAD
+from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.executor import J, Probe, R
 
 PICKLING = ("python", "dask", "distributed", "cloudpickle")
@@ -132,8 +140,6 @@ def pin_threads() -> None:
     """Limit the libraries that this thread calls to one core: the other cores compute other tiles."""
     # The environment sets libraries that are loaded later; loaded ones are set by their own functions.
     os.environ.update(ONE_THREAD)
-    from threadpoolctl import threadpool_limits
-
     threadpool_limits(1)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
@@ -181,10 +187,166 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str:
     return ", ".join(f"{name} is {there[name]} there and {here[name]} here" for name in different)
 
 
-def version_error(process: str, different: str) -> str:
-    """Return the error message about a process with other versions."""
-    return f"{process}: {different}; {SAME}"
-
-
 def _comparable(name: str, version: str) -> str:
     return ".".join(version.split(".")[:2]) if name == "python" else version.split("+")[0]
+
+
+class Admission:
+    """Accepts the proofs of workers, and tells which workers are left out.
+
+    Parameters
+    ----------
+    probe : Probe, optional
+        The probe of the `WorkerCheck`.
+    say : callable
+        Prints one line for the user.
+    """
+
+    def __init__(self, probe: Probe | None, say: Callable[[str], None]) -> None:
+        self.probe = probe
+        self.say = say
+        self.left_out: dict[str, str] = {}
+        """Why a worker gets no jobs, in one line, by its address."""
+        self._accepted: dict[str, Any] = {}
+        """Accepted proofs by worker address."""
+        self._told: set[tuple[str, str]] = set()
+        """Host and reason of the workers left out: one line for all workers of a host."""
+
+    def able(self, present: Mapping[str, int]) -> dict[str, int]:
+        """Return those of the workers that are present, by address, that are not left out."""
+        # The address of a worker that has ended may be that of another one later.
+        self._accepted = {address: proof for address, proof in self._accepted.items() if address in present}
+        self.left_out = {address: line for address, line in self.left_out.items() if address in present}
+        return {address: n for address, n in present.items() if address not in self.left_out}
+
+    def accepts(self, address: str, host: str, fault: str, proof: Any) -> bool:
+        """Return whether a worker may do jobs, by what `WorkerCheck.admit` returned; else leave it out."""
+        if address in self.left_out:
+            # Its other jobs bring the same fault or proof.
+            return False
+        if self.probe and proof is not None and self._accepted.get(address) != proof:
+            try:
+                self.probe.accept(proof)
+                self._accepted[address] = proof
+            except OSError as error:
+                fault = reason_of(error)
+        if fault:
+            self.left_out[address] = f"worker {address} on {host} is left out: {fault}"
+            if (host, fault) not in self._told:
+                self._told.add((host, fault))
+                self.say(self.left_out[address])
+        return not fault
+
+
+def check_workers(client: Client, cluster: str, probe: Probe | None) -> str:
+    """Compare the versions that pickling needs, register the plugins; return the name of the `WorkerCheck`.
+
+    Raises
+    ------
+    ConfigError
+        If a process has other versions of these, or cannot load flexroad.
+    ClusterLost
+        If the scheduler no longer answers.
+    """
+    here = versions()
+    name = uuid.uuid4().hex[:8]
+    try:
+        _compare(client, here)
+        client.register_plugin(retry_blocker(client.id, name), name=f"flexroad-{name}")
+        _register(client, WorkerCheck(here, probe), name)
+    except ConfigError:
+        raise
+    except OSError as error:
+        raise ClusterLost(f"{cluster} went away before its first tile: {error}") from error
+    except Exception as error:
+        # Unpickling on the cluster may raise any type of error.
+        reason = " ".join(str(error).split()) or repr(error)
+        raise ConfigError(
+            f"{cluster} cannot load flexroad ({reason}); install it for the workers, and let the "
+            "scheduler accept plugins (distributed.scheduler.pickle)"
+        ) from error
+    return name
+
+
+def _register(client: Client, plugin: Any, name: str) -> None:
+    """Register a plugin on all workers; retried if a worker dies meanwhile."""
+    for retries_left in range(4, -1, -1):
+        try:
+            client.register_plugin(plugin, name=name)
+            return
+        except OSError:
+            if not retries_left:
+                raise
+            time.sleep(1)
+
+
+def _compare(client: Client, here: dict[str, str]) -> None:
+    """Compare the versions that Dask reports: with very different ones no plugin could be unpickled.
+
+    Raises
+    ------
+    ConfigError
+        If the versions of the scheduler or of a worker differ from those here.
+    """
+    here = {name: here[name] for name in PICKLING}
+    reported = client.get_versions(packages=list(PICKLING[1:]))
+    _compare_process("the scheduler", reported["scheduler"], here)
+    for address, worker in reported["workers"].items():
+        _compare_process(f"worker {address}", worker, here)
+
+
+def _compare_process(name: str, reported: Any, here: dict[str, str]) -> None:
+    there = {package: reported["packages"].get(package) or "missing" for package in here}
+    there["python"] = ".".join(reported["host"]["python"].split(".")[:3])
+    different = difference(there, here)
+    if different:
+        raise ConfigError(f"{name}: {different}; {SAME}")
+
+
+def task_function() -> Callable[[bytes, str, bool], tuple[str, str, str, Any, Any]]:
+    """Return the function of every task: it unpickles a call and runs it if the worker passed its check.
+
+    Its arguments are the pickled call, the name of the `WorkerCheck` and whether the client has accepted the
+    worker. It returns address and host of the worker, what `WorkerCheck.admit` returns, and the result, None
+    if the call did not run. A scheduler unpickles the tasks that it receives; a call that is already pickled
+    stays bytes there.
+    """
+
+    def run_task(packed: bytes, check: str, accepted: bool) -> tuple[str, str, str, Any, Any]:
+        worker = get_worker()
+        address, host = worker.address, socket.gethostname()
+        admit = getattr(worker.plugins.get(check), "admit", None)
+        if admit is None:
+            # An older version may have another `WorkerCheck`.
+            return address, host, "it cannot load this version of flexroad; install it there", None, None
+        fault, proof = admit(packed, accepted)
+        if fault or proof is not None:
+            return address, host, fault, proof, None
+        work, function, job = loads(packed)
+        return address, host, "", None, work(function, job)
+
+    return run_task
+
+
+def retry_blocker(client_id: str, check: str) -> SchedulerPlugin:
+    """Return a scheduler plugin that fails a client's tasks at the first death of their worker.
+
+    By default a scheduler retries such tasks on other workers (setting
+    ``distributed.scheduler.allowed-failures``), so that a tile that kills its worker would kill others, too.
+    Tasks of other clients are not affected. When the client disconnects or is killed, the plugins are
+    removed.
+    """
+
+    class RetryBlocker(SchedulerPlugin):  # type: ignore[misc]
+        def update_graph(self, scheduler: Any, *, client: str, tasks: list[Any], **_: Any) -> None:
+            if client == client_id:
+                for key in tasks:
+                    # With this count one more death of a worker fails the task.
+                    scheduler.tasks[key].suspicious = scheduler.allowed_failures
+
+        def remove_client(self, scheduler: Any, client: str) -> None:
+            if client == client_id:
+                scheduler.worker_plugins.pop(check, None)
+                scheduler.plugins.pop(f"flexroad-{check}", None)
+
+    return RetryBlocker()

@@ -14,7 +14,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.scratch import ScratchFolder
+
+requests = lazy("requests")
+urllib3 = lazy("urllib3")
 
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the request is repeated."""
@@ -60,16 +64,12 @@ def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None =
 
 
 def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
-    import requests
-    from requests.adapters import HTTPAdapter
-    from urllib3 import Retry
-
     try:
         # The rest of the address is often a secret: messages name only the host.
         scheme, host = urlsplit(url).scheme, urlsplit(url).hostname
     except ValueError:
         return "the web address cannot be read"
-    retry = Retry(
+    retry = urllib3.Retry(
         policy.retries,
         backoff_factor=policy.pause_s / 2,
         status_forcelist=BUSY,
@@ -79,7 +79,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
         raise_on_status=False,
     )
     with requests.Session() as session:
-        session.mount(f"{scheme}://", HTTPAdapter(max_retries=retry))
+        session.mount(f"{scheme}://", requests.adapters.HTTPAdapter(max_retries=retry))
         try:
             answer = session.post(
                 url,

@@ -8,15 +8,16 @@ import time
 from collections import Counter
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path
 
 if TYPE_CHECKING:
-    from prometheus_client import CollectorRegistry
-
     from flexroad.pipeline.run.summary import Summary
     from flexroad.pipeline.worker.tile import TileResult
+
+prometheus_client = lazy("prometheus_client")
 
 EVERY_S = 10.0
 """Interval between writes (s)."""
@@ -91,10 +92,8 @@ class Textfile:
         OSError
             If the folder does not exist or is not writable.
         """
-        from prometheus_client import generate_latest
-
         with self._lock:
-            text = generate_latest(self._registry())
+            text = prometheus_client.generate_latest(self._registry())
         # The library's own function would replace a device or a pipe by a file.
         with atomic_path(self.path) as temporary:
             temporary.write_bytes(text)
@@ -105,15 +104,15 @@ class Textfile:
             with contextlib.suppress(OSError):
                 self.write()
 
-    def _registry(self) -> CollectorRegistry:
-        from prometheus_client import CollectorRegistry, Gauge
-
-        registry = CollectorRegistry()
-        gauges: dict[str, Gauge] = {}
+    def _registry(self) -> Any:
+        registry = prometheus_client.CollectorRegistry()
+        gauges: dict[str, Any] = {}
 
         def gauge(name: str, meaning: str, value: float, **labels: str) -> None:
             if name not in gauges:
-                gauges[name] = Gauge(f"flexroad_{name}", meaning, ["run", *labels], registry=registry)
+                gauges[name] = prometheus_client.Gauge(
+                    f"flexroad_{name}", meaning, ["run", *labels], registry=registry
+                )
             gauges[name].labels(self.run, *labels.values()).set(value)
 
         pending = max(0, self.total - sum(self.states.values()))

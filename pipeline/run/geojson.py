@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import shapely
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import transformer
@@ -34,8 +35,6 @@ def write_states(run: Run, where: Location) -> None:
     OSError
         If the file cannot be written.
     """
-    from shapely import to_geojson
-
     variant = run.config.export.variants[0]
     with open_database(run) as database:
         rows = [_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)]
@@ -46,7 +45,7 @@ def write_states(run: Run, where: Location) -> None:
             "properties": {name: row.get(name) for name in COLUMNS},
             "geometry": json.loads(outline) if outline else None,
         }
-        for row, outline in zip(rows, to_geojson(outlines(run.catalog.tiles)), strict=True)
+        for row, outline in zip(rows, shapely.to_geojson(outlines(run.catalog.tiles)), strict=True)
     ]
     collection = {"type": "FeatureCollection", "features": features}
     write(where, json.dumps(collection).encode(), run.config.cluster.flush)
@@ -58,16 +57,16 @@ def outlines(tiles: Sequence[Tile]) -> Any:
     Polygons are anticlockwise; coordinates are rounded to 1e-7 degrees (about 1 cm). Tiles of one CRS are
     transformed together. Tiles without a known position (`Tile.fault`) have None.
     """
-    from shapely import box, is_valid, transform
-
-    shapes = np.array([None if tile.fault else box(*tile.grid.bounds) for tile in tiles], object)
+    shapes = np.array([None if tile.fault else shapely.box(*tile.grid.bounds) for tile in tiles], object)
     crs_of_tile = np.array([tile.grid.crs for tile in tiles], object)
     for crs in set(crs_of_tile[shapes != None]):  # noqa: E711 (of each shape)
         selected = crs_of_tile == crs
         convert = transformer(crs, "EPSG:4326").transform
-        shapes[selected] = transform(shapes[selected], convert, interleaved=False)
+        shapes[selected] = shapely.transform(shapes[selected], convert, interleaved=False)
     # Beyond the range of a CRS coordinates are infinite.
-    return np.where(is_valid(shapes), transform(shapes, lambda degrees: degrees.round(7)), None)
+    return np.where(
+        shapely.is_valid(shapes), shapely.transform(shapes, lambda degrees: degrees.round(7)), None
+    )
 
 
 def _row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from flexroad.catalog.storage.paths import Location, read
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.lock_file import LockFile, LockStat, OnDisk
+from flexroad.pipeline.run.lock_file import LockFile, LockStat, lock_file
 
 NAME = "lock.json"
 TRIES = 20
@@ -134,7 +134,7 @@ def run_lock(
     ConfigError
         If another process holds the lock, or the folder is not writable.
     """
-    lock = _Lock(run, _lock_file(run / NAME), Owner.me(), notify, heartbeat or Heartbeat())
+    lock = _Lock(run, lock_file(run / NAME), Owner.me(), notify, heartbeat or Heartbeat())
     try:
         lock.take()
     except FileNotFoundError as error:
@@ -273,14 +273,6 @@ class _Lock:
             f"{text}, last sign of life {abs(current.age_s):.0f} s ago; "
             f"if it is dead, the same command takes over {self.heartbeat.stale_s:.0f} s after the last one"
         )
-
-
-def _lock_file(path: Location) -> LockFile:
-    if isinstance(path, Path):
-        return OnDisk(path)
-    from flexroad.pipeline.run.lock_object import InBucket
-
-    return InBucket(path)
 
 
 def _name(holder: Owner | None) -> str:

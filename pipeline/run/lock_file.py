@@ -1,19 +1,28 @@
 """The file of a lock: created only if it does not exist, replaced only if unchanged since it was read.
 
-Its age is measured with the clock of the storage: the time of a file written now minus its own time.
+In object storage, conditional requests create and replace it. Its age is measured with the clock of the
+storage: the time of a file written now minus its own time.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import tempfile
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from flexroad.catalog.storage.paths import write
+from flexroad.catalog.storage.paths import Location, named, read, remove, write
+
+if TYPE_CHECKING:
+    from upath import UPath
+
+REFUSED = (409, 412)
+"""HTTP status of a rejected conditional request: a conflicting request, or the condition is not met."""
 
 
 @dataclass(frozen=True)
@@ -115,3 +124,71 @@ class OnDisk:
         except FileNotFoundError:
             return False
         return same_file and file.read() == expected.data
+
+
+@dataclass(frozen=True)
+class InBucket:
+    """A lock file in a bucket."""
+
+    path: UPath
+
+    def create(self, data: bytes) -> bool:
+        """Create the object; False if it exists."""
+        try:
+            return self._put(data, REFUSED, IfNoneMatch="*")
+        except FileNotFoundError as error:
+            raise OSError(errno.EIO, "there is no such bucket", str(self.path)) from error
+
+    def read(self) -> LockStat | None:
+        """Return content, age and ETag of the object, None if it does not exist."""
+        bucket, key, _ = self.path.fs.split_path(self.path.path)
+        try:
+            with named(self.path):
+                head = self.path.fs.call_s3("head_object", Bucket=bucket, Key=key)
+            data = read(self.path)
+        except FileNotFoundError:
+            return None
+        written = head["LastModified"].timestamp()
+        # The server's time is a header of every response.
+        now = parsedate_to_datetime(head["ResponseMetadata"]["HTTPHeaders"]["date"]).timestamp()
+        return LockStat(data, written, now - written, head["ETag"])
+
+    def replace(self, expected: LockStat, data: bytes) -> bool:
+        """Replace the content; False if the object has changed since ``expected`` was read."""
+        return self._put(data, (404, *REFUSED), IfMatch=expected.version)
+
+    def renew(self, expected: LockStat) -> None:
+        """Set the object's time to now, by writing the same content."""
+        self.replace(expected, expected.data)
+
+    def remove(self, expected: LockStat) -> None:
+        """Remove the object; the caller has just read it."""
+        # Not all storages support conditional deletion. Another process takes a lock over only if it has not
+        # been renewed for minutes.
+        remove(self.path)
+
+    def _put(self, data: bytes, refusals: tuple[int, ...], **condition: str) -> bool:
+        """Write the object under a condition; False if the storage answers with one of ``refusals``."""
+        try:
+            with named(self.path):
+                self.path.fs.pipe_file(self.path.path, data, **condition)
+        except OSError as error:
+            if _status(error) in refusals:
+                return False
+            raise
+        return True
+
+
+def _status(error: BaseException | None) -> int | None:
+    """Return the HTTP status of an error or of its causes, None if it has none."""
+    while error is not None:
+        response: dict[str, Any] | None = getattr(error, "response", None)
+        if isinstance(response, dict):
+            return int(response["ResponseMetadata"]["HTTPStatusCode"])
+        error = error.__cause__
+    return None
+
+
+def lock_file(path: Location) -> LockFile:
+    """Return a lock file on disk or in a bucket."""
+    return OnDisk(path) if isinstance(path, Path) else InBucket(path)

@@ -9,6 +9,7 @@ from dataclasses import fields
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location, exists, read
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import access_reason, no_formula
@@ -17,6 +18,9 @@ from flexroad.pipeline.store.records import Failure, MetricsRow
 
 if TYPE_CHECKING:
     import pandas as pd
+
+pandas = lazy("pandas")
+pyarrow = lazy("pyarrow")
 
 METRICS, PREVIOUS = "metrics.parquet", "metrics.previous.parquet"
 """Tables of a run, and before its last execution."""
@@ -74,8 +78,6 @@ def _schema() -> Any:
 
     It is made without pandas, which would take a quarter of the start of a run.
     """
-    import pyarrow as pa
-
     described = [
         {
             "name": name,
@@ -87,8 +89,8 @@ def _schema() -> Any:
         for name, kind in COLUMNS.items()
     ]
     about = {"index_columns": [], "column_indexes": [], "columns": described, "pandas_version": "3.0.0"}
-    names = ((name, pa.type_for_alias(IN_ARROW[kind])) for name, kind in COLUMNS.items())
-    return pa.schema(names, {"pandas": json.dumps(about)})
+    names = ((name, pyarrow.type_for_alias(IN_ARROW[kind])) for name, kind in COLUMNS.items())
+    return pyarrow.schema(names, {"pandas": json.dumps(about)})
 
 
 def write_tables(
@@ -103,12 +105,10 @@ def write_tables(
     OSError
         If they cannot be written, for example on a full disk.
     """
-    import pyarrow.parquet as pq
-
     schema = _schema()
     with (
         atomic_file(run / METRICS, flushed) as path,
-        pq.ParquetWriter(path, schema, write_page_checksum=True) as table,
+        pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True) as table,
     ):
         for chunk in _chunks(rows):
             table.write_table(_table(chunk, schema))
@@ -121,23 +121,18 @@ def write_tables(
 
 def csv_text(table: pd.DataFrame, **options: Any) -> str:
     """Return a table as CSV in which no text is a formula (`no_formula`); ``options`` as of pandas."""
-    from pandas.api.types import is_numeric_dtype
-
     safe = table.set_axis([no_formula(name) for name in table.columns], axis="columns")
     for number, kind in enumerate(table.dtypes):
-        if not is_numeric_dtype(kind):
+        if not pandas.api.types.is_numeric_dtype(kind):
             safe.isetitem(number, [no_formula(value) for value in table.iloc[:, number]])
     return str(safe.to_csv(index=False, **options))
 
 
 def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
     """Return rows as a table: by way of JSON, because pyarrow imports pandas to read Python objects."""
-    import pyarrow as pa
-    import pyarrow.json
-
     lines = "\n".join(json.dumps(row, allow_nan=False) for row in rows).encode()
     table = pyarrow.json.read_json(
-        pa.BufferReader(lines),
+        pyarrow.BufferReader(lines),
         # Reader threads may still be alive when a short process ends, and would abort it.
         pyarrow.json.ReadOptions(use_threads=False, block_size=len(lines) + 1),
         pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
@@ -147,9 +142,7 @@ def _table(rows: Sequence[MetricsRow], schema: Any) -> Any:
 
 def metrics_frame(rows: Sequence[MetricsRow]) -> pd.DataFrame:
     """Return the rows as a table with the columns of metrics.parquet."""
-    import pandas as pd
-
-    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
+    frame: pd.DataFrame = pandas.DataFrame(list(rows), columns=list(COLUMNS))
     return frame.astype(COLUMNS)
 
 
@@ -197,10 +190,9 @@ def frame_of(data: bytes) -> pd.DataFrame:
     OSError, ValueError
         If they are not a Parquet file.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     # pandas.read_parquet starts threads; those still running when a short command exits can abort it.
-    file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
+    file = pyarrow.parquet.ParquetFile(
+        pyarrow.BufferReader(data), pre_buffer=False, page_checksum_verification=True
+    )
     table: pd.DataFrame = file.read(use_threads=False).to_pandas(use_threads=False)
     return table

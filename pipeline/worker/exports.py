@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
+
+rasterio = lazy("rasterio")
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,6 @@ def _ply(
 def _cog(
     graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
 ) -> dict[Kind, bytes]:
-    import rasterio
-
     core, road, surface = graph.tile.grid, evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)

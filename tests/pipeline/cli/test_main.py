@@ -243,7 +243,7 @@ def test_run_with_failed_tile_exits_with_1(survey, tmp_path):
     ],
 )
 def test_command_that_cannot_start_exits_with_2(words, message, made_survey, tmp_path, monkeypatch):
-    monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
+    monkeypatch.setattr("flexroad.pipeline.execute.clusters.ANSWER_S", 1)
     (tmp_path / "file").write_text("")
     places = {
         "CAT": made_survey / "catalog.parquet",

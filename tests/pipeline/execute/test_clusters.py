@@ -221,7 +221,7 @@ def test_map_workers_that_fail_the_probe_raise(running):
 
 
 def test_map_scheduler_that_does_not_answer_raises(monkeypatch):
-    monkeypatch.setattr("flexroad.pipeline.execute.dask.ANSWER_S", 1)
+    monkeypatch.setattr("flexroad.pipeline.execute.clusters.ANSWER_S", 1)
     with pytest.raises(ConfigError, match=r"scheduler at tcp://127.0.0.1:9 does not answer"):
         list(DaskExecutor(scheduler="tcp://127.0.0.1:9").map(double, [1], lost))
 
@@ -265,7 +265,7 @@ def test_local_workers_share_the_memory_and_may_be_silent(monkeypatch):
     from dask.utils import parse_timedelta
     from distributed import Client
 
-    monkeypatch.setattr("flexroad.pipeline.execute.memory.MEMORY_LIMIT", 2 * 1024**3)
+    monkeypatch.setattr("flexroad.pipeline.execute.start.MEMORY_LIMIT", 2 * 1024**3)
     with (
         open_cluster(Cluster(workers=2), None, None, False) as target,
         Client(target.target, set_as_default=False) as client,

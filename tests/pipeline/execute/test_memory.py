@@ -2,14 +2,14 @@
 
 import pytest
 
-from flexroad.pipeline.execute import memory
+from flexroad.pipeline.execute import start
 
 MIB = 2**20
 
 
 @pytest.fixture
 def available(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "MEMORY_LIMIT", 900 * MIB)
+    monkeypatch.setattr(start, "MEMORY_LIMIT", 900 * MIB)
 
     def call(name: str, **limits: str) -> int:
         """Return the memory of a process in the control group ``name``; ``limits`` by file, / as __."""
@@ -18,7 +18,7 @@ def available(tmp_path, monkeypatch):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
         (tmp_path / "own").write_text(name)
-        return memory.available_bytes(tmp_path, tmp_path / "own")
+        return start.available_bytes(tmp_path, tmp_path / "own")
 
     return call
 

@@ -13,7 +13,8 @@ import pytest
 from flexroad.pipeline.config.cluster import Cluster
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor
-from flexroad.pipeline.execute.clusters import check_address, open_cluster
+from flexroad.pipeline.execute.clusters import open_cluster
+from flexroad.pipeline.execute.dask import check_address
 
 # Workers cannot import this test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

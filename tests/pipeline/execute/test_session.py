@@ -149,7 +149,7 @@ class WorkingClient(Client):
             future.status = "pending"
             return future
         worker = able[next(self.turns) % len(able)]
-        self.patch.setattr("distributed.get_worker", lambda: worker)
+        self.patch.setattr("flexroad.pipeline.execute.workers.get_worker", lambda: worker)
         answer = function(packed, check, accepted)
         if worker.dies and answer[-1] is not None:
             self._replace(worker)

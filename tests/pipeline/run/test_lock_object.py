@@ -91,7 +91,7 @@ def test_lock_requested_by_many_is_taken_by_one(stale, run):
 
 def test_create_with_lost_response_takes_lock(run, monkeypatch):
     """The lock was created but the response was lost; the repeated request is rejected."""
-    from flexroad.pipeline.run.lock_object import InBucket
+    from flexroad.pipeline.run.lock_file import InBucket
 
     create = InBucket.create
     monkeypatch.setattr(InBucket, "create", lambda self, data: create(self, data) and create(self, data))
