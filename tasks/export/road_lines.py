@@ -123,10 +123,5 @@ def _table(
             append=not new,
             nan_as_null=True,
         )
-    except (
-        errors.DataLayerError,
-        errors.DataSourceError,
-        errors.FeatureError,
-        errors.GeometryError,
-    ) as error:
+    except unwritable as error:
         raise TaskError(f"{path} cannot be written: {error}; check the disk") from error
