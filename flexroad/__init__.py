@@ -16,10 +16,9 @@ if TYPE_CHECKING:
     from flexroad.catalog.errors import CatalogError
     from flexroad.pipeline.benchmark.example import example
     from flexroad.pipeline.errors import ConfigError
-    from flexroad.pipeline.inspect.fit import fit
-    from flexroad.pipeline.inspect.process import catalog_from, run
-    from flexroad.pipeline.inspect.run import RunView, open_run
-    from flexroad.pipeline.inspect.surface import Surface, open_surface
+    from flexroad.pipeline.results.process import catalog_from, run
+    from flexroad.pipeline.results.run import RunView, open_run
+    from flexroad.pipeline.results.surface import Surface, fit, open_surface
     from flexroad.pipeline.run.observer import Observer
     from flexroad.tasks.errors import TaskError
 
@@ -45,15 +44,15 @@ _HOME = {
     "CatalogError": "catalog.errors",
     "ConfigError": "pipeline.errors",
     "Observer": "pipeline.run.observer",
-    "RunView": "pipeline.inspect.run",
-    "Surface": "pipeline.inspect.surface",
+    "RunView": "pipeline.results.run",
+    "Surface": "pipeline.results.surface",
     "TaskError": "tasks.errors",
-    "catalog_from": "pipeline.inspect.process",
+    "catalog_from": "pipeline.results.process",
     "example": "pipeline.benchmark.example",
-    "fit": "pipeline.inspect.fit",
-    "open_run": "pipeline.inspect.run",
-    "open_surface": "pipeline.inspect.surface",
-    "run": "pipeline.inspect.process",
+    "fit": "pipeline.results.surface",
+    "open_run": "pipeline.results.run",
+    "open_surface": "pipeline.results.surface",
+    "run": "pipeline.results.process",
 }
 """The module of each public name, below this package."""
 

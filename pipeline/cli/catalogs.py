@@ -303,9 +303,9 @@ def catalog_check(
     Prints layers, what would fail in a run, and the shift between photo and heights.
     """
     from flexroad.catalog import Catalog
+    from flexroad.pipeline.check.catalog import check
     from flexroad.pipeline.config.loading import load_config
     from flexroad.pipeline.graph.layers import fitting_config
-    from flexroad.pipeline.inspect.catalog import check
 
     catalog, faults = Catalog.read(path, allow or ()), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog))):

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator
 
 from flexroad.catalog import Tile
 from flexroad.catalog.text import count
+from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.reasons import Kind, reason
 from flexroad.pipeline.execute.adaptive import Estimate, decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.inspect.failures import expected_failures
-from flexroad.pipeline.inspect.reasons import Kind, reason
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses

@@ -15,8 +15,7 @@ from flexroad.pipeline.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from flexroad.pipeline.inspect.downloads import Download
-    from flexroad.pipeline.inspect.proposals import Proposal
+    from flexroad.pipeline.check.downloads import Download, Proposal
 
 MAX_SHOWN = 5
 """Number of files of a kind that are described."""
@@ -49,8 +48,7 @@ def init(
 
     Asks what is unclear. The commands make a catalog of the files and run it.
     """
-    from flexroad.pipeline.inspect.downloads import MAX_FILES, look
-    from flexroad.pipeline.inspect.proposals import proposals
+    from flexroad.pipeline.check.downloads import MAX_FILES, look, proposals
 
     found, more = look(folder)
     if more:

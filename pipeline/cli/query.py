@@ -87,10 +87,9 @@ def query(
     The output is CSV: the columns of the points and height_m, nx, ny, nz, tile and class; with --line also
     distance and grade.
     """
-    from flexroad.pipeline.inspect.answers import along_lines, at_points, beyond_survey, outside, required_crs
-    from flexroad.pipeline.inspect.point_files import LONLAT, parse_csv, read_points
-    from flexroad.pipeline.inspect.points import Ground
-    from flexroad.pipeline.inspect.profile import read_lines
+    from flexroad.pipeline.results.points import Ground
+    from flexroad.pipeline.results.query import along_lines, at_points, beyond_survey, outside, required_crs
+    from flexroad.pipeline.results.query_files import LONLAT, parse_csv, read_lines, read_points
 
     if (points is None) == (line is None):
         raise ConfigError("give the points with --points FILE, or a line with --line")

@@ -9,9 +9,9 @@ from pyproj import Transformer
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.catalog.sources.rasters import index
 from flexroad.catalog.tiling import Conversion
+from flexroad.pipeline.check.catalog import expected_failures
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.sources import SourceFiles
-from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.tasks import load
 from tests.make_rasters import write
 

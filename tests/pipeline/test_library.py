@@ -29,10 +29,9 @@ ROOT = Path(__file__).parents[2]
 MODULES = [
     "flexroad",
     "flexroad.pipeline.benchmark.example",
-    "flexroad.pipeline.inspect.fit",
-    "flexroad.pipeline.inspect.process",
-    "flexroad.pipeline.inspect.run",
-    "flexroad.pipeline.inspect.surface",
+    "flexroad.pipeline.results.process",
+    "flexroad.pipeline.results.run",
+    "flexroad.pipeline.results.surface",
 ]
 CENTRE = 500210.0, 5600030.0
 

@@ -11,7 +11,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.inspect.run import open_run
+from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary

@@ -7,7 +7,6 @@ import pytest
 
 import flexroad as library
 from flexroad.catalog import Catalog, CatalogError
-from flexroad.pipeline.inspect.tile import open_tile
 
 
 @pytest.fixture
@@ -72,9 +71,9 @@ def test_run_from_another_user_needs_allow(flexroad, survey, quick_config, tmp_p
     ):
         assert "--allow" in flexroad(*words).expected(2).err, words
         flexroad(*words, *option).expected(0)
-    with pytest.raises(CatalogError, match="--allow"):
-        open_tile(run, tile.id)
     view = library.open_run(run)
+    with pytest.raises(CatalogError, match="--allow"):
+        view.tile(tile.id)
     with pytest.raises(CatalogError, match="--allow"):
         view.height(tile.grid.west + 9, tile.grid.south + 9)
     allowed = library.open_run(run, allow=[survey.parent])

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.inspect.run import open_run
+from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.store.tables import read_metrics
 from tests import bad_entries
 from tests.bad_entries import CHANGES, Change, cases

@@ -17,9 +17,9 @@ from flexroad.pipeline.cli.main import main
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.inspect.points import Ground
-from flexroad.pipeline.inspect.tile import open_tile
 from flexroad.pipeline.report import write_report
+from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.run.status import summary
@@ -137,7 +137,7 @@ def test_report_tile_and_ground_of_run_in_bucket(run, local):
     assert (summary(opened).done, summary(opened).exit_code) == (4, 0)
     assert paths.read(write_report(opened, "html"))
     tile = opened.catalog.tiles[0]
-    assert open_tile(str(run.path), tile.id).identical(open_tile(local.path, tile.id))
+    assert open_run(str(run.path)).tile(tile.id).identical(open_run(local.path).tile(tile.id))
     east, north = tile.grid.west + 10.3, tile.grid.north - 20.7
     actual, expected = (Ground.open(each.path).at(east, north) for each in (run, local))
     assert actual.height == expected.height

@@ -15,8 +15,8 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.export.viewer import write_viewer
-from flexroad.pipeline.inspect.points import Ground
 from flexroad.pipeline.report.content import gather
+from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.run.garbage import find_garbage
 from flexroad.pipeline.run.geojson import write_states
 from flexroad.pipeline.run.record import Run

@@ -1,6 +1,6 @@
 """Heights, normals, tiles and classes of a run at points.
 
->>> from flexroad.pipeline.inspect.points import Ground
+>>> from flexroad.pipeline.results.points import Ground
 >>> ground = Ground.open("RUN")                       # doctest: +SKIP
 >>> ground.at(eastings, northings).height             # doctest: +SKIP
 """

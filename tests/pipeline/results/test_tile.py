@@ -5,18 +5,17 @@ from flexroad.catalog import Catalog, CatalogError
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.inspect.points import Ground
-from flexroad.pipeline.inspect.run import open_run
-from flexroad.pipeline.inspect.tile import open_tile
+from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.results.run import open_run
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 
 
-def test_open_tile_returns_inputs_masks_and_surface(survey, quick_config, tmp_path):
+def test_tile_of_run_returns_inputs_masks_and_surface(survey, quick_config, tmp_path):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == run.catalog.tiles[0])
     tile = run.catalog.tiles[0]
-    dataset = open_tile(run.path, tile.id)
+    dataset = open_run(run.path).tile(tile.id)
     assert set(dataset.data_vars) == {
         "dsm", "dtm", "reference", "reference_road", "road", "road_filtered", "surface",
     }  # fmt: skip
@@ -26,18 +25,18 @@ def test_open_tile_returns_inputs_masks_and_surface(survey, quick_config, tmp_pa
     east, north = np.meshgrid(dataset.x, dataset.y)
     height = Ground.open(run.path).at(east.ravel(), north.ravel()).height
     assert np.allclose(dataset.surface.values.ravel(), height, atol=1e-9)
-    assert np.array_equal(open_tile(run.path, tile.id, "rgt").surface, dataset.dsm)
+    assert np.array_equal(open_run(run.path, "rgt").tile(tile.id).surface, dataset.dsm)
     with pytest.raises(ConfigError, match="no variant 'x'"):
-        open_tile(run.path, tile.id, "x")
+        open_run(run.path, "x").tile(tile.id)
     with pytest.raises(CatalogError, match="did you mean"):
-        open_tile(run.path, "1_1")
+        open_run(run.path).tile("1_1")
 
 
 def test_tile_of_an_opened_run_does_not_open_the_run_again(survey, quick_config, tmp_path, monkeypatch):
     run = Run.create(tmp_path / "run", load_config(quick_config), Catalog.read(survey))
     tile = run.catalog.tiles[0]
     run_tiles(run, SerialExecutor(), only=lambda other: other == tile)
-    view, expected = open_run(run.path), open_tile(run.path, tile.id)
+    view, expected = open_run(run.path), open_run(run.path).tile(tile.id)
 
     def opened(*arguments):
         raise AssertionError("the run is opened again")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import shapely
 from flexroad.catalog.crs import in_plan, is_geographic, same, short, transformer
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks import memory
@@ -24,6 +26,9 @@ from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyogrio
+else:
+    pd, pyogrio = lazy("pandas"), lazy("pyogrio")
 
 LONLAT = "EPSG:4326"
 VECTOR_SUFFIXES = (".gpkg", ".geojson", ".json", ".fgb", ".shp")
@@ -31,6 +36,8 @@ VECTOR_SUFFIXES = (".gpkg", ".geojson", ".json", ".fgb", ".shp")
 METRES = (("easting", "northing"), ("x", "y"))
 DEGREES = (("longitude", "latitude"), ("lon", "lat"))
 """Names of coordinate columns, in any case: first east, then north."""
+_COORDINATES = re.compile(r"[-+.\deE\s,]+")
+"""A line given by its vertices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +113,6 @@ def parse_csv(data: bytes, name: str, given: str | None = None) -> Points:
         If the text is not UTF-8, a column is missing, a line has too many values, or a coordinate is not a
         number.
     """
-    import pandas as pd
-
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -188,8 +193,6 @@ def read_features(path: Path, given: str | None, layer: str | None) -> Any:
     ConfigError
         See `read_points`.
     """
-    import pyogrio
-
     try:
         file = vector_name(path)
         memory.check(WHOLE * path.stat().st_size, f"{path}, read as a whole,", "split it", str(path))
@@ -215,8 +218,6 @@ def read_features(path: Path, given: str | None, layer: str | None) -> Any:
 
 
 def _points(table: Any, path: Path) -> Points:
-    import pandas as pd
-
     table = table.explode(index_parts=False, ignore_index=True)
     shapes = table.geometry.to_numpy()
     others = [shape.geom_type for shape in shapes if shape is not None and shape.geom_type != "Point"]
@@ -224,6 +225,62 @@ def _points(table: Any, path: Path) -> Points:
         raise ConfigError(f"{path}: has features of the type {others[0]}, not points; lines go to --line")
     attributes = pd.DataFrame(table.drop(columns=table.geometry.name))
     return Points(attributes, shapely.get_x(shapes), shapely.get_y(shapes), table.crs.to_wkt(), vector=True)
+
+
+def read_lines(given: str, crs: str | None, layer: str | None, run_crs: str) -> list[Floats]:
+    """Return the vertices of lines, ``(n, 2)`` each, easting and northing (m) in the CRS of a run.
+
+    A line is straight between its vertices in the CRS of the run.
+
+    Parameters
+    ----------
+    given : str
+        A vector file of lines, or the vertices of one line: ``"x y, x y"``. Parts of one feature that touch
+        at their ends are one line.
+    crs : str or None
+        CRS of the lines, as the user says it; None: that of the file, or for vertices that of the run.
+    layer : str or None
+        Layer of a vector file; needed if it has several.
+    run_crs : str
+        CRS of the result.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no line, the file cannot be read or has no lines, or a line cannot be transformed.
+    """
+    if _COORDINATES.fullmatch(given) and not Path(given).exists():
+        lines, source = [_vertices(given)], crs
+    else:
+        lines, source = _features(Path(given), crs, layer)
+    projected = [np.column_stack(to_crs(line[:, 0], line[:, 1], source, run_crs)) for line in lines]
+    if not all(np.isfinite(line).all() for line in projected):
+        raise ConfigError(f"--line {shown(given)}: cannot be transformed to {short(run_crs)}; check its CRS")
+    long = [line for line in projected if np.ptp(line, axis=0).any()]
+    if not long:
+        raise ConfigError(f"--line {shown(given)}: has no length; give at least two different points")
+    return long
+
+
+def _vertices(text: str) -> Floats:
+    try:
+        return np.array([[float(x), float(y)] for x, y in (part.split() for part in text.split(","))])
+    except ValueError:
+        raise ConfigError(
+            f"--line {shown(text)}: is neither a file nor the points of a line, "
+            'such as "500010 5600010, 500050 5600030"'
+        ) from None
+
+
+def _features(path: Path, crs: str | None, layer: str | None) -> tuple[list[Floats], str]:
+    """Return the vertices of the lines of a vector file, and their CRS."""
+    table = read_features(path, crs, layer)
+    shapes = [shape for shape in table.geometry if shape is not None and not shape.is_empty]
+    others = [shape.geom_type for shape in shapes if not shape.geom_type.endswith("LineString")]
+    if others:
+        raise ConfigError(f"{path}: has features of the type {others[0]}, not lines; points go to --points")
+    merged = [shapely.line_merge(shape) for shape in shapes]
+    return [shapely.get_coordinates(part) for part in shapely.get_parts(merged)], table.crs.to_wkt()
 
 
 def to_crs(x: Floats, y: Floats, source: str | None, target: str) -> tuple[Floats, Floats]:

@@ -6,32 +6,40 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 
-from flexroad.catalog import Bounds
+from flexroad.catalog import Bounds, Tile
+from flexroad.catalog.grid import overlap
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import exists, read
 from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.inspect.assembled import assembled
-from flexroad.pipeline.inspect.mosaic import LAYERS, Mosaic
-from flexroad.pipeline.inspect.points import Answer, Ground
-from flexroad.pipeline.inspect.surface import Surface
-from flexroad.pipeline.inspect.tile import tile_dataset
+from flexroad.pipeline.graph.borders import has_borders
+from flexroad.pipeline.results.mosaic import LAYERS, Mosaic
+from flexroad.pipeline.results.points import Answer, Ground
+from flexroad.pipeline.results.surface import Surface, placed
 from flexroad.pipeline.run.conductor import Workers, process, reopened
-from flexroad.pipeline.run.finished import open_variant
+from flexroad.pipeline.run.finished import FinishedTile, open_variant
 from flexroad.pipeline.run.observer import Observer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tasks import sample
+from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import geopandas
     import pandas as pd
     import xarray as xr
+else:
+    geopandas, pd, xr = lazy("geopandas"), lazy("pandas"), lazy("xarray")
+
+HEIGHTS = {"units": "m"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,19 +84,16 @@ class RunView:
         0  499980_5599980     done
         1  500040_5599980  pending
         """
-        import geopandas
-        import shapely
-
         tiles = self.run.catalog.tiles
         states = [
             "done" if status.done else "failed" if status.failed else "pending"
             for status in peek_statuses(self.run, tiles)
         ]
-        placed = self.run.catalog.usable
+        usable = self.run.catalog.usable
         return geopandas.GeoDataFrame(
             {"id": [tile.id for tile in tiles], "state": states},
             geometry=[None if tile.fault else shapely.box(*tile.grid.bounds) for tile in tiles],
-            crs=placed[0].grid.crs if placed else None,
+            crs=usable[0].grid.crs if usable else None,
         )
 
     @property
@@ -130,8 +135,6 @@ class RunView:
         >>> len(flexroad.open_run("runs/city").failures)
         0
         """
-        import pandas as pd
-
         path = self.run.path / "failures.csv"
         if not exists(path):
             raise ConfigError(f"{path} does not exist; `flexroad rerun {self.run.path}` finishes the run")
@@ -228,9 +231,6 @@ class RunView:
         >>> bool(raster.height.isnull().sum() == 20 * 30)
         True
         """
-        import rioxarray  # noqa: F401 (gives datasets their .rio)
-        import xarray as xr
-
         exported = self.run.config.export
         if "cog" not in exported.formats or self.variant not in exported.variants:
             raise ConfigError(
@@ -240,13 +240,12 @@ class RunView:
         grid = mosaic.grid
         raster = xr.Dataset(
             {
-                "height": (("y", "x"), mosaic.layer(LAYERS["height"]), {"units": "m"}),
+                "height": (("y", "x"), mosaic.layer(LAYERS["height"]), HEIGHTS),
                 "road": (("y", "x"), mosaic.layer(LAYERS["road"])),
             },
             coords={"x": grid.eastings, "y": grid.northings},
         )
-        placed: xr.Dataset = raster.rio.write_crs(grid.crs).rio.write_transform(grid.transform)
-        return placed
+        return placed(raster, grid.crs, grid.transform)
 
     def surface(self, bounds: Bounds | None = None) -> Surface:
         """Return the surface of several finished tiles as one, with one lattice of control points.
@@ -281,7 +280,27 @@ class RunView:
         >>> bool(abs(surface.height(500010.0, 5600030.0) - run.height(500010.0, 5600030.0)) < 1e-9)
         True
         """
-        return assembled(self.run, self.variant, bounds)
+        fit = self.run.config.chains[self.variant]["fit"]
+        if not has_borders(fit):
+            raise ConfigError(
+                f"{self.run.path}: the tiles of {self.variant} have no common surface; fit.method "
+                "smoothing_spline makes one. The heights of single tiles are in open_run(...).height"
+            )
+        tiles = [
+            tile for tile in self.run.catalog.usable if bounds is None or overlap(tile.grid.bounds, bounds)
+        ]
+        done = [status for status in peek_statuses(self.run, tiles) if status.done]
+        if not done:
+            raise ConfigError(
+                f"{self.run.path} has no finished tile in {bounds or 'its catalog'}; see `flexroad status`"
+            )
+        surfaces = [FinishedTile.of(self.run, status, self.variant).surface for status in done]
+        whole = _joined([status.graph.tile for status in done], cast("list[NurbsSurface]", surfaces))
+        west, south, east, north = whole.bounds
+        if bounds is not None:
+            west, south = max(west, bounds[0]), max(south, bounds[1])
+            east, north = min(east, bounds[2]), min(north, bounds[3])
+        return Surface(whole, whole.crs, (west, south, east, north), None, None, sample.Options(), "")
 
     def tile(self, tile_id: str) -> xr.Dataset:
         """Return the input rasters, masks and fitted surface of one tile.
@@ -311,7 +330,24 @@ class RunView:
         >>> float(abs(tile.surface - tile.reference).where(tile.road).mean().round(1))
         0.0
         """
-        return tile_dataset(self.run, tile_id, self.variant)
+        (tile,) = self.run.catalog.select([tile_id]).tiles
+        (status,) = peek_statuses(self.run, [tile])
+        results = FinishedTile.of(self.run, status, self.variant)
+        data, road, clusters, surface = results.data, results.road, results.clusters, results.surface
+        core, window = data.core, data.grid.window(data.core)
+        rasters = {name: getattr(data, name) for name in ("dsm", "dtm", "reference", "reference_road")}
+        rasters |= {"road": road.mask, "road_filtered": clusters.mask}
+        cut = {name: raster[window] for name, raster in rasters.items() if raster is not None}
+        cut["surface"] = surface.lattice(core.eastings, core.northings)
+        dataset = xr.Dataset(
+            {
+                name: (("y", "x"), raster, {} if raster.dtype == bool else HEIGHTS)
+                for name, raster in cut.items()
+            },
+            coords={"x": core.eastings, "y": core.northings},
+            attrs={"tile": tile.id, "variant": self.variant, "stratum": tile.stratum},
+        )
+        return placed(dataset, core.crs)
 
     def rerun(
         self,
@@ -402,3 +438,32 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     2 tiles: 1 done, 1 pending
     """
     return RunView(*open_variant(path, variant, allow), tuple(allow))
+
+
+def _joined(tiles: Sequence[Tile], surfaces: Sequence[NurbsSurface]) -> NurbsSurface:
+    """Return one surface over the rectangle around the tiles; NaN where it has no tile."""
+    first = tiles[0].grid
+    if len({tile.grid.crs for tile in tiles}) > 1:
+        raise ConfigError("the tiles are in different CRS; give bounds with tiles of one CRS")
+    width, height = first.width * first.cell, first.height * first.cell
+    edges = np.array([tile.grid.bounds for tile in tiles])
+    (west, south), (east, north) = edges[:, :2].min(axis=0), edges[:, 2:].max(axis=0)
+    p, q = surfaces[0].degree
+    n, m = surfaces[0].A.shape[1] - p, surfaces[0].A.shape[0] - q
+    columns, rows = round((east - west) / width), round((north - south) / height)
+    heights = np.full((rows * m + q, columns * n + p), np.nan)
+    for tile, surface in zip(tiles, surfaces, strict=True):
+        j, i = round((tile.grid.south - south) / height) * m, round((tile.grid.west - west) / width) * n
+        # Points on the border are in both tiles; those of a missing neighbour stay.
+        heights[j : j + m + q, i : i + n + p] = surface.A
+    return NurbsSurface(
+        crs=first.crs,
+        bounds=(float(west), float(south), float(east), float(north)),
+        degree=(p, q),
+        knots_u=uniform_knots(0, columns * n, p),
+        knots_v=uniform_knots(0, rows * m, q),
+        A=heights,
+        W=np.ones_like(heights),
+        datum=surfaces[0].datum,
+        origin=(float(np.floor(west)), float(np.floor(south))),
+    )

@@ -1,4 +1,4 @@
-"""What would fail is named before the run, with counts and examples, and then does fail."""
+"""Catalog check: what would fail is named before the run and then does fail; a shifted photo."""
 
 import os
 from dataclasses import replace
@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
+from affine import Affine
 
 from flexroad.catalog import LAYERS, Catalog
 from flexroad.catalog.headers import kept_rasters
 from flexroad.catalog.headers.open_raster import open_alone
 from flexroad.catalog.sources import rasters
 from flexroad.catalog.tile import faulty
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.check.catalog import check, expected_failures
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.inspect.failures import expected_failures
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.load import Options, load
 from tests.make_rasters import write
@@ -118,3 +120,17 @@ def test_dsm_of_several_tiles_is_opened_once(tmp_path, monkeypatch):
         f for f in expected_failures(catalog.tiles, load_config("paper"), ("dsm",)) if "height" in f.text
     ]
     assert opened == ["dsm.tif"]
+
+
+def test_check_shifted_photo_and_missing_file_are_faults(tmp_path):
+    path = write_scenes(tmp_path, 2, seed=3, size_m=120, dop=True)
+    assert not any(finding.fault for finding in check(Catalog.read(path), load_config("production")))
+    for photo in (tmp_path / "dop").glob("*.tif"):
+        with rasterio.open(photo, "r+") as raster:
+            raster.transform = Affine.translation(2.0, 0.0) @ raster.transform
+    (missing := next((tmp_path / "dtm").glob("*.tif"))).unlink()
+    faults = [
+        finding.text for finding in check(Catalog.read(path), load_config("production")) if finding.fault
+    ]
+    assert any(f"missing: {missing} (1 tile)" in text for text in faults)
+    assert any("dop lies 2.0 m east" in text for text in faults)

@@ -1,29 +1,42 @@
-"""A fitted surface in a notebook: heights, normals, rasters, a mesh, and one file."""
+"""A fitted surface in a notebook: fit in memory, heights, normals, rasters, a mesh, and one file."""
 
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from affine import Affine
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from flexroad.catalog import Bounds, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.borders import BorderStages, has_borders
+from flexroad.pipeline.graph.stages import stage_function
 from flexroad.tasks import sample, types
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
+from flexroad.tasks.load_arrays import load_arrays
 from flexroad.tasks.quality.assess import NO_ROAD
+from flexroad.tasks.segment import mask
+from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask
 
 if TYPE_CHECKING:
+    import rioxarray
     import trimesh
     import xarray as xr
+else:
+    rioxarray, trimesh, xr = lazy("rioxarray"), lazy("trimesh"), lazy("xarray")
 
 AXES = {"z": "x east, y north, z up", "y": "x east, y up, z south"}
 """Directions of the mesh axes by the upward axis."""
@@ -170,9 +183,6 @@ class Surface:
         >>> dict(raster.sizes), list(raster.data_vars), raster.rio.crs.to_epsg()
         ({'y': 120, 'x': 120}, ['height', 'road'], 25832)
         """
-        import rioxarray  # noqa: F401 (gives datasets their .rio)
-        import xarray as xr
-
         if not 0 < resolution < np.inf:
             raise ConfigError(f"resolution {resolution:g} m is no cell size; give one above 0, such as 0.5")
         grid = Grid.covering(self.crs, self.bounds, resolution)
@@ -185,8 +195,7 @@ class Surface:
             road = _cut(self.clusters.mask, self.road)[self.road.core.cells(x, y)]
             layers["road"] = ("y", "x"), road & valid
         raster = xr.Dataset(layers, coords={"x": grid.eastings, "y": grid.northings})
-        placed: xr.Dataset = raster.rio.write_crs(self.crs).rio.write_transform(grid.transform)
-        return placed
+        return placed(raster, self.crs, grid.transform)
 
     def to_mesh(self, up: Literal["z", "y"] = "z") -> trimesh.Trimesh:
         """Return the surface as a triangle mesh, sampled with the options `sampling`.
@@ -217,8 +226,6 @@ class Surface:
         >>> mesh.metadata["origin"]
         [500200.0, 5600000.0, 150.0]
         """
-        import trimesh
-
         if self.road is None or self.clusters is None:
             raise ConfigError(
                 "the surface has no road mask, as it was read from a file of a run; use the mesh of the run"
@@ -278,6 +285,82 @@ class Surface:
         return inside & ~_cut(self.road.outside, self.road)[self.road.core.cells(easting, northing)]
 
 
+def fit(
+    dsm: xr.DataArray,
+    dtm: xr.DataArray,
+    road_mask: xr.DataArray,
+    config: str | Path = "production",
+    variant: str | None = None,
+) -> Surface:
+    """Fit a smooth surface to the road and the terrain of one area.
+
+    The stages and the result are those of a run over the same rasters. The area is fitted as one tile, which
+    suits 60 m x 60 m to about 500 m x 500 m. For larger areas make a catalog and a run.
+
+    Parameters
+    ----------
+    dsm : xarray.DataArray, (H, W)
+        Digital surface model, heights in m. Its grid is that of the surface: square pixels, a projected CRS
+        in metres (``dsm.rio.crs``), coordinates of the cell centres that ascend or descend. NaN and
+        ``dsm.rio.nodata`` are nodata. Dask arrays are computed.
+    dtm : xarray.DataArray, (H, W)
+        Digital terrain model, heights in m, in the same CRS. If its cells do not coincide with those of the
+        DSM, it is resampled bilinearly, with a warning.
+    road_mask : xarray.DataArray, (H, W)
+        Road where True or not 0, in the same CRS. If its cells do not coincide with those of the DSM, the
+        nearest cell is taken, with a warning. It replaces the configuration's ``segment``. Without any road
+        cell, also after the filter, the surface is that of the terrain, as in a run, and has the flag
+        ``no-road`` (`Surface.flags`); a mask without road cells also gives a warning.
+    config : str or Path
+        A shipped configuration (``production``, ``paper``) or a YAML file.
+    variant : str, optional
+        A variant of the configuration; by default the first one exported.
+
+    Returns
+    -------
+    Surface
+        The fitted surface.
+
+    Raises
+    ------
+    TaskError
+        If an array has no CRS, is in degrees or feet, is rotated, or its pixels are not square; if the CRS of
+        two arrays differ; if the DSM has too few heights; if a stage fails.
+    ConfigError
+        If there is no such configuration or variant.
+
+    Examples
+    --------
+    >>> import flexroad
+    >>> scene = flexroad.example(size_m=60)
+    >>> surface = flexroad.fit(scene.dsm, scene.dtm, scene.road_mask)
+    >>> surface
+    <flexroad.Surface: stepped of 20 x 20 control points, config production>
+    EPSG:25832, 60 x 60 m, bounds 500200 5600000 500260 5600060
+    road: 1576 cells given, 1445 kept by the filter
+    """
+    chosen = load_config(config)
+    variant = variant or chosen.export.variants[0]
+    if variant not in chosen.chains:
+        raise ConfigError(f"{config} has no variant {variant!r}; it has {', '.join(chosen.chains)}")
+    chain = chosen.chains[variant]
+    data = load_arrays(dsm, dtm, road_mask, chain["load"])
+    for note in data.notes:
+        warnings.warn(note, stacklevel=2)
+    # At these sizes several BLAS threads are much slower than one.
+    with threadpool_limits(1):
+        road = mask.segment(data, mask.Options())
+        clusters = stage_function("ecsrc", chain["ecsrc"])(data, road, chain["ecsrc"])
+        framed: dict[str, Frame] = {}
+        # As in a run, the control points on the border are fitted first.
+        if has_borders(chain["fit"]):
+            stages = replace(BorderStages.of(chain), segment=mask.Options())
+            wide = chain["load"].model_copy(update={"halo_m": stages.reach_m})
+            framed["frame"] = stages.frame(load_arrays(dsm, dtm, road_mask, wide), data.core)
+        fitted = stage_function("fit", chain["fit"])(data, clusters, chain["fit"], **framed)
+    return Surface(fitted, data.core.crs, data.core.bounds, road, clusters, chain["sample"], str(config))
+
+
 def open_surface(path: str | Path) -> Surface:
     """Open a surface file written by `Surface.save` or by a run.
 
@@ -312,6 +395,12 @@ def open_surface(path: str | Path) -> Surface:
             return Surface(fitted, core.crs, core.bounds, road, clusters, sampling, str(archive["config"]))
     except npz.DAMAGED as error:
         raise TaskError(f"{path}: its road mask is damaged ({error}); save it again", str(path)) from error
+
+
+def placed(raster: xr.Dataset, crs: str, transform: Affine | None = None) -> xr.Dataset:
+    """Return a raster with a CRS and, if it is given, a transform, as rioxarray reads them."""
+    result: xr.Dataset = rioxarray.raster_dataset.RasterDataset(raster).write_crs(crs)
+    return result if transform is None else result.rio.write_transform(transform)
 
 
 def _cut(values: Bools, road: RoadMask) -> Bools:

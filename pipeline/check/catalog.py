@@ -1,4 +1,4 @@
-"""What would fail in a run, as far as the catalog, the headers of its files and the DSM show it."""
+"""Check of a catalog: layers per tile, what would fail, shift of the orthophoto against the heights."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
-from flexroad.catalog import CatalogError, Layer, Tile
+from flexroad.catalog import LAYERS, Catalog, CatalogError, Layer, Tile
+from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.cover import height_share
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
@@ -18,11 +20,17 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
-from flexroad.pipeline.graph.layers import lacking, without_photo
-from flexroad.tasks.load import READS
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import check_layers, lacking, without_photo
+from flexroad.tasks import load
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.roads import coregistration
 
 MAX_SHOWN = 5
 """Number of missing files, and of entries that cannot be used, that are named."""
+MAX_PHOTO_TILES = 12
+"""Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +40,29 @@ class Finding:
     text: str
     fault: bool = False
     """Whether this should be corrected before a run."""
+
+
+def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
+    """Yield the contents of a catalog, and what would fail in a run with a configuration.
+
+    Raises
+    ------
+    CatalogError
+        If a tile names a file that the catalog may not read (`Catalog.read`).
+    """
+    check_allowed(catalog)
+    tiles = catalog.usable
+    sizes = Counter(f"{tile.grid.width}x{tile.grid.height} at {tile.grid.cell:g} m" for tile in tiles)
+    systems = sorted({short(tile.grid.crs) for tile in tiles})
+    yield Finding(f"{count(len(tiles), 'tile')} of {', '.join(sizes)}; {', '.join(systems)}")
+    counts = {name: sum(tile.layer(name) is not None for tile in tiles) for name in LAYERS}
+    yield Finding("tiles with " + ", ".join(f"{name}: {number}" for name, number in counts.items() if number))
+    try:
+        check_layers(config, catalog)
+    except ConfigError as error:
+        yield Finding(f"a run would not start: {error}", fault=True)
+    yield from expected_failures(catalog.tiles, config, LAYERS)
+    yield from _photos([tile for tile in tiles if tile.layer("dop")])
 
 
 def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[str]) -> Iterator[Finding]:
@@ -124,7 +155,7 @@ def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[
 
 def _other_crs(tile: Tile, known: dict[Location, str | None]) -> str:
     """Return why a tile would fail if a raster on it is in another CRS; ``known`` has those read before."""
-    for layer, paths in _on_tile(tile, READS):
+    for layer, paths in _on_tile(tile, load.READS):
         for path in () if layer.reproject else paths:
             if path not in known:
                 known[path] = _crs(path, tile.allowed)
@@ -150,3 +181,46 @@ def _few_heights(tile: Tile, min_valid: float) -> str:
     if share is None or share >= max(min_valid, 1e-9):
         return ""
     return f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"
+
+
+def _photos(tiles: Sequence[Tile]) -> Iterator[Finding]:
+    """Compare photos with heights on a sample of the tiles that have the most frequent cell size."""
+    tiles = [tile for tile in tiles if coregistration.large_enough(tile.grid)]
+    cells = Counter(tile.grid.cell for tile in tiles)
+    tiles = [tile for tile in tiles if tile.grid.cell == cells.most_common(1)[0][0]]
+    most = min(MAX_PHOTO_TILES, len(tiles))
+    sample = [tiles[i * len(tiles) // most] for i in range(most)]
+    pairs: list[coregistration.Pair] = []
+    for tile in sample:
+        try:
+            pairs.append(_pair(tile))
+        except TaskError as error:
+            yield Finding(f"{tile.id}: {error}", fault=True)
+    if pairs:
+        yield _shift(pairs, sample[0].grid.cell)
+
+
+def _pair(tile: Tile) -> coregistration.Pair:
+    data = load.load(tile, load.Options(min_valid=0.0))
+    assert data.dop is not None  # the caller selects tiles with a photo
+    return coregistration.pair(data, read_photo(data.dop, data.grid))
+
+
+def _shift(pairs: Sequence[coregistration.Pair], cell: float) -> Finding:
+    shift = coregistration.shift(pairs)
+    tile_shifts = [coregistration.shift([pair], shift.sun) for pair in pairs]
+    scatter = median(
+        ((tile.east_m - shift.east_m) ** 2 + (tile.north_m - shift.north_m) ** 2) ** 0.5
+        for tile in tile_shifts
+    )
+    measured = (
+        f"{shift} of the heights (over {count(len(pairs), 'tile')}, half of them within "
+        f"{scatter:.1f} m of that; sun at {shift.sun[0]:.0f}°, {shift.sun[1]:.0f}° high; "
+        f"confidence {shift.confidence:.2f})"
+    )
+    if not coregistration.matters(shift, cell, scatter):
+        return Finding(f"dop: {measured}: no significant shift")
+    return Finding(
+        f"dop lies {measured}: move it, e.g. with gdal_translate -a_ullr, before it is used with them",
+        fault=True,
+    )

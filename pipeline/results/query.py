@@ -7,24 +7,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_vector import ERRORS
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import parse_location, write
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.inspect.point_files import Points, to_crs
-from flexroad.pipeline.inspect.points import Answer, Ground
-from flexroad.pipeline.inspect.profile import stations
+from flexroad.pipeline.results.points import Answer, Ground
+from flexroad.pipeline.results.query_files import Points, to_crs
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
+    import geopandas
     import pandas as pd
+else:
+    geopandas, pd = lazy("geopandas"), lazy("pandas")
 
+MAX_POINTS = 10_000_000
+"""Largest number of points of the profiles of one command: their table takes gigabytes."""
 MILLIMETRES = ("distance_m", "easting", "northing")
 """Columns that are written with three decimals; other numbers have nine digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stations:
+    """n points along lines, in equal steps from the start of each line, and at its end."""
+
+    line: NDArray[np.intp]
+    """``(n,)``, number of the line, from 1."""
+    distance: Floats
+    """``(n,)``, distance from the start of the line in plan (m)."""
+    easting: Floats
+    northing: Floats
+    """``(n,)``, m."""
+    direction: Floats
+    """``(n, 2)``, unit vectors: east and north components of the line's direction; at a vertex that of the
+    part that begins there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +96,6 @@ class AnswerTable:
         OSError
             If the file cannot be written.
         """
-        import geopandas
-        import shapely
-
         known = np.isfinite(self.easting) & np.isfinite(self.northing)
         shapes = np.full(len(known), None, dtype=object)
         shapes[known] = shapely.points(self.easting[known], self.northing[known])
@@ -146,8 +166,6 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTab
     ConfigError
         If there are too many points, or a result of a tile is missing.
     """
-    import pandas as pd
-
     points = stations(lines, step_m)
     answer = ground.at(points.easting, points.northing)
     # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
@@ -158,6 +176,40 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTab
     if len(lines) > 1:
         table.insert(0, "line", points.line)
     return AnswerTable(table, points.easting, points.northing, crs_of(ground), answer)
+
+
+def stations(lines: list[Floats], step_m: float) -> Stations:
+    """Return the points every ``step_m`` along lines, and at the end of each.
+
+    Raises
+    ------
+    ConfigError
+        If these are more than `MAX_POINTS`.
+    """
+    lengths = [float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines]
+    number = sum(length / step_m + 2 for length in lengths)
+    if number > MAX_POINTS:
+        raise ConfigError(f"--step {step_m:g}: about {count(round(number), 'point')}; at most {MAX_POINTS}")
+    parts = [_along(line, step_m) for line in lines]
+    numbers = np.repeat(np.arange(1, len(parts) + 1), [len(part) for part in parts])
+    distance, easting, northing, east, north = np.concatenate(parts).T
+    return Stations(numbers, distance, easting, northing, np.column_stack([east, north]))
+
+
+def _along(line: Floats, step_m: float) -> Floats:
+    """Return the points of one line, ``(n, 5)``: distance, easting, northing, direction east and north."""
+    parts = np.diff(line, axis=0)
+    lengths = np.hypot(*parts.T)
+    # A repeated vertex has no direction.
+    start, parts, lengths = line[:-1][lengths > 0], parts[lengths > 0], lengths[lengths > 0]
+    ends = np.cumsum(lengths)
+    distance = np.arange(0.0, ends[-1], step_m)
+    # The end is a point of its own unless the last step reaches it, within a millimetre.
+    distance = np.append(distance[distance < ends[-1] - 1e-3], ends[-1])
+    part = np.minimum(np.searchsorted(ends, distance, side="right"), len(ends) - 1)
+    direction = parts[part] / lengths[part, None]
+    beyond = distance - (ends[part] - lengths[part])
+    return np.column_stack([distance, start[part] + beyond[:, None] * direction, direction])
 
 
 def _columns(answer: Answer) -> dict[str, Any]:

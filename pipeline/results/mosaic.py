@@ -15,6 +15,7 @@ from flexroad.catalog import Bounds, Grid, Tile
 from flexroad.catalog.crs import same
 from flexroad.catalog.grid import LATTICE_TOLERANCE
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import absolute, parse_location
 from flexroad.pipeline.errors import ConfigError
@@ -23,6 +24,8 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.export import cog
 from flexroad.tasks.io.raster import read_raster
+
+rasterio = lazy("rasterio")
 
 
 class LayerFile(NamedTuple):
@@ -151,11 +154,9 @@ def _steps(edges: Sequence[int]) -> tuple[int, ...]:
 
 def _read(source: tuple[Window, str]) -> NDArray[Any]:
     """Read a part of a product, ``(height, width)``."""
-    from rasterio import windows
-
     window, suffix = source
     path = parse_location(window.stem + suffix)
     file = contained(path, path.parents[2])
-    part = windows.Window(window.column, window.row, window.width, window.height)
+    part = rasterio.windows.Window(window.column, window.row, window.width, window.height)
     values: NDArray[Any] = read_raster(file, path.name, lambda raster: raster.read(1, window=part))
     return values
