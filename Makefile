@@ -1,8 +1,9 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup reproduce run rerun test test-all viewer validators fuzz lint bench speed container clean
+.PHONY: help setup reproduce run rerun test test-all soak viewer validators fuzz lint bench speed container clean
 
 PYTHON ?= python3
 VENV := .venv
+VALIDATORS := .validators
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # At these sizes more than one BLAS thread per process is a loss.
@@ -88,13 +89,17 @@ test: $(STAMP) ## Run the tests but for the slow ones: minutes
 test-all: $(STAMP) ## Run all tests
 	$(PYTEST)
 
+soak: export FLEXROAD_VALIDATORS := $(VALIDATORS)
+soak: $(STAMP) validators ## Run the soak tests and the fuzzer; if all pass, record the commit for .ci/run
+	$(BIN)/python -m tests.fuzz --seconds 10 --seed 1 --jobs $(JOBS)
+	$(PYTEST) -m soak --soak record
+
 viewer: ## Build the browser viewer into viewer/dist and test its parts (needs npm)
 	npm ci --prefix viewer --ignore-scripts --no-audit --no-fund
 	node viewer/build.js
 	node --test viewer/tests/
 
 # Third-party programs that check exports; FLEXROAD_VALIDATORS=.validators makes the tests use them.
-VALIDATORS := .validators
 VALIDATED_BY := $(addprefix tests/validators/,requirements.txt package.json package-lock.json)
 
 validators: $(VALIDATORS)/.installed ## Install the programs that check exports into .validators (2 GB, needs npm)

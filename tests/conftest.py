@@ -10,7 +10,7 @@ import yaml
 
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-from tests import command_line
+from tests import changed, command_line
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
@@ -27,11 +27,37 @@ QUICK = {
 """The paper's three variants with a quick, inaccurate fit."""
 
 
+def pytest_addoption(parser):
+    helped = (
+        "all soak tests; those of changed areas (tests/changed.py); or all, and record the commit if all pass"
+    )
+    parser.addoption("--soak", choices=("all", "changed", "record"), default="all", help=helped)
+
+
 def pytest_collection_modifyitems(config, items):
-    """Run files with slow tests first, so that parallel test processes end at about the same time."""
+    """Skip soak tests of unchanged areas; run files with slow tests first.
+
+    Parallel test processes then end at about the same time.
+    """
+    if config.option.soak == "changed":
+        skip_unchanged(items, changed.changed_files())
     if hasattr(config, "workerinput"):
         slow = {item.path for item in items if item.get_closest_marker("slow")}
         items.sort(key=lambda item: item.path not in slow)
+
+
+def skip_unchanged(items, files):
+    for item in items:
+        marker = item.get_closest_marker("soak")
+        test = item.path.relative_to(changed.ROOT).as_posix()
+        if marker and not changed.is_due(*marker.args, files, test):
+            item.add_marker(pytest.mark.skip("soak test of an unchanged area; `make soak` runs all"))
+
+
+def pytest_terminal_summary(terminalreporter, exitstatus, config):
+    if config.option.soak == "record" and not exitstatus:
+        skipped = terminalreporter.stats.get("skipped")
+        terminalreporter.write_line("not recorded: tests were skipped" if skipped else changed.record())
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,11 +15,18 @@ def commands(tmp_path, *words: str, program: str = "flexroad", target: str = "re
     """Return the words of a program's calls that make would run in a fresh, installed checkout."""
     tmp_path.mkdir(exist_ok=True)
     shutil.copy(ROOT / "Makefile", tmp_path)
-    (tmp_path / ".venv").mkdir()
-    for name in ("pyproject.toml", "constraints.txt", ".venv/.installed"):
+    validated_by = (
+        f"tests/validators/{name}" for name in ("requirements.txt", "package.json", "package-lock.json")
+    )
+    for name in (
+        "pyproject.toml",
+        "constraints.txt",
+        ".venv/.installed",
+        "configs/gerod.yaml",
+        *validated_by,
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    (tmp_path / "configs").mkdir()
-    (tmp_path / "configs" / "gerod.yaml").touch()
     done = subprocess.run(
         ["make", "-n", target, *words], cwd=tmp_path, capture_output=True, text=True, check=True
     )
@@ -84,9 +91,18 @@ def test_make_test_omits_slow_tests_and_test_all_does_not(tmp_path):
         ]
 
 
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_soak_records_the_commit(tmp_path):
+    fuzz, words = commands(tmp_path, program=".venv/bin/python", target="soak")
+    assert fuzz[:2] == ["-m", "tests.fuzz"]
+    assert words[-4:] == ["-m", "soak", "--soak", "record"]
+
+
 def test_ci_runs_lint_all_tests_and_the_fuzzer():
     lines = (ROOT / ".ci" / "run").read_text().splitlines()
-    *_, install, tests, fuzz = [line for line in lines if not line.startswith("#")]
+    *_, install, tests, due, fuzz, end = [line for line in lines if not line.startswith("#")]
     assert {"setup", "validators", "lint"} <= set(install.split())
-    assert tests == "PYTEST_ADDOPTS=--hypothesis-profile=ci FLEXROAD_VALIDATORS=.validators make test-all"
-    assert fuzz.startswith("make fuzz FUZZ_SECONDS=10 ")
+    options = '"--hypothesis-profile=ci --soak=changed"'
+    assert tests == f"PYTEST_ADDOPTS={options} FLEXROAD_VALIDATORS=.validators make test-all"
+    assert (due, end) == ("if python3 tests/changed.py readers; then", "fi")
+    assert fuzz.startswith("  make fuzz FUZZ_SECONDS=10 ")

@@ -20,7 +20,7 @@ from tests.dask_processes import until
 from tests.slurm_daemons import slurm_daemons
 from tests.whole_run import LIGHT, assert_whole, item_times
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 # Workers cannot import this test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

@@ -12,7 +12,7 @@ from flexroad.pipeline.prepare.photos import PhotosOptions, prepare_photos
 from flexroad.tasks.acquire.photos import mvs_cpu, sfm
 from flexroad.tasks.acquire.points import to_rasters
 
-pytestmark = [pytest.mark.real, pytest.mark.slow]
+pytestmark = [pytest.mark.real, pytest.mark.slow, pytest.mark.soak("photos")]
 
 GNSS_PLAN_M, GNSS_HEIGHT_M = 3.0, 5.0
 

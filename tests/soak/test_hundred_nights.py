@@ -30,7 +30,7 @@ from tests.permissions import permissions_enforced
 from tests.soak.survey import ANCHOR, CONFIG, Survey, damage
 from tests.whole_run import rows, temporary_files
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 SEED = os.environ.get("FLEXROAD_NIGHTS_SEED", "1")
 CHOSEN = [int(night) for night in os.environ.get("FLEXROAD_NIGHTS", "").split(",") if night]

@@ -22,7 +22,7 @@ from flexroad.pipeline.execute.slurm import slurm_options
 from flexroad.pipeline.execute.workers import checksum_of_code
 from tests.dask_processes import Processes, until, wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 # Workers cannot import this test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

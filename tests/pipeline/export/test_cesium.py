@@ -20,7 +20,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.spline.stepped import without_steps
 from tests import validators
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("pages")]
 
 SCRIPT = Path(validators.__file__).with_name("cesium_page.py")
 DATUM = Datum("offset", "47.5")

@@ -15,7 +15,7 @@ from flexroad.pipeline.run.finished import FileStates
 
 from .conftest import OPTIONS
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("exports")]
 
 CHILD_S = 600
 """Longest time of a process that measures (s)."""

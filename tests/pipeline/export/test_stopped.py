@@ -19,7 +19,7 @@ from tests.whole_run import temporary_files
 
 from .conftest import OPTIONS, contents
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("exports")]
 
 POINTS = 5
 """Operations at which each format is stopped."""

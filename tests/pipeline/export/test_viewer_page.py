@@ -19,7 +19,7 @@ from flexroad.tasks.export import viewer
 from flexroad.tasks.spline.stepped import without_steps
 from tests.validators.pages import browse, visit
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("pages")]
 
 SETTLED = "() => { const now = FLEXROAD.inspect(); return now.loaded.length > 0 && now.loading === 0 }"
 MIDDLE = [200, 90, 420, 450]

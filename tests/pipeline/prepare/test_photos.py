@@ -17,7 +17,7 @@ from flexroad.tasks.acquire.photos import mvs_cpu, sfm
 from flexroad.tasks.acquire.points import to_rasters
 from tests import make_photos
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("photos")]
 
 PHOTOS_OPTIONS = PhotosOptions(
     sfm=sfm.Options(image_size=640, features=1500, threads=2, calibrate="held"),

@@ -11,7 +11,7 @@ from flexroad.pipeline.report.browser.page import html_page
 from tests.made_report import failed_row, made_content, made_row, made_run, many_rows
 from tests.validators.pages import visit
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("pages")]
 
 EVIL = "<script>document.title='evil'</script><b>x</b>"
 SELECTED = {"eval": "document.querySelector('#tile h3')?.textContent ?? ''"}

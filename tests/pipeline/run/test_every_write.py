@@ -20,7 +20,7 @@ from tests import command_line
 from tests.faulty_files import FAULTS, Faulty, Operation, intercepted
 from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 SAMPLE = 12
 """Operations that have a fault, of each kind of fault."""

@@ -36,7 +36,7 @@ from tests.dask_processes import wait_for
 from tests.permissions import permissions_enforced
 from tests.whole_run import LIGHT, assert_whole, rows, times
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 DAY_S = 86400
 

@@ -18,7 +18,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import read_metrics
 from tests.dask_processes import until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 CONFIG = """
 fit: {control_points: [20, 20], iterations: 3000}

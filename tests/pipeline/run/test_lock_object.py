@@ -10,7 +10,7 @@ from flexroad.catalog.storage.paths import parse_location, read, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.lock import Heartbeat, Owner, owner, run_lock
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 ELSEWHERE = Owner("node7", "m7 pid:[1]", "b7", 4711, 99, "2026-11-20T02:00:00+00:00", "t7")
 QUICK = Heartbeat(interval_s=0.05, stale_s=0.5)

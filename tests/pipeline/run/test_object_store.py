@@ -34,7 +34,7 @@ from tests.conftest import QUICK
 from tests.make_roads import write as write_roads
 from tests.s3_server import Fault
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 LIGHT = {"variants": {"plane": {"fit": "plane", "sample": "corners"}}}
 CONFIG = compose(LIGHT, "light")

@@ -22,7 +22,7 @@ from tests.faulty_files import Operation, intercepted
 from tests.power_loss import Disk, Recording, write_state
 from tests.whole_run import LIGHT, assert_whole, item_times, temporary_files
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 STATES = 200 if os.environ.get("FLEXROAD_ALL_FAULTS") else 10
 """Possible states that are tried, of each of the two recorded runs."""

@@ -33,7 +33,7 @@ from tests.make_rasters import damage, write
 from tests.permissions import permissions_enforced
 from tests.whole_run import products, rows
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 SIZE_M = 40
 LIGHT = ["fit.spacing_m=8"]

@@ -17,7 +17,7 @@ from flexroad.pipeline.run.runner import run_tiles
 from tests.dask_processes import wait_for
 from tests.whole_run import LIGHT, assert_whole
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("runs")]
 
 EMPTY = 'mount -t tmpfs none "$1"'
 # It shows what is below, but what is written there stays there.

@@ -14,7 +14,7 @@ from flexroad.tasks.acquire.photos.poisson import poisson, write_ply
 from flexroad.tasks.acquire.photos.sfm import Options, reconstruct
 from tests import make_photos
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak("photos")]
 
 QUICK = Options(image_size=640, features=2500, threads=2)
 STEREO = mvs_cpu.Options(size=480, partners=3)
