@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
@@ -15,7 +16,10 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.vectors import layers, listed
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count, reason
+
+pyogrio = lazy("pyogrio")
 
 TOUCH_M = 1e-3
 """Overlap that counts (m): tiles beside an area that ends on their edge do not lie on it."""
@@ -49,10 +53,6 @@ class Area:
         CatalogError
             If the file cannot be read, has no CRS, no such layer or several, or no polygons.
         """
-        import pyogrio
-        import shapely
-        from shapely.errors import ShapelyError
-
         try:
             name = vector_name(path)
             found = layers(path)
@@ -76,7 +76,7 @@ class Area:
             raise CatalogError(f"--area {path} has no CRS; add it with ogr2ogr -a_srs EPSG:N NEW {path.name}")
         try:
             return cls(str(path), table.crs.to_wkt(), shapely.make_valid(polygons))
-        except ShapelyError as error:
+        except shapely.errors.ShapelyError as error:
             raise CatalogError(f"--area {path} has polygons that cannot be used: {reason(error)}") from error
 
     def touched(self, grids: Iterable[Grid]) -> list[bool]:
@@ -84,8 +84,6 @@ class Area:
 
         Tiles are transformed to the CRS of the area, as its sides are straight there.
         """
-        import shapely
-
         tree = shapely.STRtree(self.polygons)
         return [bool(tree.query(self._outline(grid), predicate="intersects").size) for grid in grids]
 
@@ -97,8 +95,6 @@ class Area:
 
     def _outline(self, grid: Grid) -> Any:
         """Return the outline of a grid in the CRS of the area; empty if it cannot be transformed."""
-        import shapely
-
         west, south, east, north = grid.bounds
         box = shapely.box(west + TOUCH_M, south + TOUCH_M, east - TOUCH_M, north - TOUCH_M)
         corners = shapely.get_coordinates(shapely.segmentize(box, max(east - west, north - south) / STEPS))

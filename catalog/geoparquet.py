@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import shapely
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.scratch import ScratchFolder
+
+pa = lazy("pyarrow")
+pq = lazy("pyarrow.parquet")
+stac_arrow = lazy("stac_geoparquet.arrow")
 
 Item = dict[str, Any]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -46,9 +51,6 @@ def entries(data: bytes) -> Iterator[Item]:
     Exception
         Any error of pyarrow, if the data are not a table.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     file = pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, page_checksum_verification=True)
     _check_size(file.metadata)
     paths = (file.schema.column(number).path.split(".") for number in range(len(file.schema)))
@@ -102,8 +104,6 @@ def _values(table: Any) -> list[Item]:
 
 def _dates(column: Any) -> Iterator[datetime | None]:
     """Yield the dates of a column of timestamps. pyarrow would import pandas for them, which is slow."""
-    import pyarrow as pa
-
     per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
     for chunk in column.chunks:
         for number in chunk.view(pa.int64()).to_pylist():
@@ -135,9 +135,7 @@ def _add_extents(rows: list[Item], name: str, column: Any) -> None:
 
 def schema_of(full: Item) -> Any:
     """Return the columns of a table of items, inferred from an item with all fields."""
-    from stac_geoparquet.arrow import parse_stac_items_to_arrow
-
-    return parse_stac_items_to_arrow([full]).read_all().schema
+    return stac_arrow.parse_stac_items_to_arrow([full]).read_all().schema
 
 
 def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
@@ -148,16 +146,13 @@ def table_bytes(items: Iterable[Item], schema: Any) -> bytes:
     schema : pyarrow.Schema
         Of `schema_of`.
     """
-    import pyarrow as pa
-    from stac_geoparquet.arrow import to_parquet
-
     with ScratchFolder() as folder:
         # `to_parquet` writes only to files.
         file = Path(folder) / "catalog.parquet"
         rows, parts = map(row, items), [schema.empty_table()]
         while part := list(islice(rows, AT_ONCE)):
             parts.append(pa.Table.from_pylist(part, schema))
-        to_parquet(pa.concat_tables(parts).combine_chunks(), file, write_page_checksum=True)
+        stac_arrow.to_parquet(pa.concat_tables(parts).combine_chunks(), file, write_page_checksum=True)
         return file.read_bytes()
 
 

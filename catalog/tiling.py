@@ -19,11 +19,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flexroad.catalog.cover import MIN_COVER, height_share
 from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, same, scales, short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, some, zoned
+from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, Layer, Tile, by_cover
 

@@ -10,6 +10,10 @@ import struct
 from dataclasses import dataclass
 from typing import BinaryIO
 
+from flexroad.catalog.lazy import lazy
+
+lazrs = lazy("lazrs")
+
 VARIABLE = 2**32 - 1
 """Size of the chunks of COPC: each has its own."""
 WHOLE = 0
@@ -97,8 +101,6 @@ def _check_layers(file: BinaryIO, items: list[tuple[int, int]], start: int, leng
 
 def _table(file: BinaryIO, record: bytes, span: Span) -> list[tuple[int, int]]:
     """Return points and bytes of each chunk."""
-    import lazrs
-
     file.seek(span.start)
     position = struct.unpack("<q", file.read(8).ljust(8, b"\0"))[0]
     if position == -1:

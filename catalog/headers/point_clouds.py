@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers import las_header
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason, one_line
+
+laspy = lazy("laspy")
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]
@@ -214,8 +217,6 @@ def _chunk(
 
 
 def _opened(path: Path) -> Any:
-    import laspy
-
     if not _attempt(path, path.is_file):
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")

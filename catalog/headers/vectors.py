@@ -16,8 +16,11 @@ from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason, count, reason
 from flexroad.catalog.tile import REACH_M, Layer, Tile
+
+pyogrio = lazy("pyogrio")
 
 MARGIN_M = 1.0
 """Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
@@ -82,8 +85,6 @@ def layers(path: Path) -> dict[str, str]:
     Refused, or one of `ERRORS`
         If the file cannot be read as vectors.
     """
-    import pyogrio
-
     file = vector_name(path)
     kinds = {name: kind for name, kind in pyogrio.list_layers(file) if kind is not None}
     counts = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
@@ -101,8 +102,6 @@ def listed(found: Mapping[str, str]) -> str:
 
 def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFile:
     """Open one vector file; see `find`."""
-    import pyogrio
-
     try:
         file = vector_name(path)
         found = layers(path)

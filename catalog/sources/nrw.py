@@ -8,23 +8,33 @@ classified point cloud. Product and year are taken from the name, the position f
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexroad.catalog.bridges import deck_raster
-from flexroad.catalog.cover import MIN_COVER
+import numpy as np
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.globbing import glob
+from flexroad.catalog.headers.mask_values import mask_notes
+from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.point_clouds import chunks
 from flexroad.catalog.headers.rasters import RasterFile, opened, scan, skip, some, unlisted_lines
 from flexroad.catalog.headers.vectors import find, with_roads
-from flexroad.catalog.mask_values import mask_notes
+from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.tile import Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
+
+Floats = NDArray[np.float64]
 
 CRS = "EPSG:25832"
 """CRS of all downloads; XYZ files do not declare it."""
@@ -37,6 +47,9 @@ NAME = re.compile(
 )
 LAYER_OF = {"dom": "dsm", "dgm": "dtm", "dop": "dop"}
 """Layer by the first letters of the product; point clouds are not a layer."""
+DECK = 17
+"""Class of bridge decks (ASPRS LAS 1.4); terrain models do not contain bridges."""
+DECK_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -204,12 +217,69 @@ def _bridges(
     for cloud in clouds:
         target = derived.resolve() / f"{cloud.path.stem}_bridges.tif"
         try:
-            if deck_raster(cloud.path, target, cloud.square, CRS):
+            if _deck_raster(cloud.path, target, cloud.square, CRS):
                 targets.append(target)
         except CatalogError as error:
             lines.append(f"skipped {error}")
     files, skipped = opened(root, "bridges", targets, CRS)
     return files, [], [*lines, *skipped]
+
+
+def _deck_raster(cloud: Path, target: Path, square: Bounds, crs: str) -> bool:
+    """Write the mean height of a cloud's bridge points per cell (float32, NaN elsewhere).
+
+    Return whether there are any. A target that is not older than the cloud is kept, unless it is damaged.
+
+    Raises
+    ------
+    CatalogError
+        If the cloud cannot be read; names the file.
+    """
+    kept = _kept(cloud, target)
+    if kept is not None:
+        return kept
+    west, south, east, north = square
+    width, height = math.ceil((east - west) / DECK_CELL_M), math.ceil((north - south) / DECK_CELL_M)
+    total, count = np.zeros(width * height), np.zeros(width * height, np.int64)
+    for chunk in chunks(cloud):
+        deck = chunk.kind == DECK
+        x, y, z = chunk.x[deck], chunk.y[deck], chunk.z[deck]
+        col, row = (
+            np.floor((x - west) / DECK_CELL_M).astype(int),
+            np.floor((north - y) / DECK_CELL_M).astype(int),
+        )
+        inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+        cell = row[inside] * width + col[inside]
+        total += np.bincount(cell, z[inside], minlength=total.size)
+        count += np.bincount(cell, minlength=count.size)
+    with np.errstate(invalid="ignore"):
+        heights = (total / count).reshape(height, width)
+    _write(target, heights, Affine(DECK_CELL_M, 0, west, 0, -DECK_CELL_M, north), crs)
+    return bool(count.any())
+
+
+def _kept(cloud: Path, target: Path) -> bool | None:
+    """Return whether an existing target has bridges; None if it is older than the cloud, or damaged."""
+    try:
+        if target.stat().st_mtime_ns < cloud.stat().st_mtime_ns:
+            return None
+        with open_raster(target) as raster:
+            return bool(np.isfinite(raster.read(1)).any())
+    except ERRORS:
+        return None
+
+
+def _write(target: Path, heights: Floats, transform: Affine, crs: str) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    rows, cols = heights.shape
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "compress": "deflate", "nodata": np.nan}
+    with (
+        atomic_path(target) as temporary,
+        rasterio.open(
+            temporary, "w", width=cols, height=rows, transform=transform, crs=crs, **profile
+        ) as raster,
+    ):
+        raster.write(heights.astype(np.float32), 1)
 
 
 def _without_terrain(tiles: Sequence[Tile]) -> list[str]:

@@ -7,11 +7,11 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from flexroad.catalog.cover import MIN_COVER
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
-from flexroad.catalog.mask_values import mask_notes
+from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.tile import LAYERS
 from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 

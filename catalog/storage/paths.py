@@ -23,12 +23,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from uuid import uuid4
 
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path, flush_path
 from flexroad.catalog.storage.settings import s3_options
 from flexroad.catalog.text import printable
 
 if TYPE_CHECKING:
     from upath import UPath
+
+aiohttp = lazy("aiohttp")
+botocore = lazy("botocore.exceptions")
+upath = lazy("upath")
 
 Location: TypeAlias = "Path | UPath"
 
@@ -77,9 +82,7 @@ def parse_location(where: str | Location) -> Location:
             raise CatalogError(f"{printable(text)} {reason}; fetch it first, or give its path")
         return Path(where)
     try:
-        from upath import UPath
-
-        remote: UPath = UPath("s3://" + text[bucket.end() :], **s3_options())
+        remote: UPath = upath.UPath("s3://" + text[bucket.end() :], **s3_options())
         remote.fs.retries = ROUNDS
     except ImportError as error:
         raise OSError(
@@ -393,14 +396,11 @@ def _entry_stat(entry: dict[str, Any]) -> FileStat | None:
 @contextlib.contextmanager
 def named(where: UPath) -> Iterator[None]:
     """Turn errors of object storage into an OSError that names the file."""
-    from aiohttp import ClientError
-    from botocore.exceptions import BotoCoreError
-
     try:
         yield
     except OSError as error:
         number = error.errno or next((n for kind, n in _NUMBERS if isinstance(error, kind)), errno.EIO)
         raise OSError(number, error.strerror or str(error), str(where)) from error
-    except (BotoCoreError, ClientError, ValueError) as error:
+    except (botocore.BotoCoreError, aiohttp.ClientError, ValueError) as error:
         # botocore raises ValueError for settings that it cannot use.
         raise OSError(errno.EIO, str(error), str(where)) from error

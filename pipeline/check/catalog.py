@@ -10,8 +10,8 @@ from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed
-from flexroad.catalog.cover import height_share
 from flexroad.catalog.crs import in_plan, same, short
+from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import quiet, some
 from flexroad.catalog.headers.refused import Refused, head

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexroad.catalog.cover import MIN_COVER
+from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import MIN_COVER_HELP, Command

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flexroad.catalog.cover import MIN_COVER
+from flexroad.catalog.limits import MIN_COVER
 from flexroad.pipeline.errors import ConfigError
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Bounds, CatalogError, Grid
 from flexroad.catalog.headers.point_clouds import CHUNK, Chunk, Cloud, chunks, survey_dates
+from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.prepare.limits import check_extent
 from flexroad.pipeline.prepare.output import disk_errors
@@ -32,8 +33,6 @@ RECORD = np.dtype(
     [("east", "<i4"), ("north", "<i4"), ("height", "<i4"), ("kind", "u1"), ("colour", "u1", (3,))]
 )
 """One point; ``east`` and ``north`` are relative to the block's south-west corner."""
-LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Heights outside this range are nodata, as everywhere in FlexRoad."""
 POINTS_PER_BLOCK = 2_000_000
 """Target number of points that a worker holds in memory, including the rim around its block."""
 SHORTEST_EDGE_M, LONGEST_EDGE_M = 50.0, 500.0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexroad.catalog.crs import Unit, height_unit, is_projected, plan_unit
+from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import Layer
 from flexroad.tasks.errors import TaskError, Unusable
@@ -17,9 +18,6 @@ from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     from flexroad.tasks.io.raster import RasterWindow
-
-LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Heights outside this range are taken as undeclared nodata."""
 
 SMALLER = {"cm": 100, "mm": 1000}
 """Units that heights outside the range may be in, with their number in a metre."""

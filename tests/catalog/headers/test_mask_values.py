@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flexroad.catalog import mask_values
-from flexroad.catalog.mask_values import mask_notes
+from flexroad.catalog.headers import mask_values
+from flexroad.catalog.headers.mask_values import mask_notes
 from tests.make_rasters import write
 
 CLASSES = np.array([[1, 2], [5, 7]], np.uint8).repeat(20, 0).repeat(20, 1)

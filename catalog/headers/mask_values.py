@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from flexroad.catalog.cover import AS_TEXT
+import numpy as np
+from rasterio.windows import Window
+
+from flexroad.catalog.headers.cover import AS_TEXT
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import quiet, some
-
-if TYPE_CHECKING:
-    from rasterio.windows import Window
 
 MOST_FILES = 8
 """Largest number of files of a layer that are read."""
@@ -71,8 +71,6 @@ def _note(values: set[float], road_values: Sequence[int], has_nodata: bool) -> s
 
 def _values(path: Path) -> tuple[set[float], bool]:
     """Return the values of the first band in parts of a raster, and whether cells of them are nodata."""
-    import numpy as np
-
     values, has_nodata = set[float](), False
     with quiet(), open_raster(path) as raster:
         for window in _windows(raster):
@@ -84,8 +82,6 @@ def _values(path: Path) -> tuple[set[float], bool]:
 
 def _windows(raster: Any) -> Iterator[Window]:
     """Yield all of a small raster, or squares spread over a large one."""
-    from rasterio.windows import Window
-
     if max(raster.shape) <= SIDE:
         yield Window(0, 0, raster.width, raster.height)
         return

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from flexroad.catalog.crs import same, transformer
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.grid import Grid
+from flexroad.catalog.headers.kept_rasters import kept_raster
+from flexroad.catalog.headers.open_raster import ERRORS
+from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
+from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.trust import AllowedFolders
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from flexroad.catalog.grid import Grid
-    from flexroad.catalog.storage.paths import Location
-    from flexroad.catalog.trust import AllowedFolders
-
-MIN_COVER = 0.25
-"""Default share below which catalogs leave a tile out and `load` fails on it."""
 LOWEST, HIGHEST = -9000.0, 1e6
 """Values outside are undeclared nodata (-9999, 3e38) in any unit; `load` knows the unit and is stricter."""
 MAX_CELLS = 100_000_000
@@ -48,12 +51,6 @@ def height_share(
     float or None
         None if a raster cannot be read, or not in parts, or has far finer cells than the grid.
     """
-    import numpy as np
-
-    from flexroad.catalog.headers.kept_rasters import kept_raster
-    from flexroad.catalog.headers.open_raster import ERRORS
-    from flexroad.catalog.headers.rasters import quiet
-
     known = np.zeros(grid.shape, np.bool_)
     for path in paths:
         if Path(str(path)).suffix.lower() in AS_TEXT:
@@ -70,12 +67,6 @@ def height_share(
 
 def _add(known: NDArray[Any], grid: Grid, raster: Any, crs: str | None) -> bool:
     """Set the cells of a grid that have a height in an open raster; return whether it could be read."""
-    import numpy as np
-    from rasterio.windows import Window
-
-    from flexroad.catalog.crs import same, transformer
-    from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
-
     affine = raster.transform
     if georeference_fault(raster) or heights_fault(raster) or affine.b or affine.d:
         return False
