@@ -1,106 +1,111 @@
-"""Mosaic of the GeoTIFFs of a run's tiles: one lazy raster, read block by block."""
+"""Mosaic of the GeoTIFFs of a run's tiles: one lazy raster, of which parts are read when they are needed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
+from xarray.core import indexing
 
 from flexroad.catalog import Bounds, Grid, Tile
 from flexroad.catalog.crs import same
-from flexroad.catalog.grid import LATTICE_TOLERANCE
+from flexroad.catalog.grid import LATTICE_TOLERANCE, overlap
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import absolute, parse_location
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute.lazy import lazy_raster
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.tasks.export import cog
 from flexroad.tasks.io.raster import read_raster
 
-rasterio = lazy("rasterio")
+if TYPE_CHECKING:
+    import rasterio
+else:
+    rasterio = lazy("rasterio")
+
+LAYERS: tuple[tuple[str, str, str, float, dict[str, str]], ...] = (
+    ("height", cog.NAME_HEIGHT, "float32", math.nan, {"units": "m"}),
+    ("road", cog.NAME_ROAD, "bool", False, {}),
+)
+"""Name, end of the file's name, type of data, value off the finished tiles, and attributes of each layer."""
 
 
-class LayerFile(NamedTuple):
-    """One kind of GeoTIFF among the products of a tile."""
+@dataclass(frozen=True, eq=False)
+class Mosaic(xr.backends.BackendArray):
+    """One layer of the finished tiles, ``(H, W)``, which xarray reads as it reads a file."""
 
+    shape: tuple[int, int]
+    stems: tuple[str, ...]
+    """Paths of the products of the n finished tiles, without the suffix."""
+    boxes: NDArray[np.int64]
+    """``(n, 4)``, first and end row, first and end column of each tile; they may lie outside the raster."""
     suffix: str
-    """The file name after the tile id and the variant."""
-    dtype: str
+    dtype: np.dtype[Any]
     fill: float
     """Value of cells without a finished tile."""
 
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        support = indexing.IndexingSupport.BASIC
+        return indexing.explicit_indexing_adapter(key, self.shape, support, self._cells)
 
-LAYERS = {
-    "height": LayerFile(cog.NAME_HEIGHT, "float32", math.nan),
-    "road": LayerFile(cog.NAME_ROAD, "bool", False),
-}
+    def _cells(self, key: tuple[int | slice, int | slice]) -> NDArray[Any]:
+        rows, columns = (np.arange(size)[part] for size, part in zip(self.shape, key, strict=True))
+        if not (rows.size and columns.size):
+            return np.empty((*rows.shape, *columns.shape), self.dtype)
+        top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
+        values = np.full((bottom - top, right - left), self.fill, self.dtype)
+        first, start = np.maximum(self.boxes[:, [0, 2]], (top, left)).T
+        end, stop = np.minimum(self.boxes[:, [1, 3]], (bottom, right)).T
+        # The first tile in the catalog comes last, so that its cells stay where tiles overlap.
+        for i in np.flatnonzero((first < end) & (start < stop))[::-1]:
+            row, column = first[i] - self.boxes[i, 0], start[i] - self.boxes[i, 2]
+            window = rasterio.windows.Window(column, row, stop[i] - start[i], end[i] - first[i])
+            part = slice(first[i] - top, end[i] - top), slice(start[i] - left, stop[i] - left)
+            values[part] = _read(self.stems[i] + self.suffix, window)
+        chosen: NDArray[Any] = values[rows - top][..., columns - left]
+        return chosen
 
 
-class Window(NamedTuple):
-    """A rectangular part of a tile's rasters, in cells."""
+def mosaic(run: Run, variant: str, bounds: Bounds | None) -> tuple[xr.Dataset, Grid]:
+    """Return height and road of the finished tiles of a run in the bounds (m), and their grid.
 
-    stem: str
-    """The path of the tile's products without the suffix."""
-    row: int
-    """First row of the part in the tile."""
-    column: int
-    """First column of the part in the tile."""
-    height: int
-    width: int
+    The arrays are backed by Dask, with a chunk between any two neighbouring edges of tiles.
 
+    Parameters
+    ----------
+    bounds : tuple of float or None
+        None for all tiles.
 
-@dataclass(frozen=True)
-class Mosaic:
-    """A raster divided into blocks by all tile edges; each block lies in at most one finished tile."""
-
-    grid: Grid
-    """The cells of the complete raster."""
-    heights: tuple[int, ...]
-    """Number of cell rows of each row of blocks."""
-    widths: tuple[int, ...]
-    """Number of cell columns of each column of blocks."""
-    windows: dict[tuple[int, int], Window]
-    """The source of each block by its (row, column); blocks without a finished tile are absent."""
-
-    @classmethod
-    def of(cls, run: Run, variant: str, bounds: Bounds | None) -> Mosaic:
-        """Return the mosaic of the finished tiles of a run in the bounds (m); None for all tiles.
-
-        Raises
-        ------
-        ConfigError
-            If the bounds are empty, or tiles have different cell sizes or lattices.
-        """
-        tiles = run.catalog.usable
-        grid = _grid(tiles, bounds)
-        near = [tile for tile in tiles if _meet(tile.grid, grid)]
-        statuses = peek_statuses(run, near)
-        spans = [(*_span(tile, grid), status) for tile, status in zip(near, statuses, strict=True)]
-        rows = _edges([(top, bottom) for top, bottom, *_ in spans], grid.height)
-        columns = _edges([(left, right) for _, _, left, right, _ in spans], grid.width)
-        windows: dict[tuple[int, int], Window] = {}
-        for (top, bottom, left, right, status), tile in zip(spans, near, strict=True):
-            if not status.done:
-                continue
-            stem = str(absolute(run.path) / "tiles" / safe_name(tile.id) / f"{safe_name(tile.id)}_{variant}")
-            for i in _between(rows, top, bottom):
-                for j in _between(columns, left, right):
-                    size = rows[i + 1] - rows[i], columns[j + 1] - columns[j]
-                    windows.setdefault((i, j), Window(stem, rows[i] - top, columns[j] - left, *size))
-        return cls(grid, _steps(rows), _steps(columns), windows)
-
-    def layer(self, file: LayerFile) -> Any:
-        """Return one layer as a Dask array, ``(H, W)``."""
-        sources = {block: (window, file.suffix) for block, window in self.windows.items()}
-        return lazy_raster(_read, sources, self.heights, self.widths, file.dtype, file.fill)
+    Raises
+    ------
+    ConfigError
+        If the bounds are empty, or tiles have different cell sizes or lattices.
+    """
+    tiles = run.catalog.usable
+    grid = _grid(tiles, bounds)
+    near = [tile for tile in tiles if overlap(tile.grid.bounds, grid.bounds)]
+    boxes = np.array([_box(tile, grid) for tile in near], np.int64).reshape(-1, 4)
+    done = [status.done for status in peek_statuses(run, near)]
+    tile_folder = absolute(run.path) / "tiles"
+    stems = tuple(
+        str(tile_folder / safe_name(tile.id) / f"{safe_name(tile.id)}_{variant}")
+        for tile, finished in zip(near, done, strict=True)
+        if finished
+    )
+    layers = {}
+    for name, suffix, dtype, fill, attributes in LAYERS:
+        layer = Mosaic((grid.height, grid.width), stems, boxes[done], suffix, np.dtype(dtype), fill)
+        layers[name] = ("y", "x"), indexing.LazilyIndexedArray(layer), attributes
+    raster = xr.Dataset(layers, coords={"x": grid.eastings, "y": grid.northings})
+    chunks = {"y": _steps(boxes[:, :2], grid.height), "x": _steps(boxes[:, 2:], grid.width)}
+    return raster.chunk(chunks), grid
 
 
 def _grid(tiles: Sequence[Tile], bounds: Bounds | None) -> Grid:
@@ -120,11 +125,7 @@ def _grid(tiles: Sequence[Tile], bounds: Bounds | None) -> Grid:
     return Grid(first.crs, *corner, first.cell, right - left, bottom - top)
 
 
-def _meet(a: Grid, b: Grid) -> bool:
-    return a.west < b.east and b.west < a.east and a.south < b.north and b.south < a.north
-
-
-def _span(tile: Tile, grid: Grid) -> tuple[int, int, int, int]:
+def _box(tile: Tile, grid: Grid) -> tuple[int, int, int, int]:
     """Return first and end row, first and end column of a tile in the grid; they may lie outside it."""
     cells = tile.grid
     left, top = (cells.west - grid.west) / grid.cell, (grid.north - cells.north) / grid.cell
@@ -137,26 +138,15 @@ def _span(tile: Tile, grid: Grid) -> tuple[int, int, int, int]:
     return round(top), round(top) + cells.height, round(left), round(left) + cells.width
 
 
-def _edges(spans: Sequence[tuple[int, int]], size: int) -> list[int]:
-    """Return the block edges along an axis of ``size`` cells, ascending, with 0 and ``size``."""
-    inner = {edge for span in spans for edge in span if 0 < edge < size}
-    return sorted({0, size} | inner)
+def _steps(edges: NDArray[np.int64], size: int) -> tuple[int, ...]:
+    """Return the lengths of the chunks along an axis of ``size`` cells, which the edges of tiles divide."""
+    inside = edges[(edges > 0) & (edges < size)]
+    return tuple(np.diff(np.unique([0, *inside, size])).tolist())
 
 
-def _between(edges: Sequence[int], start: int, stop: int) -> range:
-    """Return the indices of the blocks from ``start`` to ``stop``, which are edges or lie outside."""
-    return range(np.searchsorted(edges, max(start, 0)), np.searchsorted(edges, min(stop, edges[-1])))
-
-
-def _steps(edges: Sequence[int]) -> tuple[int, ...]:
-    return tuple(b - a for a, b in pairwise(edges))
-
-
-def _read(source: tuple[Window, str]) -> NDArray[Any]:
+def _read(product: str, window: Any) -> NDArray[Any]:
     """Read a part of a product, ``(height, width)``."""
-    window, suffix = source
-    path = parse_location(window.stem + suffix)
+    path = parse_location(product)
     file = contained(path, path.parents[2])
-    part = rasterio.windows.Window(window.column, window.row, window.width, window.height)
-    values: NDArray[Any] = read_raster(file, path.name, lambda raster: raster.read(1, window=part))
+    values: NDArray[Any] = read_raster(file, path.name, lambda raster: raster.read(1, window=window))
     return values

@@ -19,7 +19,7 @@ from flexroad.catalog.storage.paths import exists, read
 from flexroad.catalog.text import access_reason, count, with_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.results.mosaic import LAYERS, Mosaic
+from flexroad.pipeline.results.mosaic import mosaic
 from flexroad.pipeline.results.points import Answer, Ground
 from flexroad.pipeline.results.surface import Surface, placed
 from flexroad.pipeline.run.conductor import Workers, process, reopened
@@ -236,15 +236,7 @@ class RunView:
             raise ConfigError(
                 f"{self.run.path} exports no GeoTIFF of {self.variant}; add cog to export.formats and rerun"
             )
-        mosaic = Mosaic.of(self.run, self.variant, bounds)
-        grid = mosaic.grid
-        raster = xr.Dataset(
-            {
-                "height": (("y", "x"), mosaic.layer(LAYERS["height"]), HEIGHTS),
-                "road": (("y", "x"), mosaic.layer(LAYERS["road"])),
-            },
-            coords={"x": grid.eastings, "y": grid.northings},
-        )
+        raster, grid = mosaic(self.run, self.variant, bounds)
         return placed(raster, grid.crs, grid.transform)
 
     def surface(self, bounds: Bounds | None = None) -> Surface:
