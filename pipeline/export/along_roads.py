@@ -143,7 +143,7 @@ def write_xodr(
             texts = (read(folder / _fragment(row["route"])) for row in rows if row["roads"])
             opendrive.write(file, texts, roads.frame.proj, bounds, source.run.path.name)
 
-    write_whole(folder, f"{source.run.path.name}{opendrive.NAME}", key, fill)
+    write_whole(folder / f"{source.run.path.name}{opendrive.NAME}", key, {}, fill)
     mean, largest = summary["profiles_mean_mm"], summary["profiles_max_mm"]
     missed = f"misses the surface by {mean:.0f} mm on average, at most {largest:.0f} mm, without OpenCRG"
     return with_line(summary, missed if mean is not None else "")

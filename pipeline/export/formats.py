@@ -21,11 +21,10 @@ from flexroad.pipeline.export import (
     terrain_tiles,
     tiles3d,
 )
-from flexroad.pipeline.export.joined import write_joined
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.photo import Photographed
-from flexroad.pipeline.export.pieces import Encode, figures, write_pieces
+from flexroad.pipeline.export.pieces import Encode, figures, write_joined, write_pieces
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile

@@ -9,9 +9,8 @@ import numpy as np
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.joined import part_name
 from flexroad.pipeline.export.photo import Photographed, texture_of
-from flexroad.pipeline.export.pieces import Piece
+from flexroad.pipeline.export.pieces import Piece, part_name
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import cityjson, landxml, obj, rhino, step
 from flexroad.tasks.spline.stepped import without_steps

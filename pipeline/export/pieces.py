@@ -1,16 +1,21 @@
-"""Files of an export that belong to one tile, area or road each, written by workers.
+"""Files of an export, each with a mark: what it was made of, written when it is complete.
 
-A file ``.pieces/ID.json`` names what the files of a tile were made of, and is written last: an interrupted
+Workers write the files of one tile, area or road, and its mark ``.pieces/ID.json`` last: an interrupted
 export goes on where it stopped, and writes only tiles that have changed. Files of tiles that an earlier
 export had and this one does not have are removed: a folder has one export, and its manifest counts what is
 there.
+
+A file over all tiles has a mark ``.FORMAT.json`` beside the format's folder: if nothing has changed, a later
+export does nothing. Some of these files are joined from parts of the tiles, files ``.parts/ID``, which
+together are about as large as the file itself; so they are removed when it is written.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -23,10 +28,14 @@ from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 
 MARKERS = ".pieces"
-"""Folder of the markers."""
+"""Folder of the marks of tiles, areas or roads."""
+PARTS = ".parts"
+"""Folder of the parts of a joined file."""
 Row = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
 
@@ -61,10 +70,51 @@ class Item(Protocol):
 
 Encode = Callable[[Any, Any], Piece]
 """Makes the files of an `Item` with the options of a format; runs in the worker processes."""
+Join = Callable[[Path, Iterator[bytes]], None]
+"""Writes a file from the parts of all tiles, in the order of the catalog; each part is in memory alone."""
 
 
 @dataclass(frozen=True)
-class Job:
+class _Mark:
+    """What files were made of, as JSON; written when they are complete."""
+
+    key: str
+    """Fingerprint of their content, the format's version and its options."""
+    sizes: Mapping[str, int]
+    """Names and sizes of the files."""
+    row: Row
+    """What else of them is needed later."""
+
+    @classmethod
+    def read(cls, where: Location) -> _Mark | None:
+        """Return a mark, None if it does not exist or is damaged."""
+        try:
+            content = json.loads(read(where))
+            if "figures" in content:
+                # That of a joined file of an earlier version.
+                content |= {"sizes": {content["name"]: content["size"]}, "row": content["figures"]}
+            mark = cls(content["key"], dict(content["sizes"]), content["row"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        inside = all(".." not in name.split("/") and not name.startswith("/") for name in mark.sizes)
+        return mark if inside and isinstance(mark.row, dict) else None
+
+    def write(self, where: Location) -> None:
+        write(where, json.dumps({"key": self.key, "sizes": self.sizes, "row": self.row}).encode())
+
+    def holds(self, folder: Location, key: str) -> bool:
+        """Return whether its files are of a key, and exist in their full size."""
+        return self.key == key and all(_size(folder / name) == size for name, size in self.sizes.items())
+
+    def remove_files(self, folder: Location, kept: Collection[str] = ()) -> None:
+        """Remove its files that are as an earlier export has left them; others may be of the user."""
+        for name, size in self.sizes.items():
+            if name not in kept and _size(folder / name) == size:
+                remove(folder / name)
+
+
+@dataclass(frozen=True)
+class _Job:
     """One item of an export; sent to a worker."""
 
     tile: Item
@@ -72,10 +122,10 @@ class Job:
     options: Any
     folder: str
     key: str
-    """Fingerprint of the content, the format's version and its options."""
+    """See `_Mark`."""
     group: str
-    former: Mapping[str, int]
-    """Names and sizes of the item's files of an earlier export."""
+    former: _Mark | None
+    """That of an earlier export."""
 
 
 def write_pieces(
@@ -104,16 +154,16 @@ def write_pieces(
     unchanged: list[Row] = []
     kept: set[str] = set()
 
-    def jobs() -> Iterator[Job]:
+    def jobs() -> Iterator[_Job]:
         for tile in tiles:
             marker = _marker(folder, group, tile.id)
             kept.add(marker.name)
-            written = _written(marker)
+            former = _Mark.read(marker)
             key = sha256(f"{tile.fingerprint} {version} {options}".encode()).hexdigest()
-            if written and written.key == key and written.whole(folder):
-                unchanged.append(written.row)
+            if former and former.holds(folder, key):
+                unchanged.append(former.row)
             else:
-                yield Job(tile, encode, options, str(folder), key, group, written.sizes if written else {})
+                yield _Job(tile, encode, options, str(folder), key, group, former)
 
     for row, failure in executor.map(_write, jobs(), _lost):
         if failure:
@@ -122,8 +172,8 @@ def write_pieces(
     yield from unchanged
     markers = _markers(folder, group)
     for name in listing(markers):
-        if name not in kept and (other := _written(markers / name)):
-            _remove(folder, other.sizes)
+        if name not in kept and (other := _Mark.read(markers / name)):
+            other.remove_files(folder)
             remove(markers / name)
 
 
@@ -137,13 +187,17 @@ def figures(rows: Iterable[Row]) -> dict[str, Any]:
     return ({"height_error_m": max(errors)} if errors else {}) | {"notes": said}
 
 
-def write_whole(folder: Location, name: str, key: str, fill: Callable[[Path], None]) -> None:
-    """Write one file over all pieces, unless it exists and was made with the same key.
+def write_whole(file: Location, key: str, row: Row, fill: Callable[[Path], None]) -> None:
+    """Write the one file of a folder, unless it exists and was made with the same key.
+
+    Its former one, if it had another name, is removed.
 
     Parameters
     ----------
     key : str
-        Fingerprint of its content.
+        Fingerprint of its content and name.
+    row : dict
+        Kept in its mark.
     fill : callable
         Writes the file to a local path.
 
@@ -152,30 +206,82 @@ def write_whole(folder: Location, name: str, key: str, fill: Callable[[Path], No
     OSError
         If it cannot be written.
     """
-    marker, file = folder / MARKERS / f"{name}.whole", stat(folder / name)
-    try:
-        if file is not None and json.loads(read(marker)) == {"key": key, "size": file.size}:
-            return
-    except (OSError, ValueError):
-        pass
-    with atomic_file(folder / name) as local:
+    folder = file.parent
+    former = _Mark.read(_whole_marker(folder))
+    if former and file.name in former.sizes and former.holds(folder, key):
+        return
+    with atomic_file(file) as local:
         fill(local)
         size = local.stat().st_size
-    write(marker, json.dumps({"key": key, "size": size}).encode())
+    if former:
+        former.remove_files(folder, {file.name})
+    _Mark(key, {file.name: size}, row).write(_whole_marker(folder))
 
 
-def _write(job: Job) -> tuple[Row, str]:
+def part_name(tile_id: str) -> str:
+    """Return the name of the part of a tile."""
+    return f"{PARTS}/{safe_name(tile_id)}"
+
+
+def write_joined(
+    source: Source,
+    tiles: Iterable[FinishedTile],
+    file: Location,
+    version: int,
+    encode: Callable[[FinishedTile, Any], Piece],
+    options: Any,
+    executor: Executor,
+    join: Join,
+) -> dict[str, Any]:
+    """Write one file of all tiles, unless it exists and is of the same meshes, version and options.
+
+    The figures of all tiles are returned.
+
+    Parameters
+    ----------
+    tiles : iterable of FinishedTile
+        All tiles of the source.
+    encode : callable
+        Makes the piece of a tile, whose only file has the name of `part_name`; runs in the workers.
+    options : object
+        Given to ``encode``; with the name of the file, also all that ``join`` depends on.
+
+    Raises
+    ------
+    ConfigError
+        If a tile's results cannot be read, a file cannot be written, or a worker dies twice.
+    TaskError
+        If the parts do not fit together.
+    """
+    folder = file.parent
+    made_of = sha256(f"{file.name} {version} {options}".encode())
+    for tile, snapshot in zip(source.tiles, source.snapshots, strict=True):
+        made_of.update(f" {tile.id} {snapshot.nodes['sample']}".encode())
+    key, mark = made_of.hexdigest(), _Mark.read(_whole_marker(folder))
+    if mark and mark.holds(folder, key):
+        for _ in tiles:
+            pass  # each is checked to be still finished
+        rows = mark.row
+    else:
+        rows = figures(write_pieces(tiles, folder, version, encode, options, executor))
+        parts = (read(folder / part_name(tile.id)) for tile in source.tiles)
+        write_whole(file, key, rows, lambda local: join(local, parts))
+    _remove_parts(folder)
+    return rows
+
+
+def _write(job: _Job) -> tuple[Row, str]:
     """Write the files of a tile; return its row, or the reason why it has none."""
     folder = parse_location(job.folder)
     try:
         piece = job.encode(job.tile, job.options)
-        # First, while the marker still names them.
-        _remove(folder, {name: size for name, size in job.former.items() if name not in piece.files})
+        # First, while the mark still names them.
+        if job.former:
+            job.former.remove_files(folder, piece.files)
         for name, data in piece.files.items():
             write(folder / name, data)
         sizes = {name: len(data) for name, data in piece.files.items()}
-        marker = json.dumps({"key": job.key, "sizes": sizes, "row": piece.row})
-        write(_marker(folder, job.group, job.tile.id), marker.encode())
+        _Mark(job.key, sizes, piece.row).write(_marker(folder, job.group, job.tile.id))
     except OSError as error:
         return {}, f"{job.tile.label}: {error}; correct that, and the same command goes on"
     except (ConfigError, TaskError, CatalogError) as error:
@@ -184,7 +290,7 @@ def _write(job: Job) -> tuple[Row, str]:
     return piece.row, ""
 
 
-def _lost(job: Job, reason: str) -> tuple[Row, str]:
+def _lost(job: _Job, reason: str) -> tuple[Row, str]:
     return {}, f"{job.tile.label}: {reason}"
 
 
@@ -196,33 +302,19 @@ def _marker(folder: Location, group: str, tile_id: str) -> Location:
     return _markers(folder, group) / f"{safe_name(tile_id)}.json"
 
 
-@dataclass(frozen=True)
-class _Written:
-    """The files of a tile that an export has written, by its marker."""
-
-    key: str
-    sizes: Mapping[str, int]
-    row: Row
-
-    def whole(self, folder: Location) -> bool:
-        """Return whether all files exist in their full size."""
-        return all((file := stat(folder / name)) and file.size == size for name, size in self.sizes.items())
+def _whole_marker(folder: Location) -> Location:
+    return folder.parent / f".{folder.name}.json"
 
 
-def _written(marker: Location) -> _Written | None:
-    """Return what a marker says, None if it does not exist or is damaged."""
-    try:
-        content = json.loads(read(marker))
-        written = _Written(content["key"], dict(content["sizes"]), content["row"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    inside = all(".." not in name.split("/") and not name.startswith("/") for name in written.sizes)
-    return written if inside and isinstance(written.row, dict) else None
+def _size(file: Location) -> int | None:
+    found = stat(file)
+    return found.size if found else None
 
 
-def _remove(folder: Location, sizes: Mapping[str, int]) -> None:
-    """Remove files that are as an earlier export has left them; others may be of the user."""
-    for name, size in sizes.items():
-        file = stat(folder / name)
-        if file and file.size == size:
-            remove(folder / name)
+def _remove_parts(folder: Location) -> None:
+    for part in (folder / PARTS, folder / MARKERS):
+        for name in listing(part):
+            remove(part / name)
+        if isinstance(part, Path):
+            with contextlib.suppress(OSError):
+                part.rmdir()

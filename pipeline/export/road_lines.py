@@ -54,7 +54,7 @@ def write_lines(
             road_lines.write(file, (road for row in rows for road in _of_route(folder, row)), crs, date)
             copyfile(file, local)
 
-    write_whole(folder, f"{source.run.path.name}{road_lines.NAME}", key, fill)
+    write_whole(folder / f"{source.run.path.name}{road_lines.NAME}", key, {}, fill)
     return with_line(totals(rows, roads))
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export import joined, pieces
+from flexroad.pipeline.export import pieces
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.output import BEGUN
@@ -68,6 +68,32 @@ def test_second_export_encodes_nothing_and_says_the_same(made_city, tmp_path, na
     assert file.stat().st_mtime_ns == before
 
 
+@each
+def test_mark_of_an_earlier_version_is_valid(made_city, tmp_path, name, encoded):
+    write(made_city, tmp_path, name)
+    mark = json.loads((tmp_path / f".{name}.json").read_text())
+    ((file, size),) = mark["sizes"].items()
+    earlier = {"key": mark["key"], "name": file, "size": size, "figures": mark["row"]}
+    (tmp_path / f".{name}.json").write_text(json.dumps(earlier))
+    encoded.clear()
+    write(made_city, tmp_path, name)
+    assert not encoded
+
+
+def test_whole_file_is_written_once_and_replaces_one_of_another_name(tmp_path):
+    filled = []
+
+    def fill(local):
+        filled.append(local)
+        local.write_text("roads")
+
+    for name in ("first.xodr", "first.xodr", "second.xodr"):
+        (tmp_path / "xodr").mkdir(exist_ok=True)
+        pieces.write_whole(tmp_path / "xodr" / name, "key", {}, fill)
+    assert len(filled) == 2
+    assert [path.name for path in (tmp_path / "xodr").iterdir()] == ["second.xodr"]
+
+
 @pytest.mark.parametrize("damage", ["removed", "cut", "record"])
 @each
 def test_damaged_file_is_written_again(made_city, tmp_path, name, encoded, damage):
@@ -92,7 +118,7 @@ def test_parts_of_an_interrupted_export_are_used(made_city, tmp_path, name, enco
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(joined, "atomic_file", interrupted)
+        patch.setattr(pieces, "atomic_file", interrupted)
         with pytest.raises(KeyboardInterrupt):
             write(made_city, tmp_path, name)
     assert encoded == list(made_city.done)
