@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,8 @@ Bounds = tuple[float, float, float, float]
 
 FARTHEST = 1e9
 """Largest coordinate, in any unit: beyond it are no places on Earth, but damaged numbers."""
+MOST_CELLS = 2**31 - 1
+"""Largest width and height of a raster in GDAL."""
 LATTICE_TOLERANCE = 0.01
 """Two lattices coincide when they are off by less than this part of a cell."""
 
@@ -59,6 +61,25 @@ class Grid:
         width = math.ceil(round((east - west) / cell, 6))
         height = math.ceil(round((north - south) / cell, 6))
         return cls(crs, west, north, cell, width, height)
+
+    @classmethod
+    def holding(cls, grids: Sequence[Grid]) -> Grid | None:
+        """Return the smallest grid that has the cells of all grids.
+
+        It is None if there are none, their lattices or CRSs differ, or it has more than `MOST_CELLS` a side.
+        """
+        if not grids:
+            return None
+        crs, cell = grids[0].crs, grids[0].cell
+        west, north = min(grid.west for grid in grids), max(grid.north for grid in grids)
+        east, south = max(grid.east for grid in grids), min(grid.south for grid in grids)
+        for grid in grids:
+            columns, rows = (grid.west - west) / cell, (north - grid.north) / cell
+            off = max(abs(columns - round(columns)), abs(rows - round(rows)))
+            if (grid.crs, grid.cell) != (crs, cell) or off > LATTICE_TOLERANCE:
+                return None
+        width, height = round((east - west) / cell), round((north - south) / cell)
+        return cls(crs, west, north, cell, width, height) if max(width, height) <= MOST_CELLS else None
 
     @property
     def has_code(self) -> bool:

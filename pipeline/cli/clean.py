@@ -28,10 +28,9 @@ def clean(
     """
     from flexroad.catalog.storage.paths import absolute, parse_location
     from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
-    from flexroad.pipeline.run.folder import check_links
     from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
     from flexroad.pipeline.run.lock import run_lock
-    from flexroad.pipeline.run.record import Run
+    from flexroad.pipeline.run.record import Run, check_links
     from flexroad.pipeline.run.store_users import runs_using, unregister
 
     def say(line: str) -> None:

@@ -123,7 +123,7 @@ def export(
     from flexroad.pipeline.export.driver import export as write
     from flexroad.pipeline.export.options import Options
     from flexroad.pipeline.export.source import select
-    from flexroad.pipeline.monitor.progress import StepProgress
+    from flexroad.pipeline.run.progress import StepProgress
 
     datum = _datum(vertical, geoid, height_offset)
     if roads_layer and not roads:

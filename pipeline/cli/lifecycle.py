@@ -18,7 +18,7 @@ from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from flexroad.pipeline.monitor.prometheus import Textfile
+    from flexroad.pipeline.run.prometheus import Textfile
     from flexroad.pipeline.run.summary import Summary
 
 CANNOT_START = 2
@@ -122,7 +122,7 @@ def signals_interrupt() -> Iterator[None]:
 def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
     if path is None:
         return None
-    from flexroad.pipeline.monitor.prometheus import Textfile
+    from flexroad.pipeline.run.prometheus import Textfile
 
     try:
         return stack.enter_context(Textfile(path, str(absolute(run))))
@@ -141,7 +141,7 @@ def _notify(outcome: Outcome, run: Location, before: dict[str, Any], target: str
     """Send the outcome to the target if the exit code is not 0."""
     if not target or not outcome.exit_code:
         return
-    from flexroad.pipeline.monitor.alerts import notify
+    from flexroad.pipeline.run.alerts import notify
     from flexroad.pipeline.run.summary import read_summary
 
     after = read_summary(run)

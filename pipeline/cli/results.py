@@ -53,8 +53,8 @@ def report(
     from rich.console import Console
 
     from flexroad.catalog.storage.paths import parse_location, read
-    from flexroad.pipeline.monitor.progress import StepProgress
     from flexroad.pipeline.report import write_report
+    from flexroad.pipeline.run.progress import StepProgress
     from flexroad.pipeline.run.record import Run
 
     if form != "html" and (compared or viewer):

@@ -19,8 +19,8 @@ from flexroad.pipeline.errors import ClusterLost
 from flexroad.pipeline.run.observer import Observer
 
 if TYPE_CHECKING:
-    from flexroad.pipeline.monitor.progress import ProgressDisplay
     from flexroad.pipeline.run.conductor import Prepared
+    from flexroad.pipeline.run.progress import ProgressDisplay
     from flexroad.pipeline.run.record import Run
     from flexroad.pipeline.run.summary import Summary
     from flexroad.pipeline.worker.tile import TileResult
@@ -196,7 +196,7 @@ class Shown(Observer):
     @contextlib.contextmanager
     def working(self, work: str) -> Iterator[None]:
         """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
-        from flexroad.pipeline.monitor.progress import FIRST_S, said_repeatedly
+        from flexroad.pipeline.run.progress import FIRST_S, said_repeatedly
 
         def line(spent_s: float) -> str:
             return f"{work}, {spent_s:.0f} s spent"
@@ -216,7 +216,7 @@ class Shown(Observer):
         """Show the progress."""
         from rich.console import Console
 
-        from flexroad.pipeline.monitor.progress import ProgressDisplay
+        from flexroad.pipeline.run.progress import ProgressDisplay
 
         self.display = self._stack.enter_context(ProgressDisplay(selected, Console(stderr=True)))
         if self.outcome.textfile is not None:
@@ -294,7 +294,7 @@ def status(
 
     opened = Run.open(parse_location(path), allow or ())
     if geojson is not None:
-        from flexroad.pipeline.run.geojson import write_states
+        from flexroad.pipeline.run.collection import write_states
 
         write_states(opened, parse_location(geojson))
         echo(str(geojson))

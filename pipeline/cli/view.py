@@ -69,7 +69,7 @@ def view(
     from flexroad.catalog.storage.paths import is_remote, parse_location
     from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
     from flexroad.pipeline.export.viewer import write_viewer
-    from flexroad.pipeline.monitor.progress import StepProgress
+    from flexroad.pipeline.run.progress import StepProgress
     from flexroad.pipeline.run.record import Run
 
     if port and not serve:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.crs import compound
-from flexroad.catalog.grid import Bounds, Grid
+from flexroad.catalog.grid import MOST_CELLS, Bounds, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -31,7 +31,6 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.pipeline.run.mosaic import MOST_CELLS, common_grid
 from flexroad.tasks.export import cog
 from flexroad.tasks.types import Floats
 
@@ -150,7 +149,7 @@ def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
         If the grids have no common lattice, or the grid has too many cells.
     """
     if cell is None:
-        whole = common_grid(grids)
+        whole = Grid.holding(grids)
         if whole is None:
             raise ConfigError("the tiles have cells of several sizes or lattices; give --resolution METRES")
         return whole

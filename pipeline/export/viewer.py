@@ -20,8 +20,7 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.pieces import write_pieces
 from flexroad.pipeline.export.viewer_tile import Look, Shown, piece
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
-from flexroad.pipeline.run.folder import check_links
-from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.record import Run, check_links
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
 from flexroad.tasks.export import glb, viewer
 from flexroad.tasks.io.vertical import vertical_crs

@@ -27,7 +27,6 @@ from flexroad.catalog import Layer, Tile
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
 from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderPattern, BorderTask, has_borders
-from flexroad.pipeline.graph.products import product_layers, product_options, product_versions
 from flexroad.pipeline.graph.sources import (
     Recorded,
     SourceFiles,
@@ -46,7 +45,14 @@ from flexroad.pipeline.graph.stages import (
     stage_head,
     stage_module,
 )
+from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.options import Options
+
+ITEM_VERSION = 2
+"""Raised when the STAC item of a tile changes for the same result."""
+PHOTO = "texture"
+"""Start of the names of the options of the photo on the mesh."""
+FORMATS = {"glb": glb, "ply": ply, "cog": cog, "npz": npz}
 
 
 @dataclass(frozen=True)
@@ -236,6 +242,24 @@ class Pattern:
         ]
         layers = [sources.text(layer) for layer in _product_sources(tile, self.export)]
         return hashed(f"{','.join([to_json(requested)[:-1], *layers, self.exported])}]")
+
+
+def product_versions(export: Export) -> dict[str, int]:
+    """Return the versions of the item and of the exported formats."""
+    return {"item": ITEM_VERSION} | {name: FORMATS[name].VERSION for name in export.formats}
+
+
+def product_options(export: Export) -> dict[str, Any]:
+    """Return the options that the products depend on: without a texture not those of the texture."""
+    options: dict[str, Any] = export.model_dump(mode="json")
+    if export.texture:
+        return options
+    return {name: value for name, value in options.items() if not name.startswith(PHOTO)}
+
+
+def product_layers(export: Export) -> tuple[str, ...]:
+    """Return the names of the source layers that the products are made of."""
+    return ("dop",) if export.texture else ()
 
 
 def _product_sources(tile: Tile, export: Export) -> tuple[Layer, ...]:

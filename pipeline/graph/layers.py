@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.products import product_layers
+from flexroad.pipeline.graph.graph import product_layers
 from flexroad.pipeline.graph.stages import stage_module, stage_version
 
 PRODUCTION = {"road_mask": "production", "roads": "production_vector"}

@@ -19,7 +19,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.report.pages import template
 from flexroad.pipeline.report.render import curves, segmentation_map
 from flexroad.pipeline.run.record import versions
-from flexroad.pipeline.store.products import no_nan
+from flexroad.pipeline.store.records import no_nan
 from flexroad.pipeline.training.train import Evaluation, Outcome
 from flexroad.tasks.roads.mask_metrics import Quality
 

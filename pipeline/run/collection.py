@@ -1,25 +1,50 @@
-"""The STAC collection of a run, ``RUN/collection.json``: the way to the items of its done tiles."""
+"""What describes all tiles of a run at once, for other programs.
+
+``RUN/collection.json`` is a STAC collection, the way to the items of the done tiles. ``RUN/height.vrt`` and
+the like are their rasters as one, in GDAL's format for this: its own builder is not in rasterio, and the file
+is written as a stream, because a state has hundreds of thousands of tiles. ``RUN/tiles.geojson`` is a map of
+the state of every tile.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
+from xml.sax.saxutils import XMLGenerator, escape
+from xml.sax.xmlreader import AttributesImpl
 
-from flexroad.catalog import Tile
-from flexroad.catalog.crs import bounds_in
+import numpy as np
+import shapely
+
+from flexroad.catalog import Grid, Tile
+from flexroad.catalog.crs import bounds_in, transformer
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.index import PROJECTION, STAC_VERSION, datetime_text
-from flexroad.catalog.storage.paths import remove, write
+from flexroad.catalog.storage.paths import Location, remove, write
+from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
-from flexroad.pipeline.run.mosaic import vrt_name, write_mosaics
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.store.records import DONE
-from flexroad.pipeline.worker.exports import Kind
-from flexroad.pipeline.worker.stac import COLLECTION, EXTENSIONS, GEOJSON, JSON, item_assets
+from flexroad.pipeline.run.status import open_database, recorded
+from flexroad.pipeline.store.database import TileState
+from flexroad.pipeline.store.records import DONE, TileRecord
+from flexroad.pipeline.worker.exports import (
+    COLLECTION,
+    EXTENSIONS,
+    GEOJSON,
+    JSON,
+    KINDS,
+    Kind,
+    file_name,
+    item_assets,
+)
+from flexroad.tasks.export.cog import BLOCK, Band
 
+MAP = "tiles.geojson"
+MAP_COLUMNS = ("id", "state", "stale", "error", "seconds", "error_estimate_m", "flags", "finished")
 METRICS = {
     "href": "./metrics.parquet",
     "type": "application/vnd.apache.parquet",
@@ -28,6 +53,8 @@ METRICS = {
 }
 VRT = "application/xml"
 """Media type of mosaics; GDAL's format has none of its own."""
+TYPES = {"float32": "Float32", "uint8": "Byte"}
+"""GDAL's names of the types of cells."""
 
 
 def write_collection(run: Run, done: Sequence[Tile]) -> None:
@@ -102,3 +129,164 @@ def _degrees(tiles: Sequence[Tile]) -> Bounds:
 def _union(bounds: Sequence[Bounds]) -> Bounds:
     wests, souths, easts, norths = zip(*bounds, strict=True)
     return min(wests), min(souths), max(easts), max(norths)
+
+
+def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
+    """Write a VRT for each raster of the main variant over the done tiles; return their kinds.
+
+    Tiles without a common lattice, or without exported rasters, give none; older files are then removed.
+
+    Raises
+    ------
+    OSError
+        If one cannot be written.
+    """
+    grid = Grid.holding([tile.grid for tile in done]) if "cog" in run.config.export.formats else None
+    written = []
+    for kind in KINDS["cog"]:
+        path = run.path / vrt_name(kind)
+        if grid is None or kind.band is None:
+            remove(path)
+            continue
+        with atomic_file(path, run.config.cluster.flush) as local, local.open("w", encoding="utf-8") as file:
+            xml = XMLGenerator(file, "utf-8", short_empty_elements=True)
+            _write_vrt(xml, grid, kind, kind.band, done, run.config.export.variants[0])
+        written.append(kind)
+    return written
+
+
+def vrt_name(kind: Kind) -> str:
+    """Return the name of the mosaic of a kind of raster."""
+    return f"{kind.key}.vrt"
+
+
+def _write_vrt(
+    xml: XMLGenerator, grid: Grid, kind: Kind, band: Band, tiles: Sequence[Tile], variant: str
+) -> None:
+    _begin(xml, "VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
+    _leaf(xml, "SRS", grid.crs)
+    _leaf(xml, "GeoTransform", f"{grid.west!r}, {grid.cell!r}, 0.0, {grid.north!r}, 0.0, {-grid.cell!r}")
+    _begin(xml, "VRTRasterBand", dataType=TYPES[band.dtype], band="1")
+    _describe(xml, band)
+    for tile in tiles:
+        name = f"tiles/{safe_name(tile.id)}/{file_name(tile.id, variant, kind)}"
+        _source(xml, name, grid, tile.grid, band)
+    xml.endElement("VRTRasterBand")
+    xml.endElement("VRTDataset")
+
+
+def _describe(xml: XMLGenerator, band: Band) -> None:
+    """Write name, unit, nodata, colours and names of classes."""
+    _leaf(xml, "Description", band.name)
+    if band.unit:
+        _leaf(xml, "UnitType", band.unit)
+    if band.nodata is not None:
+        _leaf(xml, "NoDataValue", _number(band.nodata))
+    if not band.classes:
+        _leaf(xml, "ColorInterp", "Gray")
+        return
+    _leaf(xml, "ColorInterp", "Palette")
+    _begin(xml, "CategoryNames")
+    for one in band.classes:
+        _leaf(xml, "Category", one.name)
+    xml.endElement("CategoryNames")
+    _begin(xml, "ColorTable")
+    for one in band.classes:
+        red, green, blue = map(str, one.colour)
+        _leaf(xml, "Entry", c1=red, c2=green, c3=blue, c4="255")
+    xml.endElement("ColorTable")
+
+
+def _source(xml: XMLGenerator, name: str, whole: Grid, tile: Grid, band: Band) -> None:
+    """Write the file of one tile; where it has nodata, other tiles show."""
+    kind = "SimpleSource" if band.nodata is None else "ComplexSource"
+    size = f'xSize="{tile.width}" ySize="{tile.height}"'
+    left, top = round((tile.west - whole.west) / whole.cell), round((whole.north - tile.north) / whole.cell)
+    nodata = "" if band.nodata is None else f"<NODATA>{_number(band.nodata)}</NODATA>"
+    # Written as text, because element by element it takes several times as long. With the properties, GDAL
+    # does not open all files when it opens the mosaic.
+    xml.ignorableWhitespace(
+        f'<{kind}><SourceFilename relativeToVRT="1">{escape(name)}</SourceFilename><SourceBand>1</SourceBand>'
+        f'<SourceProperties RasterXSize="{tile.width}" RasterYSize="{tile.height}" '
+        f'DataType="{TYPES[band.dtype]}" BlockXSize="{BLOCK}" BlockYSize="{BLOCK}"/>'
+        f'<SrcRect xOff="0" yOff="0" {size}/><DstRect xOff="{left}" yOff="{top}" {size}/>{nodata}</{kind}>'
+    )
+
+
+def _begin(xml: XMLGenerator, name: str, **attributes: str) -> None:
+    xml.startElement(name, AttributesImpl(attributes))
+
+
+def _leaf(xml: XMLGenerator, name: str, text: str = "", **attributes: str) -> None:
+    _begin(xml, name, **attributes)
+    xml.characters(text)
+    xml.endElement(name)
+
+
+def _number(value: float) -> str:
+    return "nan" if math.isnan(value) else f"{value:g}"
+
+
+def write_states(run: Run, where: Location) -> None:
+    """Write the tiles as polygons in longitude and latitude (WGS 84, RFC 7946).
+
+    Columns: ``id``; ``state`` (``done``: computed by the last run; ``cached``: done before it; ``failed``;
+    ``pending``); ``stale``, whether a failed or pending tile still has products of an earlier result;
+    ``error``, the reason of a failure; ``seconds``, the computing time; ``error_estimate_m``, the error
+    estimate of the surface exported first (m); ``flags``, its flags, such as ``no-road``; ``finished``, the
+    time of completion.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    variant = run.config.export.variants[0]
+    with open_database(run) as database:
+        rows = [
+            _map_row(tile_id, state, record, variant) for tile_id, state, record in recorded(run, database)
+        ]
+    features = [
+        {
+            "id": row["id"],
+            "type": "Feature",
+            "properties": {name: row.get(name) for name in MAP_COLUMNS},
+            "geometry": json.loads(outline) if outline else None,
+        }
+        for row, outline in zip(rows, shapely.to_geojson(outlines(run.catalog.tiles)), strict=True)
+    ]
+    content = {"type": "FeatureCollection", "features": features}
+    write(where, json.dumps(content).encode(), run.config.cluster.flush)
+
+
+def outlines(tiles: Sequence[Tile]) -> Any:
+    """Return the outlines of tiles in longitude and latitude, an ``(n,)`` array of shapely polygons.
+
+    Polygons are anticlockwise; coordinates are rounded to 1e-7 degrees (about 1 cm). Tiles of one CRS are
+    transformed together. Tiles without a known position (`Tile.fault`) have None.
+    """
+    shapes = np.array([None if tile.fault else shapely.box(*tile.grid.bounds) for tile in tiles], object)
+    crs_of_tile = np.array([tile.grid.crs for tile in tiles], object)
+    for crs in set(crs_of_tile[shapes != None]):  # noqa: E711 (of each shape)
+        selected = crs_of_tile == crs
+        convert = transformer(crs, "EPSG:4326").transform
+        shapes[selected] = shapely.transform(shapes[selected], convert, interleaved=False)
+    # Beyond the range of a CRS coordinates are infinite.
+    return np.where(
+        shapely.is_valid(shapes), shapely.transform(shapes, lambda degrees: degrees.round(7)), None
+    )
+
+
+def _map_row(tile_id: str, state: TileState, record: TileRecord | None, variant: str) -> dict[str, Any]:
+    stale = state in ("failed", "pending") and record is not None and record.has_products
+    row: dict[str, Any] = {"id": tile_id, "state": state, "stale": stale}
+    # The record of a pending tile belongs to earlier files or options.
+    if record is not None and state != "pending":
+        row |= {"seconds": round(record.seconds, 3), "finished": record.finished or None}
+        if record.failures:
+            row["error"] = record.failures[0].line
+        for metrics in record.rows:
+            if metrics["variant"] == variant:
+                row["error_estimate_m"] = metrics.get("error_estimate_m")
+                row["flags"] = metrics.get("flags") or None
+    return row

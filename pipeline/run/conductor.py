@@ -9,8 +9,10 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,25 +20,27 @@ from flexroad.catalog import Bounds, Catalog, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.area import Area
 from flexroad.catalog.storage.outputs import made_folder
-from flexroad.catalog.storage.paths import Location
+from flexroad.catalog.storage.paths import Location, exists
+from flexroad.catalog.text import printable
+from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.settings import Setting, applied
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.run.folder import check_folder, check_links
-from flexroad.pipeline.run.geojson import NAME as MAP
-from flexroad.pipeline.run.geojson import write_states
+from flexroad.pipeline.run.collection import MAP, write_states
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.observer import Observer
-from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.record import Run, check_folder, check_links
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.selection import merged_catalog, rerun_filter
+from flexroad.pipeline.run.status import Folders
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.run.workers import with_workers
+from flexroad.pipeline.store.records import FAILED
 
 Kind = Literal["auto", "serial", "dask"]
+SECTION = "cluster"
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class Selection:
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
         some = self.tiles or self.bbox is not None or self.area
-        return Selected(merged_catalog(path, whole, selected) if some else whole, selected)
+        return Selected(_merged_catalog(path, whole, selected) if some else whole, selected)
 
 
 ALL = Selection()
@@ -238,6 +242,78 @@ def stages_from(stage: str | None) -> frozenset[str]:
     force = frozenset(steps[steps.index(stage) :]) if stage else frozenset()
     # The control points of a border are part of the fit.
     return force | {BORDER} if "fit" in force else force
+
+
+def rerun_filter(run: Run, tiles: Sequence[str], failed: bool) -> Callable[[Tile], bool]:
+    """Return a filter for the tiles of a rerun: the given tiles, the failed ones, both, or all.
+
+    Raises
+    ------
+    CatalogError
+        If a tile is not in the run's catalog.
+    """
+    folders = Folders(run.path)
+    ids = {tile.id for tile in run.catalog.select(tiles).tiles} if tiles else set()
+
+    def selected(tile: Tile) -> bool:
+        if tile.id in ids or not (ids or failed):
+            return True
+        # The marker is enough, even if it is of other sources: a corrected file is a reason to rerun.
+        return failed and FAILED in folders(tile.id)
+
+    return selected
+
+
+def _merged_catalog(path: Location, whole: Catalog, wanted: Catalog) -> Catalog:
+    """Return the tiles of the run at ``path`` when the tiles ``wanted`` of a catalog are requested.
+
+    They are those tiles and the earlier tiles of the run that are still in the catalog, so that the results
+    of these stay in the tables.
+    """
+    record = path / "catalog.parquet"
+    earlier = {tile.id for tile in Catalog.read(record).tiles} if exists(record) else set()
+    ids = earlier | {tile.id for tile in wanted.tiles}
+    return Catalog(tuple(tile for tile in whole.tiles if tile.id in ids))
+
+
+def with_workers(run: Run, settings: Sequence[str]) -> Run:
+    """Return a run with options of its workers replaced for one command.
+
+    Those of RUN/config.yaml that can start programs (`Cluster.programs`) count only if they are sealed: the
+    run may come from anyone.
+
+    Parameters
+    ----------
+    run : Run
+    settings : sequence of str
+        Options of the command line: ``cluster.workers=8``.
+
+    Raises
+    ------
+    ConfigError
+        If a setting is not of the workers or is invalid, or an option that can start programs is neither
+        sealed nor among the settings.
+    """
+    parsed = [Setting.parse(text) for text in settings]
+    for setting in parsed:
+        if setting.keys[0] != SECTION:
+            raise ConfigError(
+                f"--set {printable('.'.join(setting.keys))}: rerun takes options of {SECTION} only, like "
+                f"--set {SECTION}.workers=8; change others with `flexroad run`"
+            )
+    config = run.config
+    if parsed:
+        config = compose(applied(config.raw, parsed), config.name)
+    given = {name for setting in parsed for name in setting.keys[1:2]}
+    whole = any(len(setting.keys) == 1 for setting in parsed)
+    unsealed = {name: value for name, value in config.cluster.programs.items() if name not in given}
+    if unsealed and not whole and not run.programs_sealed:
+        again = (f"--set {shlex.quote(f'{SECTION}.{n}={json.dumps(v)}')}" for n, v in unsealed.items())
+        raise ConfigError(
+            f"{run.path / 'config.yaml'}: {SECTION}.{next(iter(unsealed))} can start programs, and this user "
+            f"has not given it on this machine; if it is right, add {' '.join(again)}"
+        )
+    return replace(run, config=config)
 
 
 @contextlib.contextmanager

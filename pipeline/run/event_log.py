@@ -22,7 +22,7 @@ from typing import IO, Any
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.storage.staging import StagedFile
-from flexroad.pipeline.worker.profiling import utc_now
+from flexroad.pipeline.store.records import utc_now
 from flexroad.pipeline.worker.tile import TileResult
 
 NAME = "log.jsonl"

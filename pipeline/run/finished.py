@@ -21,8 +21,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, parse_location, read, stat
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing
-from flexroad.pipeline.graph.products import product_layers
+from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
 from flexroad.pipeline.store import checked_json

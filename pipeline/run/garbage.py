@@ -20,9 +20,8 @@ from flexroad.catalog.storage.paths import Location, absolute, entries, exists, 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.stages import STAGE_NAMES
-from flexroad.pipeline.run.folder import RECORD, check_links
 from flexroad.pipeline.run.lock import run_lock
-from flexroad.pipeline.run.record import Run, check_models
+from flexroad.pipeline.run.record import RECORD, Run, check_links, check_models
 from flexroad.pipeline.run.status import open_database, peek_statuses
 from flexroad.pipeline.run.store_users import FOLDER, runs_using
 from flexroad.pipeline.store.records import DONE, FAILED

@@ -12,7 +12,16 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import absolute, exists, flush_names, parse_location, stat
+from flexroad.catalog.storage.paths import (
+    Location,
+    absolute,
+    exists,
+    flush_names,
+    parse_location,
+    read,
+    stat,
+    write,
+)
 from flexroad.catalog.storage.scratch import remove_abandoned
 from flexroad.catalog.text import access_reason
 from flexroad.pipeline.errors import ConfigError
@@ -20,7 +29,6 @@ from flexroad.pipeline.execute import Executor, Jobs
 from flexroad.pipeline.graph.graph import TileGraph, own_files_missing
 from flexroad.pipeline.run.collection import write_collection
 from flexroad.pipeline.run.event_log import EventLog
-from flexroad.pipeline.run.previous import keep_previous
 from flexroad.pipeline.run.record import Run, check_inputs
 from flexroad.pipeline.run.status import (
     Folders,
@@ -30,11 +38,10 @@ from flexroad.pipeline.run.status import (
     tile_states,
     tile_statuses,
 )
-from flexroad.pipeline.run.summary import Summary, summarise, write_summary
+from flexroad.pipeline.run.summary import Summary, read_summary, summarise, write_summary
 from flexroad.pipeline.store.database import RunDatabase, TileState
-from flexroad.pipeline.store.records import DONE, Failure, TileRecord
-from flexroad.pipeline.store.tables import write_tables
-from flexroad.pipeline.worker.profiling import utc_now
+from flexroad.pipeline.store.records import DONE, Failure, TileRecord, utc_now
+from flexroad.pipeline.store.tables import METRICS, PREVIOUS, write_tables
 from flexroad.pipeline.worker.shared_files import SharedFiles
 from flexroad.pipeline.worker.tile import (
     TileJob,
@@ -253,7 +260,7 @@ def _close(
     if plan:
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:
-            keep_previous(run.path, run.config.cluster.flush)
+            _keep_previous(run.path, run.config.cluster.flush)
         write_tables(run.path, database.rows(), database.failures(), run.config.cluster.flush)
         states = zip(run.catalog.tiles, database.states(), strict=True)
         write_collection(run, [tile for tile, state in states if state in ("done", "cached")])
@@ -264,6 +271,17 @@ def _close(
     if run.config.cluster.flush:
         flush_names(run.path)
     return summary
+
+
+def _keep_previous(run: Location, flushed: bool) -> None:
+    """Keep metrics.parquet as metrics.previous.parquet, if the last execution was complete.
+
+    One that was interrupted or refused has left a table of some tiles: then the one before it stays.
+    """
+    last, table = read_summary(run), run / METRICS
+    complete = last.get("pending") == 0 and not last.get("interrupted") and not last.get("refused")
+    if complete and exists(table):
+        write(run / PREVIOUS, read(table), flushed)
 
 
 def _final_summary(

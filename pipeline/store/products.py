@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store import checked_json
+from flexroad.pipeline.store.records import DONE, FAILED
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class TileProducts:
 
     def done(self, graph: TileGraph) -> dict[str, Any] | None:
         """Return the tile's item, None unless it has the graph's fingerprint and all products exist."""
-        item = self._read("item.json")
+        item = self._read(DONE)
         try:
             if item is None or item["properties"]["flexroad:fingerprint"] != graph.fingerprint:
                 return None
@@ -61,7 +61,7 @@ class TileProducts:
 
     def nodes(self, variant: str) -> dict[str, str]:
         """Return the fingerprint of each stage of a variant when the tile was last finished."""
-        item = self._read("item.json") or {}
+        item = self._read(DONE) or {}
         try:
             return dict(item["properties"]["flexroad:nodes"][variant])
         except (KeyError, TypeError, ValueError):
@@ -69,7 +69,7 @@ class TileProducts:
 
     def verified(self) -> bool:
         """Return whether every product named by the item has the checksum it was written with."""
-        item = self._read("item.json") or {}
+        item = self._read(DONE) or {}
         try:
             return all(
                 _checksum(paths.read(self.file(asset["href"]))) == asset["file:checksum"]
@@ -93,8 +93,8 @@ class TileProducts:
                 paths.flush(self.path / name)
             # Otherwise a new item could meet an old product of the same size.
             paths.flush_names(self.path)
-        self._mark("item.json", item, flushed)
-        paths.remove(self.file("failed.json"))
+        self._mark(DONE, item, flushed)
+        paths.remove(self.file(FAILED))
 
     def fail(self, failure: dict[str, Any], flushed: bool = False) -> None:
         """Write failed.json and remove the item, so that the tile no longer counts as done.
@@ -102,11 +102,11 @@ class TileProducts:
         With ``flushed`` the file is on the disk at the end.
         """
         self._unmark(flushed)
-        self._mark("failed.json", failure, flushed)
+        self._mark(FAILED, failure, flushed)
 
     def _unmark(self, flushed: bool) -> None:
         """Remove the item; with ``flushed`` it is not back after a power failure."""
-        paths.remove(self.file("item.json"))
+        paths.remove(self.file(DONE))
         if flushed:
             paths.flush_names(self.path)
 
@@ -135,8 +135,3 @@ def file_entry(name: str, data: bytes, media_type: str) -> dict[str, Any]:
 
 def _checksum(data: bytes) -> str:
     return "1220" + hashlib.sha256(data).hexdigest()
-
-
-def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row with None for NaN and infinities, which JSON cannot represent."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

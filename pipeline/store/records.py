@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from typing import Any, Literal
 
 from flexroad.tasks.quality.assess import NO_ROAD
@@ -130,3 +133,13 @@ def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecor
         marker=marker,
         stale=tuple(content.get("stale", ())),
     )
+
+
+def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row with None for NaN and infinities, which JSON cannot represent."""
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
+def utc_now() -> str:
+    """Return the current time in UTC, ISO 8601 with milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -6,11 +6,15 @@ has changed, the stage fails, so that no result is stored under a wrong fingerpr
 
 from __future__ import annotations
 
+import contextlib
+import resource
 import traceback
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from flexroad.catalog import Tile
@@ -19,15 +23,56 @@ from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
 from flexroad.pipeline.graph.stages import stage_function
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.records import Failure
-from flexroad.pipeline.worker.profiling import StageCost
+from flexroad.pipeline.store.records import Failure, utc_now
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, Surface, TileData
 
+PROC = Path("/proc/self")
 WITH_NOTES = ("load", "segment")
 """Stages whose results have notes on their sources."""
+
+
+@dataclass
+class StageCost:
+    """The cost of one stage over all variants of a tile."""
+
+    time: str = ""
+    """Start of the first computation, ISO 8601 in UTC; empty if nothing was computed."""
+    seconds: float = 0.0
+    """Computing time (s)."""
+    bytes: int = 0
+    """Bytes written to the store or as products."""
+    peak_mb: float = 0.0
+    """Peak memory of the process during the stage (MB)."""
+    computed: int = 0
+    """Number of nodes computed."""
+    reused: int = 0
+    """Number of nodes read from the store."""
+
+    @contextlib.contextmanager
+    def measure(self) -> Iterator[None]:
+        """Add time and peak memory of the ``with`` block, also if it raises."""
+        self.time = self.time or utc_now()
+        _reset_peak()
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds += perf_counter() - start
+            self.peak_mb = max(self.peak_mb, peak_mb())
+
+
+def peak_mb() -> float:
+    """Return the peak memory of this process (MB) since `_reset_peak`; outside Linux since its start."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _reset_peak() -> None:
+    # Only Linux can reset the peak.
+    with contextlib.suppress(OSError):
+        (PROC / "clear_refs").write_text("5")
 
 
 class StageError(Exception):

@@ -17,7 +17,7 @@ from flexroad.catalog.storage.paths import parse_location, stat
 from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.graph.stages import STAGE_NAMES, stage_version
 from flexroad.pipeline.store.artefacts import ArtefactStore
-from flexroad.pipeline.store.products import TileProducts, no_nan
+from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
     MARKERS,
     Failure,
@@ -26,12 +26,12 @@ from flexroad.pipeline.store.records import (
     State,
     TileRecord,
     from_item,
+    no_nan,
     to_failed,
+    utc_now,
 )
-from flexroad.pipeline.worker.evaluator import Evaluator, StageError, failure_of
-from flexroad.pipeline.worker.exports import Product, product_names, products
-from flexroad.pipeline.worker.profiling import StageCost, utc_now
-from flexroad.pipeline.worker.stac import EXTENSIONS, assets, links
+from flexroad.pipeline.worker.evaluator import Evaluator, StageCost, StageError, failure_of
+from flexroad.pipeline.worker.exports import EXTENSIONS, Product, assets, links, product_names, products
 from flexroad.pipeline.worker.texture import tile_texture
 from flexroad.tasks.types import Metrics, Quality
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -74,3 +76,20 @@ def test_grid_invalid_size_raises_error():
         Grid(UTM, 0, 0, 0.0, 1, 1)
     with pytest.raises(CatalogError, match="at least one cell"):
         Grid(UTM, 0, 0, 1.0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "shape"),
+    [
+        ({"west": 500060.0}, (60, 120)),
+        ({"west": 499000.0, "north": 5600300.0}, (360, 1060)),
+        ({"west": 500060.25}, None),
+        ({"cell": 0.5}, None),
+        ({"crs": "EPSG:25833"}, None),
+        ({"west": 5e9}, None),
+    ],
+)
+def test_holding_has_the_cells_of_all_grids(change, shape):
+    grid = Grid(UTM, 500000.0, 5600000.0, 1.0, 60, 60)
+    common = Grid.holding([grid, replace(grid, **change)])
+    assert (common and common.shape) == shape

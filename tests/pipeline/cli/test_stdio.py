@@ -4,7 +4,7 @@ from pathlib import Path
 
 from flexroad.pipeline.cli.stdio import echo, echo_document
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.monitor.progress import ProgressDisplay
+from flexroad.pipeline.run.progress import ProgressDisplay
 from tests.command_line import call
 
 CLI = Path(__file__).parents[3] / "pipeline" / "cli"

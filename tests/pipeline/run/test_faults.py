@@ -409,7 +409,7 @@ def test_run_clock_set_back_midway_is_cached_next_time(night, before_tile, monke
     def set_back() -> None:
         monkeypatch.setattr(time, "time", lambda: now() - 5 * DAY_S)
         frozen = "2001-01-01T00:00:00.000+00:00"
-        for module in ("worker.profiling", "worker.tile", "run.event_log", "run.runner"):
+        for module in ("worker.evaluator", "worker.tile", "run.event_log", "run.runner"):
             monkeypatch.setattr(f"flexroad.pipeline.{module}.utc_now", lambda: frozen)
         monkeypatch.setattr(paths, "write", write_with_old_time)
 

@@ -4,7 +4,7 @@ import pytest
 
 from flexroad.catalog.storage import paths
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.run.folder import check_folder
+from flexroad.pipeline.run.record import check_folder
 from flexroad.pipeline.run.summary import Summary, write_summary
 from tests.permissions import permissions_enforced
 

@@ -9,7 +9,7 @@ from pyproj import Transformer
 
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.run.geojson import outlines, write_states
+from flexroad.pipeline.run.collection import outlines, write_states
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.records import Failure, TileRecord

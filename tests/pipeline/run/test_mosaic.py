@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from flexroad.catalog import Catalog, Grid
+from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.run.mosaic import common_grid, write_mosaics
+from flexroad.pipeline.run.collection import write_mosaics
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from tests.whole_run import LIGHT
-
-GRID = Grid("EPSG:25832", 500000.0, 5600000.0, 1.0, 60, 60)
 
 
 @pytest.fixture(scope="module")
@@ -66,19 +64,3 @@ def test_tiles_of_different_lattices_have_no_mosaic(done, tmp_path):
     shifted = replace(tiles[1], grid=replace(tiles[1].grid, west=tiles[1].grid.west + 0.5))
     assert write_mosaics(moved, [tiles[0], shifted]) == []
     assert not list(moved.path.glob("*.vrt"))
-
-
-@pytest.mark.parametrize(
-    ("change", "shape"),
-    [
-        ({"west": 500060.0}, (60, 120)),
-        ({"west": 499000.0, "north": 5600300.0}, (360, 1060)),
-        ({"west": 500060.25}, None),
-        ({"cell": 0.5}, None),
-        ({"crs": "EPSG:25833"}, None),
-        ({"west": 5e9}, None),
-    ],
-)
-def test_common_grid_holds_the_cells_of_all_tiles(change, shape):
-    common = common_grid([GRID, replace(GRID, **change)])
-    assert (common and common.shape) == shape

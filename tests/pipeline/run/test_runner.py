@@ -20,9 +20,9 @@ from flexroad.pipeline.report.browser.relief import relief
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.report.results import find_results
 from flexroad.pipeline.report.steps import edge_steps
+from flexroad.pipeline.run.conductor import rerun_filter
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from flexroad.pipeline.run.selection import rerun_filter
 from flexroad.pipeline.run.status import summary
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -222,7 +222,7 @@ def test_damaged_artefact_is_computed_again(finished, executor):
 def test_tiles_of_an_older_version_are_exported_again_from_the_store(finished, executor, monkeypatch):
     monkeypatch.setattr("flexroad.tasks.export.cog.VERSION", 10**6)
     assert computed(results_of(finished, executor)) == times(4, {"export": 1})
-    monkeypatch.setattr("flexroad.pipeline.graph.products.ITEM_VERSION", 10**6)
+    monkeypatch.setattr("flexroad.pipeline.graph.graph.ITEM_VERSION", 10**6)
     assert computed(results_of(Run.open(finished.path), executor)) == times(4, {"export": 1})
 
 

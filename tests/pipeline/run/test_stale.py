@@ -17,8 +17,8 @@ from flexroad.pipeline.export.source import select
 from flexroad.pipeline.export.viewer import write_viewer
 from flexroad.pipeline.report.content import gather
 from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.run.collection import write_states
 from flexroad.pipeline.run.garbage import find_garbage
-from flexroad.pipeline.run.geojson import write_states
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store import checked_json

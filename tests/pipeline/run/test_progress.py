@@ -6,8 +6,8 @@ import threading
 import pytest
 from rich.console import Console
 
-from flexroad.pipeline.monitor import progress
-from flexroad.pipeline.monitor.progress import ProgressDisplay, StepProgress, said_repeatedly
+from flexroad.pipeline.run import progress
+from flexroad.pipeline.run.progress import ProgressDisplay, StepProgress, said_repeatedly
 from flexroad.pipeline.store.records import TileRecord
 from flexroad.pipeline.worker.tile import TileResult
 

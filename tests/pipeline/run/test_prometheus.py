@@ -3,10 +3,10 @@
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from flexroad.pipeline.monitor.prometheus import Textfile
+from flexroad.pipeline.run.prometheus import Textfile
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import TileRecord
-from flexroad.pipeline.worker.profiling import StageCost
+from flexroad.pipeline.worker.evaluator import StageCost
 from flexroad.pipeline.worker.tile import TileResult
 
 

@@ -6,7 +6,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from flexroad.pipeline.monitor.alerts import RetryPolicy, notify
+from flexroad.pipeline.run.alerts import RetryPolicy, notify
 
 SUMMARY = {"exit_code": 1, "failed": 3}
 QUICK = RetryPolicy(command_s=1, answer_s=1, pause_s=0.01)

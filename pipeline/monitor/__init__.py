@@ -1,1 +1,0 @@
-"""Progress, tile states and alerts of a run."""
