@@ -1,15 +1,15 @@
 """Folders written by FlexRoad itself: ``FOLDER/<layer>/<tile id>.tif``, one GeoTIFF per layer and tile.
 
-This module both writes and reads them. Tile id, layer, stratum and date are stored as tags in the files;
-file names are never parsed. Heights are float32, which is exact to 0.03 mm below 512 m and to 0.5 mm anywhere
-on Earth; NaN is nodata. Masks are 1 where there is road. The orthophoto has its own pixel size over the same
-bounds.
+`write_tile` returns the tile that it has written, and `with_neighbours` adds the files of the others. Tile
+id, layer, stratum and date are also stored as tags in the files. Heights are float32, which is exact to
+0.03 mm below 512 m and to 0.5 mm anywhere on Earth; NaN is nodata. Masks are 1 where there is road. The
+orthophoto has its own pixel size over the same bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
@@ -24,7 +24,6 @@ from rasterio.io import MemoryFile
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid, overlap
-from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.paths import write
 from flexroad.catalog.text import write_reason
 from flexroad.catalog.tile import LAYERS, REACH_M, Layer, Tile, by_cover
@@ -37,7 +36,7 @@ SUPPORTED = (*HEIGHTS, *MASKS, PHOTO)
 TILE_TAG, LAYER_TAG, STRATUM_TAG = "FLEXROAD_TILE", "FLEXROAD_LAYER", "FLEXROAD_STRATUM"
 DATASET_TAG = "FLEXROAD_DATASET"
 DATE_TAG, DATE_FORMAT = "TIFFTAG_DATETIME", "%Y:%m:%d %H:%M:%S"
-"""TIFF dates have no time zone; they are written and read as UTC."""
+"""TIFF dates have no time zone; they are written as UTC."""
 
 
 def write_tile(
@@ -48,8 +47,8 @@ def write_tile(
     stratum: str = "",
     date: datetime | None = None,
     dataset: str = "",
-) -> None:
-    """Write a tile's layers; existing files are replaced, each atomically.
+) -> Tile:
+    """Write a tile's layers, and return the tile; existing files are replaced, each atomically.
 
     Parameters
     ----------
@@ -66,9 +65,14 @@ def write_tile(
     stratum : str
         Class of area for reports.
     date : datetime, optional
-        Date of the survey, with a time zone.
+        Date of the survey, with a time zone; None: when the files were written.
     dataset : str
         Name of the data in reports.
+
+    Returns
+    -------
+    Tile
+        Its layers list only its own files, see `with_neighbours`.
 
     Raises
     ------
@@ -85,51 +89,39 @@ def write_tile(
         _check(name, array, grid, tile_id)
     for name, array in layers.items():
         _write(folder / name / f"{tile_id}.tif", grid, name, array, {**tags, LAYER_TAG: name})
+    names = [name for name in LAYERS if name in layers]
+    return Tile(
+        tile_id,
+        grid,
+        tuple(Layer(name, (f"{name}/{tile_id}.tif",), extents=(grid.bounds,)) for name in names),
+        str(folder.resolve()),
+        date.astimezone(UTC) if date else datetime.now(UTC),
+        datetime_assumed=date is None,
+        stratum=stratum,
+        dataset=dataset,
+    )
 
 
-def index(folder: Path, only: Container[str] | None = None) -> list[Tile]:
-    """Return the tiles of a folder written by `write_tile`, in the order of their ids.
+def with_neighbours(tiles: Iterable[Tile]) -> list[Tile]:
+    """Return tiles of one folder, as `write_tile` returns them, with the files of their neighbours.
 
     A tile's layers list its own file first, then those of the tiles of the same dataset, CRS and cell size
     that lie within `REACH_M` of it. Tiles that overlap are other surveys of the same ground, and do not list
-    each other's files.
-
-    Parameters
-    ----------
-    folder : Path
-        Parent of the layers' folders.
-    only : container of str, optional
-        Ids of the tiles to return; other tiles in the folder are left out, as neighbours as well.
-
-    Raises
-    ------
-    CatalogError
-        If there is no layer, a file is not a GeoTIFF or lacks its tags, or the files of a tile contradict
-        each other.
+    each other's files. The tiles are ordered by their ids.
     """
-    root = folder.resolve()
-    files = [path for name in LAYERS for path in sorted((root / name).glob("*.tif"))]
-    if not files:
-        raise CatalogError(f"no LAYER/*.tif in {folder} with LAYER one of {', '.join(SUPPORTED)}")
-    by_id: dict[str, list[_File]] = {}
-    for path in files:
-        file = _read(path)
-        if only is None or file.tile_id in only:
-            by_id.setdefault(file.tile_id, []).append(file)
-    return _with_neighbours([_tile(by_id[tile_id], root) for tile_id in sorted(by_id)])
-
-
-@dataclass(frozen=True)
-class _File:
-    """The header and tags of one file."""
-
-    path: Path
-    tile_id: str
-    layer: str
-    stratum: str
-    dataset: str
-    date: datetime | None
-    grid: Grid
+    ordered = sorted(tiles, key=lambda tile: tile.id)
+    groups: dict[tuple[str, float, str], list[Tile]] = {}
+    for tile in ordered:
+        groups.setdefault((tile.grid.crs, tile.grid.cell, tile.dataset), []).append(tile)
+    near = {tile.id: [tile] for tile in ordered}
+    for (_, cell, _), group in groups.items():
+        bounds = [tile.grid.bounds for tile in group]
+        reached = np.array([tile.grid.buffered(REACH_M).bounds for tile in group])
+        tree = shapely.STRtree(shapely.box(*np.array(bounds).T))
+        for one, other in sorted(tree.query(shapely.box(*reached.T)).T.tolist()):
+            if not overlap(bounds[one], bounds[other], LATTICE_TOLERANCE * cell):
+                near[group[one].id].append(group[other])
+    return [_joined(near[tile.id]) for tile in ordered]
 
 
 def _check(name: str, array: NDArray[Any], grid: Grid, tile_id: str) -> None:
@@ -179,109 +171,6 @@ def _write(path: Path, grid: Grid, name: str, array: NDArray[Any], tags: Mapping
             write(path, memory.getbuffer())
         except (OSError, CRSError) as error:
             raise CatalogError(f"cannot write {path}: {write_reason(error)}") from error
-
-
-def _read(path: Path) -> _File:
-    try:
-        with open_raster(path) as dataset:
-            tags, transform, crs = dataset.tags(), dataset.transform, dataset.crs
-            width, height = dataset.width, dataset.height
-    except ERRORS as error:
-        raise CatalogError(f"{path} is not a GeoTIFF: {error}") from error
-    missing = [tag for tag in (TILE_TAG, LAYER_TAG) if not tags.get(tag)]
-    if missing or crs is None:
-        lack = ", ".join(missing) or "CRS"
-        raise CatalogError(f"{path} has no {lack}; FlexRoad did not write it, so catalog it as rasters")
-    cell = transform.a
-    if (transform.b, transform.d, transform.e) != (0, 0, -cell):
-        raise CatalogError(f"{path} has no square north-up cells: {tuple(transform)[:6]}; write it again")
-    return _File(
-        path=path,
-        tile_id=tags[TILE_TAG],
-        layer=tags[LAYER_TAG],
-        stratum=tags.get(STRATUM_TAG, ""),
-        dataset=tags.get(DATASET_TAG, ""),
-        date=_date(path, tags.get(DATE_TAG)),
-        grid=Grid(crs.to_string(), transform.c, transform.f, cell, width, height),
-    )
-
-
-def _date(path: Path, tag: str | None) -> datetime | None:
-    if tag is None:
-        return None
-    try:
-        return datetime.strptime(tag, DATE_FORMAT).replace(tzinfo=UTC)
-    except ValueError as error:
-        raise CatalogError(
-            f"{path} has {DATE_TAG} {tag!r}, not YYYY:MM:DD HH:MM:SS; write it again"
-        ) from error
-
-
-def _tile(files: Iterable[_File], root: Path) -> Tile:
-    """Return the tile made of the files of one id, given in the order of `LAYERS`."""
-    files = list(files)
-    first = next((file for file in files if file.layer != PHOTO), None)
-    if first is None:
-        raise CatalogError(
-            f"{files[0].path} is the only file of tile {files[0].tile_id}; a tile needs heights"
-        )
-    by_layer: dict[str, _File] = {}
-    for file in files:
-        if file.layer in by_layer:
-            raise CatalogError(
-                f"{by_layer[file.layer].path} and {file.path} are both tagged as layer {file.layer} "
-                f"of tile {file.tile_id}; remove one"
-            )
-        _check_same_tile(first, file)
-        by_layer[file.layer] = file
-    date = first.date or datetime.fromtimestamp(first.path.stat().st_mtime, UTC)
-    return Tile(
-        id=first.tile_id,
-        grid=first.grid,
-        layers=tuple(
-            Layer(name, (by_layer[name].path.relative_to(root).as_posix(),), extents=(first.grid.bounds,))
-            for name in LAYERS
-            if name in by_layer
-        ),
-        root=str(root),
-        datetime=date,
-        datetime_assumed=first.date is None,
-        stratum=first.stratum,
-        dataset=first.dataset,
-    )
-
-
-def _check_same_tile(first: _File, file: _File) -> None:
-    """Raise an error if two files of a tile differ in grid, stratum or dataset."""
-    for name in ("grid", "stratum", "dataset"):
-        expected, value = getattr(first, name), getattr(file, name)
-        if name == "grid" and file.layer == PHOTO and _same_bounds(expected, value):
-            continue
-        if expected != value:
-            raise CatalogError(
-                f"{first.path} and {file.path} of tile {file.tile_id} differ in {name}: "
-                f"{expected} and {value}; write the tile again"
-            )
-
-
-def _same_bounds(a: Grid, b: Grid) -> bool:
-    return a.crs == b.crs and np.allclose(a.bounds, b.bounds, rtol=0, atol=1e-3)
-
-
-def _with_neighbours(tiles: Sequence[Tile]) -> list[Tile]:
-    """Return the tiles, given with their own files, with the files of their neighbours."""
-    groups: dict[tuple[str, float, str], list[Tile]] = {}
-    for tile in tiles:
-        groups.setdefault((tile.grid.crs, tile.grid.cell, tile.dataset), []).append(tile)
-    near = {tile.id: [tile] for tile in tiles}
-    for (_, cell, _), group in groups.items():
-        bounds = [tile.grid.bounds for tile in group]
-        reached = np.array([tile.grid.buffered(REACH_M).bounds for tile in group])
-        tree = shapely.STRtree(shapely.box(*np.array(bounds).T))
-        for one, other in sorted(tree.query(shapely.box(*reached.T)).T.tolist()):
-            if not overlap(bounds[one], bounds[other], LATTICE_TOLERANCE * cell):
-                near[group[one].id].append(group[other])
-    return [_joined(near[tile.id]) for tile in tiles]
 
 
 def _joined(tiles: Sequence[Tile]) -> Tile:

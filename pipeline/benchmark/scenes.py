@@ -86,12 +86,13 @@ def write_scenes(
     executor = AdaptiveExecutor(None, DaskExecutor(), lambda line: None)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for error in executor.map(_write_scene, Jobs(iter(jobs), len(jobs)), _failure):
-            if error:
-                raise ConfigError(error)
+        written = list[Tile]()
+        for result in executor.map(_write_scene, Jobs(iter(jobs), len(jobs)), _failure):
+            if isinstance(result, str):
+                raise ConfigError(result)
+            written.append(result)
         path = folder / "catalog.parquet"
-        # The folder may also contain tiles of an earlier call.
-        tiles_written = prepared.index(folder, only={job.tile_id for job in jobs})
+        tiles_written = prepared.with_neighbours(written)
         catalog = Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written))
         if preset:
             true = tuple(with_truth(tile, KNOWN, tile.dataset) for tile in catalog.tiles)
@@ -123,7 +124,7 @@ def _jobs(
     ]
 
 
-def _write_scene(job: SceneJob) -> str:
+def _write_scene(job: SceneJob) -> Tile | str:
     arguments = (job.grid, job.seed, job.stratum, job.options)
     scene = make_scene(*arguments)
     layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
@@ -132,8 +133,7 @@ def _write_scene(job: SceneJob) -> str:
         truth = {"reference": scene.reference, "reference_road": scene.reference_road}
         prepared.write_tile(folder / KNOWN, job.tile_id, job.grid, truth, *about)
         layers |= {"reference": scene.extended_dtm}
-    prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
-    return ""
+    return prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
 
 
 def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
@@ -167,5 +167,5 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _failure(job: SceneJob, reason: str) -> str:
+def _failure(job: SceneJob, reason: str) -> Tile | str:
     return f"scene {job.tile_id}: {reason}"

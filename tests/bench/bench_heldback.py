@@ -242,10 +242,11 @@ def made(stratum: str, folder: Path, draw: int) -> Place:
         "dsm": left.dsm, "dtm": left.dtm, "road_height": left.top.height, "road_mask": scene.road_mask,
         "reference": scene.reference, "reference_road": scene.reference_road,
     }  # fmt: skip
+    tiles = []
     for name, tile in whole.tiles(250):
-        cut = whole.window(tile)
-        prepared.write_tile(folder, name, tile, {layer: values[cut] for layer, values in layers.items()})
-    Catalog(tuple(prepared.index(folder))).write(folder / "catalog.parquet")
+        of_tile = {layer: values[whole.window(tile)] for layer, values in layers.items()}
+        tiles.append(prepared.write_tile(folder, name, tile, of_tile))
+    Catalog(tuple(prepared.with_neighbours(tiles))).write(folder / "catalog.parquet")
     x, y = np.meshgrid(whole.eastings, whole.northings)
     number, out = squares(x, y, draw)
     z, road = scene.reference, scene.reference_road

@@ -95,9 +95,11 @@ class Survey:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self._original = folder / "survey", folder / "original"
-        for tile_id, grid in GRIDS.items():
-            date = datetime(2025, 1, 1, tzinfo=UTC)
+        date = datetime(2025, 1, 1, tzinfo=UTC)
+        self._written = [
             prepared.write_tile(self._original, tile_id, grid, ground(grid), date=date, dataset="waves")
+            for tile_id, grid in GRIDS.items()
+        ]
         for name, columns in ROADS.items():
             (self._original / name).write_bytes(roads(*columns))
         shutil.copytree(self._original, self.folder)
@@ -126,7 +128,8 @@ class Survey:
     def _tiles(self, ids: set[str]) -> tuple[Tile, ...]:
         """Return the tiles of the catalog of the original files: damage does not change it."""
         lines = [vectors.opened(self._original / name, None) for name in ROADS]
-        tiles, _ = vectors.with_roads(prepared.index(self._original, only=ids), lines, None)
+        own = [tile for tile in self._written if tile.id in ids]
+        tiles, _ = vectors.with_roads(prepared.with_neighbours(own), lines, None)
         return tuple(replace(tile, root=str(self.folder)) for tile in tiles)
 
     @property

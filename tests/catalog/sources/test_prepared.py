@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog import Catalog, CatalogError, Grid
-from flexroad.catalog.sources.prepared import index, write_tile
+from flexroad.catalog.sources.prepared import with_neighbours, write_tile
 from flexroad.tasks.load import Options, load
 
 GRID = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 25, 20)
@@ -28,10 +28,12 @@ def road(grid: Grid = GRID) -> np.ndarray:
     return np.random.default_rng(1).random(grid.shape) < 0.3
 
 
-def test_write_tile_and_index_round_trip(tmp_path):
-    write_tile(tmp_path, "b", GRID, {"dsm": heights(), "road_mask": road()}, "urban", TAKEN, "made")
-    write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
-    first, second = index(tmp_path)
+def test_write_tile_returns_the_tile_of_its_files(tmp_path):
+    layers = {"dsm": heights(), "road_mask": road()}
+    second = write_tile(tmp_path, "b", GRID, layers, "urban", TAKEN, "made")
+    first = write_tile(tmp_path, "a", GRID, {"reference_road": road().astype(np.uint8)})
+    # Tiles of the same ground.
+    assert with_neighbours([second, first]) == [first, second]
     assert (first.id, second.id) == ("a", "b")
     assert (second.grid, second.stratum, second.dataset) == (GRID, "urban", "made")
     assert first.dataset == ""
@@ -44,6 +46,14 @@ def test_write_tile_and_index_round_trip(tmp_path):
         assert np.array_equal(file.read(1), heights().astype(np.float32), equal_nan=True)
         assert np.isnan(file.nodata)
         assert file.crs.to_epsg() == 25832
+        assert file.tags()["TIFFTAG_DATETIME"] == "2024:05:01 10:30:00"
+        tags = {name: text for name, text in file.tags().items() if name.startswith("FLEXROAD_")}
+    assert tags == {
+        "FLEXROAD_TILE": "b",
+        "FLEXROAD_LAYER": "dsm",
+        "FLEXROAD_STRATUM": "urban",
+        "FLEXROAD_DATASET": "made",
+    }
     for layer, tile in ((mask, second), (first.layers[0], first)):
         with rasterio.open(tile.paths(layer)[0]) as file:
             assert np.array_equal(file.read(1), road())
@@ -57,10 +67,10 @@ def test_write_tile_heights_are_exact_to_a_tenth_of_a_millimetre(tmp_path):
         assert np.nanmax(np.abs(file.read(1) - heights())) < 1e-4
 
 
-def test_index_layers_follow_catalog_order(tmp_path):
+def test_write_tile_layers_follow_catalog_order(tmp_path):
     names = ("reference_road", "reference", "dtm", "road_mask", "dsm")
-    write_tile(tmp_path, "a", GRID, {n: road() if "road" in n else heights() for n in names}, "rural", TAKEN)
-    (tile,) = index(tmp_path)
+    layers = {name: road() if "road" in name else heights() for name in names}
+    tile = write_tile(tmp_path, "a", GRID, layers, "rural", TAKEN)
     assert [layer.name for layer in tile.layers] == [
         "dsm",
         "dtm",
@@ -72,10 +82,9 @@ def test_index_layers_follow_catalog_order(tmp_path):
     assert Catalog.read(tmp_path / "catalog.parquet").tiles == (tile,)
 
 
-def test_index_without_date_uses_file_time(tmp_path):
+def test_write_tile_without_date_uses_file_time(tmp_path):
     before = datetime.now(UTC) - timedelta(seconds=5)
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    (tile,) = index(tmp_path)
+    tile = write_tile(tmp_path, "a", GRID, {"dsm": heights()})
     assert tile.datetime_assumed
     assert before < tile.datetime < datetime.now(UTC) + timedelta(seconds=5)
 
@@ -86,18 +95,12 @@ def test_index_without_date_uses_file_time(tmp_path):
     west=st.floats(0, 1e6, allow_subnormal=False),
     north=st.floats(0, 1e7, allow_subnormal=False),
 )
-def test_index_odd_lattice_is_exact(tmp_path, cell, west, north):
+def test_write_tile_odd_lattice_is_exact(tmp_path, cell, west, north):
     grid = Grid("EPSG:25832", west, north, cell, 7, 5)
-    write_tile(tmp_path, "a", grid, {"dsm": heights(grid)})
-    assert index(tmp_path)[0].grid == grid
-
-
-def test_index_id_is_read_from_tag(tmp_path):
-    write_tile(tmp_path, "500000_5600000", GRID, {"dsm": heights()})
-    (tmp_path / "dsm" / "500000_5600000.tif").rename(tmp_path / "dsm" / "1_2.tif")
-    (tile,) = index(tmp_path)
-    assert tile.id == "500000_5600000"
-    assert tile.layers[0].files == ("dsm/1_2.tif",)
+    tile = write_tile(tmp_path, "a", grid, {"dsm": heights(grid)})
+    assert tile.grid == grid
+    with rasterio.open(tmp_path / "dsm" / "a.tif") as file:
+        assert (file.transform, file.shape) == (grid.transform, grid.shape)
 
 
 def test_write_tile_again_replaces_files(tmp_path):
@@ -132,59 +135,12 @@ def test_write_tile_invalid_input_writes_nothing(tmp_path, tile_id, layers, line
     assert not list(tmp_path.iterdir())
 
 
-def test_index_empty_folder_raises_error(tmp_path):
-    with pytest.raises(CatalogError, match=f"no LAYER/.*{tmp_path.name}.*dsm"):
-        index(tmp_path)
-
-
-def test_index_file_without_tags_raises_error(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
-        file.update_tags(FLEXROAD_TILE="")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif has no FLEXROAD_TILE; .*catalog it as rasters"):
-        index(tmp_path)
-
-
-def test_index_broken_file_raises_error(tmp_path):
-    (tmp_path / "dsm").mkdir()
-    (tmp_path / "dsm" / "a.tif").write_bytes(b"II*\0 nothing")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif is not a GeoTIFF"):
-        index(tmp_path)
-
-
-def test_index_invalid_date_raises_error(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()}, date=TAKEN)
-    with rasterio.open(tmp_path / "dsm" / "a.tif", "r+") as file:
-        file.update_tags(TIFFTAG_DATETIME="May 2024")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif has TIFFTAG_DATETIME 'May 2024'"):
-        index(tmp_path)
-
-
-def test_index_contradicting_files_raise_error(tmp_path):
-    moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()}, "urban")
-    write_tile(tmp_path, "a", moved, {"dtm": heights()}, "urban")
-    with pytest.raises(CatalogError, match=r"dsm/a.tif and .*dtm/a.tif of tile a differ in grid"):
-        index(tmp_path)
-    write_tile(tmp_path, "a", GRID, {"dtm": heights()}, "rural")
-    with pytest.raises(CatalogError, match="differ in stratum: urban and rural"):
-        index(tmp_path)
-
-
-def test_index_two_files_of_one_layer_raise_error(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dsm": heights()})
-    (tmp_path / "dsm" / "b.tif").write_bytes((tmp_path / "dsm" / "a.tif").read_bytes())
-    with pytest.raises(CatalogError, match=r"a.tif and .*b.tif are both tagged as layer dsm of tile a"):
-        index(tmp_path)
-
-
 def photo(rows: int = 40, columns: int = 50) -> np.ndarray:
     return np.random.default_rng(2).integers(0, 256, (3, rows, columns), dtype=np.uint8)
 
 
 def test_write_tile_photo_keeps_its_pixels(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dop": photo(), "road_mask": road()}, "urban", TAKEN)
-    (tile,) = index(tmp_path)
+    tile = write_tile(tmp_path, "a", GRID, {"dop": photo(), "road_mask": road()}, "urban", TAKEN)
     assert tile.grid == GRID
     dop, mask = tile.layers
     assert (dop.name, dop.files, mask.name) == ("dop", ("dop/a.tif",), "road_mask")
@@ -196,8 +152,9 @@ def test_write_tile_photo_keeps_its_pixels(tmp_path):
 
 
 def test_write_tile_photo_with_odd_pixel_size_fits(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
-    assert index(tmp_path)[0].layer("dop") is not None
+    tile = write_tile(tmp_path, "a", GRID, {"dsm": heights(), "dop": photo(28, 35)})
+    with rasterio.open(tile.paths(tile.layer("dop"))[0]) as file:
+        assert file.bounds == pytest.approx(GRID.bounds)
 
 
 @pytest.mark.parametrize("wrong", [photo()[0], photo()[:2], photo().astype(float), photo(40, 40)])
@@ -206,24 +163,20 @@ def test_write_tile_invalid_photo_raises_error(tmp_path, wrong):
         write_tile(tmp_path, "a", GRID, {"dop": wrong})
 
 
-def test_index_photo_alone_or_misplaced_raises_error(tmp_path):
-    write_tile(tmp_path, "a", GRID, {"dop": photo()})
-    with pytest.raises(CatalogError, match="dop/a.tif is the only file of tile a"):
-        index(tmp_path)
-    moved = Grid(GRID.crs, GRID.west + 1, GRID.north, 1.0, 25, 20)
-    write_tile(tmp_path, "a", moved, {"dsm": heights()})
-    with pytest.raises(CatalogError, match=r"dsm/a.tif and .*dop/a.tif of tile a differ in grid"):
-        index(tmp_path)
-
-
 def block(folder, names, size=60, gap=0.0, **options):
-    """Write tiles side by side, three to a row, all with the heights of the same ground, and index them."""
+    """Write tiles side by side, three to a row, all with the heights of the same ground."""
+    tiles = []
     for number, name in enumerate(names):
         west, north = 500_000.0 + (size + gap) * (number % 3), 5_600_000.0 - (size + gap) * (number // 3)
         grid = Grid("EPSG:25832", west, north, 1.0, size, size)
         z = np.add.outer(np.sin(grid.northings), grid.eastings / 1e4)
-        write_tile(folder, name, grid, {"dsm": z, "dtm": z - 1}, **options)
-    return {tile.id: tile for tile in index(folder)}
+        tiles.append(write_tile(folder, name, grid, {"dsm": z, "dtm": z - 1}, **options))
+    return {tile.id: tile for tile in with_neighbours(tiles)}
+
+
+def alone(tile):
+    """Return a tile with only its own files, as `write_tile` returns it."""
+    return replace(tile, layers=tuple(layer.part([0]) for layer in tile.layers), nearby=())
 
 
 def test_tile_lists_files_of_neighbours_after_its_own(tmp_path):
@@ -239,7 +192,7 @@ def test_tile_lists_files_of_neighbours_after_its_own(tmp_path):
 def test_tiles_out_of_reach_or_of_other_data_are_not_neighbours(tmp_path):
     assert {len(t.layers[0].files) for t in block(tmp_path / "far", "abcd", gap=201.0).values()} == {1}
     assert {len(t.layers[0].files) for t in block(tmp_path / "near", "ab", gap=200.0).values()} == {2}
-    block(tmp_path / "mixed", "abc")
+    written = [alone(tile) for tile in block(tmp_path / "mixed", "abc").values()]
     beside = Grid("EPSG:25832", 500_000.0, 5_600_030.0, 1.0, 30, 30)
     for name, grid, dataset in (
         ("dataset", beside, "other"),
@@ -248,14 +201,14 @@ def test_tiles_out_of_reach_or_of_other_data_are_not_neighbours(tmp_path):
         # Over the southern half of tile a.
         ("overlap", replace(beside, north=5_599_970.0, width=60), ""),
     ):
-        write_tile(tmp_path / "mixed", name, grid, {"dsm": heights(grid)}, dataset=dataset)
-    tiles = {tile.id: tile.layers[0].files for tile in index(tmp_path / "mixed")}
+        written.append(write_tile(tmp_path / "mixed", name, grid, {"dsm": heights(grid)}, dataset=dataset))
+    tiles = {tile.id: tile.layers[0].files for tile in with_neighbours(written)}
     assert tiles["a"] == ("dsm/a.tif", "dsm/b.tif", "dsm/c.tif")
     assert tiles["b"] == ("dsm/b.tif", "dsm/a.tif", "dsm/c.tif", "dsm/overlap.tif")
     assert [tiles[name] for name in ("dataset", "cell", "crs")] == [
         (f"dsm/{name}.tif",) for name in ("dataset", "cell", "crs")
     ]
-    left_out = index(tmp_path / "mixed", only={"a", "c"})
+    left_out = with_neighbours(tile for tile in written if tile.id in ("a", "c"))
     assert [tile.layers[0].files for tile in left_out] == [
         ("dsm/a.tif", "dsm/c.tif"),
         ("dsm/c.tif", "dsm/a.tif"),
@@ -263,10 +216,11 @@ def test_tiles_out_of_reach_or_of_other_data_are_not_neighbours(tmp_path):
 
 
 def test_layer_of_a_neighbour_alone_is_nearby(tmp_path):
-    block(tmp_path, "ab")
+    ground = block(tmp_path, "ab")
     mask = Grid("EPSG:25832", 500_060.0, 5_600_000.0, 1.0, 60, 60)
-    write_tile(tmp_path, "b", mask, {"road_mask": road(mask)})
-    first, second = index(tmp_path)
+    (only,) = write_tile(tmp_path, "b", mask, {"road_mask": road(mask)}).layers
+    first, second = (alone(tile) for tile in ground.values())
+    first, second = with_neighbours([first, replace(second, layers=(*second.layers, only))])
     assert [layer.name for layer in first.layers] == ["dsm", "dtm"]
     assert first.nearby == (second.layer("road_mask"),)
     strip = Grid("EPSG:25832", 500_050.0, 5_600_000.0, 1.0, 20, 60)

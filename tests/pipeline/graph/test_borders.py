@@ -36,7 +36,7 @@ SIZE_M = 250
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory):
     """A prepared survey of 3 x 3 flat tiles of 250 m."""
-    folder = tmp_path_factory.mktemp("flat")
+    folder, tiles = tmp_path_factory.mktemp("flat"), []
     for column in range(3):
         for row in range(3):
             north = 5600000 + (row + 1) * SIZE_M
@@ -44,7 +44,8 @@ def flat(tmp_path_factory):
             layers = {"dsm": np.full(grid.shape, 200.0), "dtm": np.full(grid.shape, 200.0)}
             layers["road_mask"] = np.ones(grid.shape, bool)
             tile_id = f"{grid.west:.0f}_{grid.south:.0f}"
-            prepared.write_tile(folder, tile_id, grid, layers, date=MADE, dataset="flat")
+            tiles.append(prepared.write_tile(folder, tile_id, grid, layers, date=MADE, dataset="flat"))
+    Catalog(tuple(prepared.with_neighbours(tiles))).write(folder / "catalog.json")
     return folder
 
 
@@ -59,7 +60,7 @@ def by_rasters(folder):
 
 
 def by_prepared(folder):
-    return Catalog(tuple(prepared.index(folder)))
+    return Catalog.read(folder / "catalog.json")
 
 
 CATALOGS = pytest.mark.parametrize("catalog_of", [by_rasters, by_prepared])
@@ -320,14 +321,12 @@ def test_control_points_as_close_as_cells_are_accepted():
 
 
 def test_dry_run_counts_shared_nodes_once(survey, flexroad, tmp_path):
-    by_prepared(survey).write(survey / "catalog.json")
     words = ("--catalog", survey / "catalog.json", "--out", tmp_path / "run", "--dry-run")
     out = flexroad("run", "--config", "production", "--set", "fit.spacing_m=10", *words).expected(0).out
     assert "  border   40 to do" in out.splitlines()
 
 
 def test_dry_run_looks_up_shared_nodes_once(survey, flexroad, tmp_path, monkeypatch):
-    by_prepared(survey).write(survey / "catalog.json")
     looked_up = Counter()
 
     def has(store, node):

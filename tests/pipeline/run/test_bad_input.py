@@ -307,8 +307,7 @@ def test_unusual_input_gives_finite_metrics(damage, note, run, survey, tmp_path)
 @pytest.mark.parametrize("cell", [0.5, 2.0])
 def test_other_cell_size_gives_correct_heights(cell, run, flexroad, tmp_path):
     grid = Grid("EPSG:25832", 500_000, 5_600_040, cell, int(40 / cell), int(40 / cell))
-    tilted_ground(tmp_path / "folder", "a", grid)
-    catalog = cataloged(tmp_path / "folder")
+    catalog = tilted_ground(tmp_path / "folder", "a", grid)
     result = run(catalog=catalog)
     assert (result.code, result.errors) == (0, [])
     rows = read_metrics(tmp_path / "run").set_index("variant")
@@ -327,21 +326,18 @@ def plane(easting, northing):
     return 100 + 0.05 * (easting - 500_000) - 0.02 * (northing - 5_600_000)
 
 
-def tilted_ground(folder: Path, tile_id: str, grid: Grid) -> None:
+def tilted_ground(folder: Path, tile_id: str, grid: Grid) -> Path:
+    """Write a tile of a plane; return its catalog."""
     heights = plane(grid.eastings[None, :], grid.northings[:, None])
     road = np.zeros(grid.shape, bool)
     road[grid.height // 4 : grid.height // 2 + 1] = True
-    prepared.write_tile(folder, tile_id, grid, {"dsm": heights, "dtm": heights, "road_mask": road})
-
-
-def cataloged(folder: Path) -> Path:
-    Catalog(tuple(prepared.index(folder))).write(folder / "catalog.json")
+    tile = prepared.write_tile(folder, tile_id, grid, {"dsm": heights, "dtm": heights, "road_mask": road})
+    Catalog((tile,)).write(folder / "catalog.json")
     return folder / "catalog.json"
 
 
 def test_tile_of_2_by_2_cells_fails_only_nurbs(run, tmp_path):
-    tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
-    catalog = cataloged(tmp_path / "tiny")
+    catalog = tilted_ground(tmp_path / "tiny", "tiny", Grid("EPSG:25832", 500_000, 5_600_002, 1.0, 2, 2))
     result = run(catalog=catalog, config="paper")
     assert result.code == 1
     (line,) = result.errors

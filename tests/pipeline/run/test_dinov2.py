@@ -1,13 +1,13 @@
 """`segment: {method: dinov2}` in a run: selected by the configuration; a tile without a photo fails alone."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
 from flexroad.catalog import Catalog
-from flexroad.catalog.sources import prepared
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
@@ -26,9 +26,13 @@ from tests.make_backbone import save_backbone
 def place(tmp_path):
     """A folder with a catalog of two tiles (the first without photo), a backbone and a trained head."""
     write_scenes(tmp_path / "scenes", 2, seed=3, size_m=60, dop=True)
-    first, _ = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
+    first, second = Catalog.read(tmp_path / "scenes" / "catalog.parquet").tiles
     first.paths(first.layer("dop"))[0].unlink()
-    first, second = prepared.index(tmp_path / "scenes")
+    dop = second.layer("dop").part([0])
+    first = replace(
+        first, layers=tuple(layer for layer in first.layers if layer.name != "dop"), nearby=(dop,)
+    )
+    second = replace(second, layers=tuple(dop if x.name == "dop" else x for x in second.layers))
     Catalog((first, second)).write(tmp_path / "scenes" / "catalog.parquet")
     folder = save_backbone(tmp_path / "backbone", registers=2)
     data = load.load(second, load.Options())
