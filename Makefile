@@ -127,7 +127,7 @@ lint: $(STAMP) ## Check style and types
 bench: $(STAMP) ## Print the stages beside their floors, peers, starts and make reproduce; one other benchmark: make bench BENCH=scale
 	@$(BIN)/python -m tests.bench $(BENCH)
 
-speed: $(STAMP) ## Measure the tables and the plot of docs/speed.md anew
+speed: $(STAMP) ## Measure the tables and the plot of docs/results/speed.md anew
 	@PYTHONPATH=. $(BIN)/python tests/bench/speed_page.py
 
 # The extras of pyproject.toml in the image, and where PyTorch's build for CPUs comes from.

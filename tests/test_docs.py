@@ -1,4 +1,4 @@
-"""Documentation: the commands of README and docs/cli.md run, links have targets, named tests exist."""
+"""Documentation: its commands run, links have targets, named tests exist, options are those of the models."""
 
 import re
 import shlex
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import options_page
 from tests.command_line import call
 from tests.make_backbone import save_backbone
 
@@ -19,13 +20,21 @@ def console_lines(page: Path) -> list[str]:
     return [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
 
 
+def anchors(page: Path) -> list[str]:
+    """Return the names of a page's sections in links."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+
+
 @pytest.mark.slow
-def test_docs_cli_commands_run(tmp_path, monkeypatch):
+def test_docs_commands_run(tmp_path, monkeypatch):
+    """Those of three pages, in this order, in one folder."""
     monkeypatch.chdir(tmp_path)
     save_backbone(tmp_path / "dinov2-small", layers=4)
     (tmp_path / "points.csv").write_text("easting,northing\n500001,5600001\n")
-    lines = console_lines(ROOT / "docs" / "cli.md")
-    assert len(lines) > 12
+    pages = ("data.md", "run.md", "results.md")
+    lines = [line for name in pages for line in console_lines(ROOT / "docs" / name)]
+    assert len(lines) > 30
     for line in lines:
         command, *words = shlex.split(line)
         assert command == "flexroad"
@@ -58,8 +67,15 @@ def test_readme_commands_and_code_run_in_empty_folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_have_targets(page):
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
-        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    for target, section in re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)", page.read_text()):
+        linked = page.parent / target if target else page
+        assert linked.exists(), f"{page.name} links to {target}"
+        if section and linked.suffix == ".md":
+            assert section in anchors(linked), f"{page.name} links to {target}#{section}"
+
+
+def test_options_are_those_of_the_models():
+    assert options_page.PAGE.read_text() == options_page.page(), "run python -m tests.options_page"
 
 
 def test_development_names_existing_files():

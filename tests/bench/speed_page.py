@@ -1,4 +1,4 @@
-"""Measure the tables and the plot of docs/speed.md and write them into the page: ``make speed``.
+"""Measure the tables and the plot of docs/results/speed.md and write them into the page: ``make speed``.
 
 Everything is CPU time, so other programs on the machine change it little. The page says how each figure is
 made; the text around the tables is not touched.
@@ -28,8 +28,8 @@ from flexroad.tasks import load
 from tests.bench import bench_simulated, bench_tile, measure_stages
 from tests.bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 
-PAGE = Path(__file__).parents[2] / "docs" / "speed.md"
-PLOT = PAGE.parent / "images" / "speed.webp"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "speed.md"
+PLOT = PAGE.parents[1] / "images" / "speed.webp"
 STATE = 550_000
 """Tiles of 250 m of one German state (34,100 km2)."""
 CORES = 16

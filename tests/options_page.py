@@ -1,0 +1,79 @@
+"""The page docs/options.md, from the models that hold the options: ``python -m tests.options_page``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from flexroad.pipeline.config.cluster import Cluster
+from flexroad.pipeline.config.methods import DEFAULTS, HOMES, methods
+from flexroad.pipeline.config.models import Export
+
+PAGE = Path(__file__).parents[1] / "docs" / "options.md"
+HEAD = """# Options
+
+The options of a configuration with default, bounds and meaning, for looking up. `flexroad config template` prints
+them as YAML, `flexroad config show NAME` the values of a shipped configuration, `flexroad config schema` a schema for
+editors. `python -m tests.options_page` writes this page; a test compares.
+"""
+BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+
+
+def page() -> str:
+    """Return the text of the page."""
+    parts = [HEAD]
+    for stage in HOMES:
+        parts.append(f"## {stage}\n")
+        modules = methods(stage)
+        for model in dict.fromkeys(module.Options for module in modules.values()):
+            names = [name for name, module in modules.items() if module.Options is model]
+            if names == [""]:
+                parts.append(rows(model))
+            else:
+                default = ", the default" if DEFAULTS[stage] in names else ""
+                title = f"`method: {'` or `'.join(names)}`{default}"
+                parts.append(f"{title}\n\n{rows(model, without='method')}")
+        inner = {name: part for module in modules.values() for name, part in parts_of(module.Options)}
+        parts += [f"`{name}`\n\n{rows(part)}" for name, part in inner.items()]
+    parts += [f"## {name}\n\n{rows(part)}" for name, part in (("export", Export), ("cluster", Cluster))]
+    return "\n".join(parts)
+
+
+def parts_of(model: type[BaseModel]) -> list[tuple[str, type[BaseModel]]]:
+    """Return the fields of a model that hold models."""
+    fields = model.model_fields.items()
+    kinds = [
+        (name, kind) for name, field in fields for kind in (field.annotation, *get_args(field.annotation))
+    ]
+    return [(name, kind) for name, kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
+
+
+def rows(model: type[BaseModel], without: str = "") -> str:
+    """Return a line for each option of a model."""
+    lines = [row(name, field) for name, field in model.model_fields.items() if name != without]
+    return "\n".join(lines or ["No options."]) + "\n"
+
+
+def row(name: str, field: FieldInfo) -> str:
+    meaning = " ".join((field.description or "").split())
+    value = field.get_default(call_default_factory=True)
+    if field.is_required() or isinstance(value, BaseModel):
+        return f"- `{name}`{' (required)' if field.is_required() else ''}: {meaning}"
+    plain = [*value] if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=1000).splitlines()[0]
+    bounds = [
+        f"{word} {getattr(mark, key):,.10g}"
+        for mark in field.metadata
+        for key, word in BOUNDS.items()
+        if hasattr(mark, key)
+    ]
+    limits = f" ({', '.join(bounds)})" if bounds else ""
+    return f"- `{name}: {text}`{limits}: {meaning}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
