@@ -17,8 +17,12 @@ def test_viewer_built_again_has_the_same_bytes(tmp_path):
     install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline"]
     subprocess.run(install, cwd=copy, check=True, capture_output=True)
     subprocess.run(["node", "build.js", tmp_path / "built"], cwd=copy, check=True, capture_output=True)
-    built = {file.name: file.read_bytes() for file in (tmp_path / "built").iterdir()}
-    assert built == {file.name: file.read_bytes() for file in (VIEWER / "dist").iterdir()}
+    assert files(tmp_path / "built") == files(VIEWER / "dist")
+
+
+def files(folder):
+    """The content of the files of a folder, by their names in it."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")

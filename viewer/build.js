@@ -8,9 +8,7 @@ const here = (path) => fileURLToPath(new URL(path, import.meta.url));
 const out = (name) => `${process.argv[2] ?? here("dist")}/${name}`;
 
 await mkdir(out("."), { recursive: true });
-await build({
-  entryPoints: [here("src/main.js")],
-  outfile: out("viewer.js"),
+const options = {
   bundle: true,
   // A classic script: browsers load no modules from file://.
   format: "iife",
@@ -18,8 +16,15 @@ await build({
   minify: true,
   charset: "ascii",
   legalComments: "none",
+};
+await build({
+  ...options,
+  entryPoints: [here("src/main.js")],
+  outfile: out("viewer.js"),
   banner: { js: "/* FlexRoad viewer. Contains three.js (MIT), see LICENSES.txt. */" },
 });
+// The script of the HTML report, which shares the map; not a file of a viewer, so in a folder of its own.
+await build({ ...options, entryPoints: [here("src/report/page.js")], outfile: out("report/page.js") });
 for (const name of ["index.html", "viewer.css"]) {
   await copyFile(here(`page/${name}`), out(name));
 }

@@ -2,8 +2,8 @@
 
 const CLICK_PX = 6;
 
-/** Calls move(dx, dy), zoom(factor, x, y), point(x, y or null) and choose(x, y) for what is done on an element. */
-export function gestures(element, { move, zoom, point, choose }) {
+/** Calls move(dx, dy), zoom(factor, x, y), point(x, y or null) and choose(x, y) for what is done on an element; wheel(event) says whether it zooms. */
+export function gestures(element, { move, zoom, point, choose, wheel = () => true }) {
   const down = new Map();
   let travelled = 0;
   const at = (event) => {
@@ -12,6 +12,7 @@ export function gestures(element, { move, zoom, point, choose }) {
   };
 
   element.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
     element.setPointerCapture(event.pointerId);
     if (!down.size) travelled = 0;
     down.set(event.pointerId, at(event));
@@ -45,6 +46,7 @@ export function gestures(element, { move, zoom, point, choose }) {
   element.addEventListener(
     "wheel",
     (event) => {
+      if (!wheel(event)) return;
       event.preventDefault();
       zoom(2 ** (-event.deltaY / (event.deltaMode ? 12 : 400)), ...at(event));
     },

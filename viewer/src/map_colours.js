@@ -2,17 +2,12 @@
 
 import { DONE, FAILED } from "./run.js";
 import { short } from "./place.js";
+import { mix } from "./scale.js";
 import { flagText, isFlagged } from "./words.js";
 
 export const STATES = { done: "#3f8fb5", flagged: "#e3a02c", failed: "#b8352c", pending: "#9aa3aa" };
 const PALE = "#b9c8d1";
-const RAMP = [
-  [236, 240, 214],
-  [166, 211, 176],
-  [76, 164, 170],
-  [48, 102, 150],
-  [58, 36, 102],
-];
+const RAMP = ["#ecf0d6", "#a6d3b0", "#4ca4aa", "#306696", "#3a2466"];
 
 /** Returns the choices of a run: key, label and a function that gives the colour of a tile; with a legend. */
 export function choices(run) {
@@ -82,9 +77,4 @@ function quantile(sorted, share) {
 }
 
 /** Returns the colour of a share from 0 to 1. */
-export function ramp(share) {
-  const at = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1);
-  const i = Math.min(Math.floor(at), RAMP.length - 2);
-  const mixed = RAMP[i].map((value, k) => Math.round(value + (at - i) * (RAMP[i + 1][k] - value)));
-  return `rgb(${mixed.join(",")})`;
-}
+export const ramp = (share) => mix(RAMP, share);

@@ -21,12 +21,12 @@ export class MapView {
       open: (tile) => this.choose(tile),
       point: (tile, x, y) => this.tip(tile, x, y),
     });
-    this.map.paint(this.choice.colour);
+    this.map.colourBy(this.choice.colour);
   }
 
   /** Does what a key means; returns whether it means anything. */
   key(event) {
-    return this.map.key(event, (tile) => this.choose(tile), (tile, x, y) => this.tip(tile, x, y));
+    return this.map.key(event);
   }
 
   /** Colours the map by a choice; unknown keys are ignored. */
@@ -34,7 +34,7 @@ export class MapView {
     const choice = this.choices.find((one) => one.key === key);
     if (!choice) return;
     this.choice = choice;
-    this.map.paint(choice.colour);
+    this.map.colourBy(choice.colour);
   }
 
   /** Returns the settings. */

@@ -41,8 +41,8 @@ from flexroad.tasks.quality.assess import FLAGS, Options
 pyproj = lazy("pyproj")
 
 HERE = Path(__file__).parent
-SCRIPTS = ("colours.js", "map.js", "tables.js", "page.js")
-"""In the order in which they need each other."""
+SCRIPT = HERE.resolve().parents[2] / "viewer" / "dist" / "report" / "page.js"
+"""Built from viewer/src/report. Folders of a checkout's package are links, which resolve() follows."""
 NAMED = 5
 """Tiles without a position that are named."""
 ESTIMATE, TRUE_ERROR = "error_estimate_m", "l2_road_m"
@@ -107,7 +107,7 @@ def html_page(
     if background:
         places = [background.places.get(tile.id) for tile in table.tiles]
         data["relief"] = {"side": background.side_px, "columns": background.columns, "places": places}
-    script = _script()
+    script = SCRIPT.read_text(encoding="utf-8")
     return template("page.html.j2", HERE).render(
         content=content,
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
@@ -195,14 +195,6 @@ def _look(
         reasons(row, options, found.places if found else {}),
         found,
         f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
-    )
-
-
-def _script() -> str:
-    parts = "\n".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    return (
-        '"use strict";(() => {\nconst DATA = JSON.parse(document.getElementById("data").textContent);\n'
-        f"{parts}}})();"
     )
 
 

@@ -1,5 +1,8 @@
 // Tables that sort by a click on a heading, and the table of all tiles, which is made when it is opened.
 
+import { STATE_KEYS, element, flagNamesOf, format } from "./colours.js";
+import { DATA } from "./data.js";
+
 const PAGE_ROWS = 100;
 
 function sortKey(text) {
@@ -33,7 +36,7 @@ function sortableHeadings(headings, sort) {
   });
 }
 
-function makeSortable(table) {
+export function makeSortable(table) {
   const body = table.tBodies[0];
   sortableHeadings([...table.tHead.rows[0].cells], (column, direction) => {
     const rows = [...body.rows].map((row) => [sortKey(row.cells[column].textContent), row]);
@@ -42,7 +45,7 @@ function makeSortable(table) {
   });
 }
 
-class TileList {
+export class TileList {
   constructor(box, select) {
     this.box = box;
     this.select = select;

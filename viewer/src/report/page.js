@@ -1,5 +1,12 @@
 // The page: joins map, legend, details of the selected tile and tables.
 
+import {
+  STATE_KEYS, darkMedia, drawLegend, element, flagNamesOf, format, isDone, scaleOf, setPrinting, withUnit,
+} from "./colours.js";
+import { DATA } from "./data.js";
+import { TileMap } from "./map.js";
+import { TileList, makeSortable } from "./tables.js";
+
 const find = (id) => document.getElementById(id);
 const select = find("colour-by"), panel = find("tile"), tip = find("tip"), hint = find("hint");
 const dimmed = new Set();
@@ -35,27 +42,24 @@ function grouped(value) {
 }
 
 function hover(i, px, py) {
-  const place = map.toGround(px, py);
-  find("cursor").textContent = i < 0 && !px ? "" : `${grouped(DATA.bounds[0] + place[0])} / ${grouped(DATA.bounds[1] + place[1])}`;
+  const place = map.box.toGround(px, py);
+  find("cursor").textContent = px === null ? "" : `${grouped(DATA.bounds[0] + place[0])} / ${grouped(DATA.bounds[1] + place[1])}`;
   tip.hidden = i < 0;
   if (i < 0) return;
   const value = select.value === "state" ? "" : `: ${scale.text(i)}`;
   tip.replaceChildren(element("b", {}, DATA.ids[i]), element("br"), `${DATA.stateNames[STATE_KEYS[DATA.states[i]]]}`,
     ...(value ? [element("br"), `${scale.title}${value}`] : []));
-  tip.style.left = `${Math.min(px + 14, map.width - tip.offsetWidth - 4)}px`;
-  tip.style.top = `${py + 18 + tip.offsetHeight > map.height ? py - tip.offsetHeight - 8 : py + 18}px`;
+  tip.style.left = `${Math.min(px + 14, map.box.width - tip.offsetWidth - 4)}px`;
+  tip.style.top = `${py + 18 + tip.offsetHeight > map.box.height ? py - tip.offsetHeight - 8 : py + 18}px`;
 }
 
-function drawScaleBar(map) {
-  const metres = map.scaleMetres();
-  find("scale").style.width = `${metres * map.view.scale}px`;
-  find("scale").textContent = length(metres);
+function drawScaleBar(pixels, text) {
+  find("scale").style.width = `${pixels}px`;
+  find("scale").textContent = text;
 }
 
 function selectTile(i, byKey = false) {
-  map.selected = i;
-  if (i >= 0) map.show(i);
-  else map.draw();
+  map.selectNumber(i);
   history.replaceState(null, "", i < 0 ? location.pathname + location.search : `#tile=${encodeURIComponent(DATA.ids[i])}`);
   showDetails(i);
   if (i >= 0 && !byKey && window.innerWidth < 900) panel.scrollIntoView({ block: "nearest" });
@@ -148,13 +152,13 @@ function onThePage() {
   window.addEventListener("beforeprint", () => {
     closed = [...document.querySelectorAll("details[data-print]:not([open])")];
     for (const one of closed) one.open = true;
-    printing = true;
+    setPrinting(true);
     recolour();
     map.paint();
   });
   window.addEventListener("afterprint", () => {
     for (const one of closed) one.open = false;
-    printing = false;
+    setPrinting(false);
     recolour();
   });
 }

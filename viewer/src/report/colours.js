@@ -1,6 +1,9 @@
 // Colours of the map by state, flag, name or number, for light and dark pages, and the legend.
 
-const STATE_KEYS = Object.keys(DATA.stateNames);
+import { mix } from "../scale.js";
+import { DATA } from "./data.js";
+
+export const STATE_KEYS = Object.keys(DATA.stateNames);
 const STATE_COLOURS = {
   light: { fine: "#bcd9ee", flagged: "#ffb43d", "no-road": "#e3d9c2", failed: "#e0475c", pending: "#c9ccd2" },
   dark: { fine: "#4f7fa3", flagged: "#ffab2e", "no-road": "#8d8168", failed: "#ee4f66", pending: "#5a6270" },
@@ -20,37 +23,28 @@ const NAMES = {
 const BARS = 18;
 const NO_CHANGE = 0.01; // Ends of a scale of differences if all are 0.
 
-const darkMedia = window.matchMedia("(prefers-color-scheme: dark)");
-let printing = false;
+export const darkMedia = window.matchMedia("(prefers-color-scheme: dark)");
+export let printing = false;
+export const setPrinting = (now) => { printing = now; };
 const isDark = () => darkMedia.matches && !printing;
 const tone = () => (isDark() ? "dark" : "light");
 
-function themeColours() {
+export function themeColours() {
   return isDark()
     ? { dark: true, ground: "#171c23", beyond: "#6d747d", none: "#39414c", edge: "rgba(0,0,0,.45)", halo: "#10141a", mark: "#ffffff" }
     : { dark: false, ground: "#eef1f4", beyond: "#ffffff", none: "#d3d8de", edge: "rgba(255,255,255,.6)", halo: "#ffffff", mark: "#111820" };
 }
 
-function mix(stops, share) {
-  const at = Math.min(Math.max(share, 0), 1) * (stops.length - 1);
-  const i = Math.min(Math.floor(at), stops.length - 2);
-  const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
-  const a = rgb(stops[i]), b = rgb(stops[i + 1]);
-  return `rgb(${a.map((v, k) => Math.round(v + (b[k] - v) * (at - i))).join(",")})`;
-}
-
-function format(value) {
+export function format(value) {
   if (value === null || value === undefined) return "–";
   if (Math.abs(value) >= 100) return Math.round(value).toLocaleString("en-US");
   return String(Number(value.toPrecision(3)));
 }
 
-const length = (metres) => (metres >= 1000 ? `${metres / 1000} km` : `${metres} m`);
-
-const withUnit = (value, unit) => (unit === "%" || unit === "°" ? format(value) + unit : `${format(value)} ${unit}`.trim());
+export const withUnit = (value, unit) => (unit === "%" || unit === "°" ? format(value) + unit : `${format(value)} ${unit}`.trim());
 
 // A scale gives the colour of a tile, the text of its value, and the entries of the legend.
-function scaleOf(key) {
+export function scaleOf(key) {
   if (key === "state") return stateScale();
   if (key === "flags") return flagScale();
   if (key.startsWith("flag:")) return oneFlagScale(Number(key.slice(5)));
@@ -84,8 +78,8 @@ function stateScale() {
     (kind) => STATE_COLOURS[tone()][kind], (kind) => DATA.stateNames[kind]);
 }
 
-const isDone = (i) => !["failed", "pending"].includes(STATE_KEYS[DATA.states[i]]);
-const flagNamesOf = (i) => DATA.flagNames.filter((_, bit) => DATA.flags[i] & (1 << bit));
+export const isDone = (i) => !["failed", "pending"].includes(STATE_KEYS[DATA.states[i]]);
+export const flagNamesOf = (i) => DATA.flagNames.filter((_, bit) => DATA.flags[i] & (1 << bit));
 
 function flagScale() {
   const kinds = ["no flag", "one flag", "two flags", "three or more flags"];
@@ -130,7 +124,7 @@ function numberScale(column) {
 // Taken from the page, so that the file has no web address at all.
 const SVG = document.getElementById("svg").namespaceURI;
 
-function element(tag, attributes = {}, ...children) {
+export function element(tag, attributes = {}, ...children) {
   const node = tag.startsWith("svg:") ? document.createElementNS(SVG, tag.slice(4)) : document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
     if (value !== null && value !== undefined && value !== false) node.setAttribute(name, value === true ? "" : value);
@@ -139,7 +133,7 @@ function element(tag, attributes = {}, ...children) {
   return node;
 }
 
-function drawLegend(box, scale, dimmed, toggle) {
+export function drawLegend(box, scale, dimmed, toggle) {
   box.replaceChildren(element("h3", {}, scale.title));
   box.append(scale.numbers ? numberLegend(scale.numbers) : kindLegend(scale, dimmed, toggle));
 }
