@@ -44,7 +44,7 @@ FIELDS = tuple(
 
 
 def entries(data: bytes) -> Iterator[Item]:
-    """Yield the fields of each item that make a tile; reading whole items is many times slower.
+    """Yield the fields of each item that make a tile; reading complete items is many times slower.
 
     Raises
     ------

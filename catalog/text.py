@@ -82,7 +82,7 @@ def write_reason(error: BaseException) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error's whole message as one short line, or its type if it has none."""
+    """Return an error's complete message as one short line, or its type if it has none."""
     return " ".join(str(error).split())[:MAX_LINE] or type(error).__name__
 
 

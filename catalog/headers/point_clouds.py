@@ -221,7 +221,7 @@ def _opened(path: Path) -> Any:
         missing = "is not a file" if path.exists() else "does not exist"
         raise CatalogError(f"{path} {missing}; give LAS or LAZ files, or folders of them")
     largest = _attempt(path, lambda: las_header.check(path))
-    # The parallel decoder allocates a whole chunk, which the header may give as 2^32 points.
+    # The parallel decoder allocates a complete chunk, which the header may give as 2^32 points.
     backend = laspy.LazBackend.Lazrs if largest > CHUNK_BYTES else laspy.LazBackend.LazrsParallel
     return _attempt(path, lambda: laspy.open(path, laz_backend=backend))
 

@@ -368,7 +368,7 @@ def open_surface(path: str | Path) -> Surface:
     ----------
     path : str or Path
         An ``.npz`` file, such as ``RUN/tiles/ID/ID_flexroad_surface.npz``. Files of a run contain no road
-        mask: the surface then has heights and normals over its whole domain, but no mesh.
+        mask: the surface then has heights and normals over its complete domain, but no mesh.
 
     Raises
     ------

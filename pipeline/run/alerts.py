@@ -128,7 +128,7 @@ def _wait(process: subprocess.Popen[bytes], text: str, policy: RetryPolicy, name
     try:
         process.communicate(text.encode(), policy.command_s)
     except subprocess.TimeoutExpired:
-        # The whole process group: the command may have started others.
+        # The complete process group: the command may have started others.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         return f"{name} took more than {policy.command_s:g} s and was killed"

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SQUARE_M = 4000.0
 """Side of the squares in which indexed files are read (m)."""
 CACHE_SIZE = 8
-"""Number of squares, or whole files, that a process keeps in memory."""
+"""Number of squares, or complete files, that a process keeps in memory."""
 OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highway%'"}
 """Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
