@@ -1,6 +1,6 @@
 """Local copies of files in a bucket that grow or change in place, or are large.
 
-A bucket stores only complete files, so such files are written locally and uploaded. For a location on disk the
+A bucket stores only complete files, so such files are written locally and uploaded. On disk the
 staged file is the file itself; nothing is copied.
 """
 

@@ -1,6 +1,6 @@
 """The surface along a road as OpenCRG 1.2: a grid of heights along a curved line, for tyres and vehicles.
 
-The file is KRBI: a text header, then binary rows of big-endian float32, filled up with NaN to complete records.
+The file is KRBI: a text header, then binary rows of big-endian float32, filled with NaN to complete records.
 A row has the heading and the heights across the road from right to left. Heights are relative to a whole
 metre (``REFERENCE_LINE_START_Z``), so that float32 resolves micrometres.
 """

@@ -119,7 +119,7 @@ class RasterGrid:
         return slice(tall.start, min(tall.stop, self.height)), slice(wide.start, min(wide.stop, self.width))
 
     def coarser(self, step: int) -> RasterGrid:
-        """Return the lattice of cells read together; a last step with fewer cells counts as a complete one."""
+        """Return the lattice of cells read together; a last step with fewer cells counts as complete."""
         width, height = -(-self.width // step), -(-self.height // step)
         return replace(
             self, dx=self.dx * step, dy=self.dy * step, width=width, height=height, northward=False

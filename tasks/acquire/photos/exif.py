@@ -271,7 +271,7 @@ def _accuracy(xmp: Mapping[str, str], gps: Mapping[int, Any]) -> tuple[float, fl
 def _focal(xmp: Mapping[str, str], film_mm: Any, width: int, height: int) -> float | None:
     """Return the focal length (pixels): the manufacturer's calibration, else from the 35 mm equivalent.
 
-    The equivalent compares diagonals of complete sensors (CIPA DCG-001); wide photographs are cropped in height.
+    The equivalent compares diagonals of full sensors (CIPA DCG-001); wide photographs are cropped in height.
     """
     longer, shorter = max(width, height), min(width, height)
     if 0 < float(xmp.get("CalibratedFocalLength") or 0) <= LONGEST * longer:
