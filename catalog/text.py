@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 MAX_SHOWN = 160
@@ -51,6 +51,12 @@ def with_formula(text: str) -> str:
 def count(number: int, noun: str) -> str:
     """Return a number with its noun: ``1 tile``, ``2 tiles``."""
     return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def some(names: Sequence[str]) -> str:
+    """Return the first three names and the number of the others, for a message."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
 
 
 def edges(bounds: Iterable[float]) -> str:

@@ -23,9 +23,9 @@ from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, sa
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.catalog.headers.cover import height_share
-from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, some, zoned
+from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, zoned
 from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.text import count
+from flexroad.catalog.text import count, some
 from flexroad.catalog.tile import HEIGHTS, LAYERS, REACH_M, Layer, Tile, by_cover
 
 MASKS = ("road_mask", "reference_road")

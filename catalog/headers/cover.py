@@ -15,8 +15,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.headers.open_raster import ERRORS
-from flexroad.catalog.headers.raster_faults import georeference_fault, heights_fault
-from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.headers.rasters import georeference_fault, heights_fault, quiet
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.trust import AllowedFolders
 

@@ -11,7 +11,8 @@ from rasterio.windows import Window
 
 from flexroad.catalog.headers.cover import AS_TEXT
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.rasters import quiet, some
+from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.text import some
 
 MOST_FILES = 8
 """Largest number of files of a layer that are read."""

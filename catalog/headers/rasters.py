@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
+import sys
+import threading
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,23 +15,23 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from glob import has_magic
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePath
+from types import TracebackType
+from typing import Any
 
 import rasterio
 from affine import Affine
+from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 
 from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.globbing import glob, is_folder
+from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.raster_faults import AGAIN, georeference_fault, heights_fault
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.headers.undecodable import undecodable_ignored
 from flexroad.catalog.storage.settings import gdal_options
-from flexroad.catalog.text import access_reason
-from flexroad.catalog.tile import HEIGHTS
+from flexroad.catalog.text import access_reason, some
+from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.trust import AllowedFolders
 
 GDAL = {
@@ -39,10 +42,17 @@ GDAL = {
     # Do not write a file with the unpacked size beside a .gz file.
     "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
 }
-
-
 DATE_TAGS = ("ACQUISITIONDATETIME", "ACQUISITIONDATE", "ACQUISITION_DATE", "TIFFTAG_DATETIME")
 """Tags with a date, the first one with a value wins."""
+AGAIN = "give it its georeference with gdal_translate -a_ullr"
+BANDS = tuple(name for name, _ in ROAD_HEIGHT_BANDS)
+HANDLERS = (
+    "rasterio._env.log_error",
+    "rasterio._err.log_error",
+    "rasterio._err.chaining_error_handler",
+)
+"""rasterio's functions that decode GDAL's messages for its log and cannot raise: of one that is no UTF-8,
+Python prints the UnicodeDecodeError. The reader of the file reports its damage by itself."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +77,51 @@ class RasterFile:
     """Unit of heights that the band or the CRS declares, or None."""
 
 
+class _Hooks:
+    """Python's two hooks that print errors of `HANDLERS`, replaced while any thread needs it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._unraisable, self._printed = sys.unraisablehook, sys.excepthook
+                sys.unraisablehook, sys.excepthook = self._unless_ignored, self._unless_traceless
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users:
+                sys.unraisablehook, sys.excepthook = self._unraisable, self._printed
+
+    def _unless_ignored(self, event: Any) -> None:
+        if event.exc_type is not UnicodeDecodeError or event.object not in HANDLERS:
+            self._unraisable(event)
+
+    def _unless_traceless(
+        self, kind: type[BaseException], value: BaseException, traceback: TracebackType | None
+    ) -> None:
+        # Cython prints the error itself, before it is ignored; an error of Python has a traceback.
+        if kind is not UnicodeDecodeError or traceback is not None:
+            self._printed(kind, value, traceback)
+
+
+_hooks = _Hooks()
+
+
+_hooks = _Hooks()
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """Set GDAL's options for catalog and tasks; suppress what is printed about files that are damaged.
 
     That is warnings about files without a georeference, and messages that are no text.
     """
-    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings(), undecodable_ignored():
+    with rasterio.Env(**GDAL, **gdal_options()), warnings.catch_warnings(), _hooks:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield
 
@@ -147,12 +195,6 @@ def skip(names: str, layer: str, reason: str) -> str:
     return f"skipped {names} ({layer}): {reason}"
 
 
-def some(names: Sequence[str]) -> str:
-    """Return the first three names and the number of the others, for a message."""
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
-
-
 def _option(layer: str) -> str:
     return "--" + layer.replace("_", "-")
 
@@ -182,12 +224,58 @@ def matching(root: Path, layer: str, pattern: str) -> tuple[list[Path], list[str
     except (ValueError, NotImplementedError) as error:
         raise CatalogError(f"{_option(layer)} {pattern!r} is no pattern below {folder}: {error}") from error
     names_files = "." in Path(relative).name
-    paths = [path for path in found if names_files or not is_folder(path)]
+    paths = [path for path in found if names_files or not _is_folder(path)]
     lines = unlisted_lines(root, layer, unlisted)
     if not paths:
-        there = lines[0] if lines else _there(folder)
-        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {there}")
+        why = lines[0] if lines else there(folder)
+        raise CatalogError(f"no file matches {_option(layer)} {pattern!r} below {folder}; {why}")
     return paths, lines
+
+
+def glob(folder: Path, pattern: str) -> tuple[list[Path], list[tuple[Path, OSError]]]:
+    """Return all that matches a glob pattern, and the folders that may hold more.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder that the pattern is relative to.
+    pattern : str
+
+    Returns
+    -------
+    paths : list of Path
+        Files, folders, and links to nothing, by name.
+    unlisted : list of (Path, OSError)
+        Folders on the pattern's way that cannot be listed, each with the error; `Path.glob` ignores them.
+
+    Raises
+    ------
+    ValueError, NotImplementedError
+        If the pattern is invalid.
+    """
+    paths = sorted(folder.glob(pattern))
+    return paths, list(_unlisted(folder, pattern))
+
+
+def _unlisted(folder: Path, pattern: str) -> Iterator[tuple[Path, OSError]]:
+    above = PurePath(pattern).parts[:-1]
+    places = {folder}
+    for depth in range(1, len(above) + 1):
+        places.update(folder.glob("/".join(above[:depth])))
+    for place in sorted(places):
+        try:
+            with os.scandir(place):
+                pass
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            yield place, error
+
+
+def _is_folder(path: Path) -> bool:
+    """Return whether a path is a folder; what cannot be looked up is none."""
+    # `Path.is_dir` raises an error for a name in a folder without permission.
+    return os.path.isdir(path)  # noqa: PTH112
 
 
 def unlisted_lines(root: Path, layer: str, unlisted: Iterable[tuple[Path, OSError]]) -> list[str]:
@@ -211,13 +299,13 @@ def _start(root: Path, pattern: str) -> tuple[Path, str]:
     return Path(*parts[:fixed]), str(Path(*parts[fixed:]))
 
 
-def _there(folder: Path) -> str:
-    """Return which files are in a folder, for a message."""
+def there(folder: Path, remedy: str = "") -> str:
+    """Return which files are in a folder, for a message, and if there are any, what to do with them."""
     if not folder.is_dir():
         return "the folder does not exist"
-    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not is_folder(path))
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not _is_folder(path))
     names = some(sorted(islice(files, 100)))
-    return f"there are {names}" if names else "the folder is empty"
+    return f"there are {names}{remedy}" if names else "the folder is empty"
 
 
 def _name(root: Path, path: Path) -> str:
@@ -332,3 +420,37 @@ def require_metric(file: RasterFile, option: str = "") -> None:
         f"{file.name} is in {short(file.crs)}, whose unit is {units}; "
         f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}{instead}"
     )
+
+
+def georeference_fault(dataset: Any) -> str | None:
+    """Return why the position of an open raster is no place, to follow its name; None if it is one."""
+    # A dataset makes its transform anew each time.
+    transform = dataset.transform
+    east_step, _, west, _, north_step, north = transform[:6]
+    if not all(map(math.isfinite, transform[:6])):
+        cells = f"cells of {east_step:g} x {north_step:g}"
+        return f"has the origin {west:g}, {north:g} and {cells}, which is no place; {AGAIN}"
+    if not transform.determinant:
+        return f"has cells of {east_step:g} x {north_step:g}; {AGAIN}"
+    corners = (west, north, west + dataset.width * east_step, north + dataset.height * north_step)
+    if max(map(abs, corners)) > FARTHEST:
+        return (
+            f"reaches from {west:g}, {north:g} to {corners[2]:g}, {corners[3]:g}, which is no place; {AGAIN}"
+        )
+    return None
+
+
+def heights_fault(dataset: Any) -> str | None:
+    """Return why an open raster has no heights, to follow its name; None if it has them.
+
+    They are its only band of numbers, or the first one if its bands are described as `ROAD_HEIGHT_BANDS`.
+    """
+    kinds = [kind for kind in dataset.colorinterp if kind != ColorInterp.alpha]
+    if len(kinds) > 1 and dataset.descriptions[: len(BANDS)] != BANDS:
+        bands = f"{len(kinds)} bands ({', '.join(kind.name for kind in kinds[:4])})"
+        return f"has {bands}, but heights are one; keep theirs with gdal_translate -b 1"
+    if ColorInterp.palette in kinds:
+        return "has a palette of colours, no heights; give a raster of heights"
+    if dataset.dtypes[0].startswith("complex"):
+        return f"has complex numbers ({dataset.dtypes[0]}), no heights; give a raster of heights"
+    return None

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
-from flexroad.catalog.headers.globbing import glob
 from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.point_clouds import chunks
-from flexroad.catalog.headers.rasters import RasterFile, opened, scan, skip, some, unlisted_lines
+from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, skip, there, unlisted_lines
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.storage.outputs import atomic_path
+from flexroad.catalog.text import some
 from flexroad.catalog.tile import Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
@@ -138,9 +138,8 @@ def index(
         if files:
             layer_files[layer] = files
     if "dsm" not in layer_files:
-        raise CatalogError(
-            f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {_hint(root, left_out)}"
-        )
+        why = left_out[0] if left_out else there(root)
+        raise CatalogError(f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {why}")
     if road_mask is not None:
         layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
         left_out += skipped
@@ -287,11 +286,3 @@ def _without_terrain(tiles: Sequence[Tile]) -> list[str]:
     if not lacking:
         return []
     return [f"no dgm1 file under {some(lacking)}: these tiles will fail; download the terrain model as well"]
-
-
-def _hint(root: Path, left_out: Sequence[str]) -> str:
-    """Return the end of the error for a folder without a DSM: the first skipped file, or those that exist."""
-    if left_out:
-        return left_out[0]
-    files = sorted(path.name for path in root.rglob("*") if path.is_file())
-    return f"there are {some(files)}" if files else "the folder is empty"

@@ -13,11 +13,11 @@ from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.rasters import quiet, some
+from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
-from flexroad.catalog.text import access_reason, count
+from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError

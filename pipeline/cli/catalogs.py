@@ -199,10 +199,11 @@ def catalog_gerod(
     strict: Strict = False,
 ) -> None:
     """List the tiles of the GeRoD dataset."""
-    from flexroad.catalog.sources import gerod
+    from flexroad.catalog.sources import templates
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(gerod.index(root, load_config(layout).dataset, date=date), output, strict, layout)
+    result = templates.index(root, load_config(layout).dataset, templates.GEROD, date=date)
+    _write_catalog(result, output, strict, layout)
 
 
 @catalogs.command("dsc3d", cls=Command)
@@ -214,10 +215,11 @@ def catalog_dsc3d(
     strict: Strict = False,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
-    from flexroad.catalog.sources import dsc3d
+    from flexroad.catalog.sources import templates
     from flexroad.pipeline.config.loading import load_config
 
-    _write_catalog(dsc3d.index(root, load_config(layout).dataset, date=date), output, strict, layout)
+    result = templates.index(root, load_config(layout).dataset, templates.DSC3D, date=date)
+    _write_catalog(result, output, strict, layout)
 
 
 def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str | None = None) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexroad.catalog.headers.rasters import some
+from flexroad.catalog.text import some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.mesh import MeshOptions, publish_mesh

@@ -13,7 +13,7 @@ import numpy as np
 from flexroad.catalog import CatalogError
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.point_clouds import Cloud, find, inspect
-from flexroad.catalog.headers.rasters import some
+from flexroad.catalog.text import some
 from flexroad.catalog.to_metres import MetricTransform, agreed
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks

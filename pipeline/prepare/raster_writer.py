@@ -27,10 +27,11 @@ from rasterio.windows import Window
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.crs import compound
 from flexroad.catalog.headers.cover import height_share
-from flexroad.catalog.headers.rasters import opened, some, zoned
+from flexroad.catalog.headers.rasters import opened, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError

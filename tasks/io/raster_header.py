@@ -11,7 +11,7 @@ from rasterio.enums import MaskFlags
 
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.grid import Bounds, Grid
-from flexroad.catalog.headers.raster_faults import georeference_fault
+from flexroad.catalog.headers.rasters import georeference_fault
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid

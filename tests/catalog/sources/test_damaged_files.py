@@ -11,7 +11,7 @@ import pytest
 from shapely.geometry import box
 
 from flexroad.catalog import Catalog, CatalogError
-from flexroad.catalog.sources import gerod, nrw
+from flexroad.catalog.sources import nrw, templates
 from flexroad.catalog.sources.rasters import index
 from flexroad.catalog.tiling import Conversion
 from tests.command_line import call
@@ -255,7 +255,7 @@ def test_scene_in_degrees_is_left_out_of_scenes_by_templates(tmp_path):
         for layer in ("dsm", "dtm"):
             write(tmp_path / layer / f"{number}.tif", np.ones((9, 9), np.float32), 7, 51, crs=crs)
     layout = {"layers": {"dsm": "dsm/{tile}.tif", "dtm": "dtm/{tile}.tif"}}
-    result = gerod.index(tmp_path, layout)
+    result = templates.index(tmp_path, layout, templates.GEROD)
     assert [tile.id for tile in result.tiles] == ["0", "1"]
     (line,) = result.left_out
     assert line.startswith("skipped dsm/2.tif is in EPSG:4326, whose unit is degrees")

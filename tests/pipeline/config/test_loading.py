@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.path_templates import Layout
+from flexroad.catalog.sources.templates import Layout
 from flexroad.pipeline.config.loading import compose, load_config, read_mapping, shipped
 from flexroad.pipeline.config.schema import schema, template
 from flexroad.pipeline.errors import ConfigError

@@ -2,26 +2,34 @@
 
 A template is a path relative to the folder. ``{tile}`` is the tile's id, ``{stratum}`` its class of area, and
 ``*`` any text; none of them matches a slash.
+
+The paper's datasets are read so: GeRoD, 240 tiles of 250 x 250 m of North Rhine-Westphalia, and DSC3D, the
+DeepScenario Open 3D Dataset, as rasters made from the meshes of its scenes with separate true heights. The
+names of their files are not fixed: the templates in ``configs/gerod.yaml`` and ``configs/dsc3d.yaml`` are a
+guess, to be adapted to the folder.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.globbing import glob
-from flexroad.catalog.headers.rasters import RasterFile, opened, require_metric, some, unlisted_lines
-from flexroad.catalog.text import shown
+from flexroad.catalog.headers.rasters import RasterFile, glob, opened, require_metric, there, unlisted_lines
+from flexroad.catalog.text import shown, some
 from flexroad.catalog.tile import LAYERS, Layer, Tile
 from flexroad.catalog.tiling import MASKS, TilingResult, assumed, taken
 
+GEROD, DSC3D = "GeRoD", "DSC3D"
+GEROD_TILES = 240
+CORNER = re.compile(r"(\d+)_(\d+)")
+"""Ids of GeRoD are the south-west corner in whole metres: the paper's ``295500_5629250``."""
 NEEDED = ("dsm", "dtm")
 PLACEHOLDER = re.compile(r"\{(.*?)\}")
 
@@ -63,8 +71,8 @@ class Layout:
         kinds = {
             "layers": (dict, "a mapping of layers to templates"),
             "crs": (str, "a CRS such as EPSG:25832"),
+            "road_values": (list, "a list of whole numbers"),
         }
-        kinds["road_values"] = (list, "a list of whole numbers")
         for key, value in raw.items():
             if key not in kinds:
                 raise CatalogError(f"layout: unknown key {shown(key)}; keys are {', '.join(kinds)}")
@@ -81,12 +89,61 @@ class Layout:
         return cls(raw.get("layers", {}), tuple(raw.get("road_values", ())), raw.get("crs"))
 
 
-@dataclass(frozen=True)
-class _MatchedFile:
-    """A file, and the stratum read from its path."""
-
+class _MatchedFile(NamedTuple):
     file: RasterFile
     stratum: str
+    """Read from its path."""
+
+
+def index(
+    root: Path, layout: Mapping[str, Any], dataset: str, *, date: datetime | None = None
+) -> TilingResult:
+    """Return the tiles of a dataset's folder, with notes on what differs from the paper's.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    layout : Mapping[str, Any]
+        ``layers`` (templates), ``road_values`` and ``crs``, as in a configuration's ``dataset``.
+    dataset : str
+        `GEROD` or `DSC3D`.
+    date : datetime, optional
+        Date of the survey; overrides the files' dates.
+
+    Raises
+    ------
+    CatalogError
+        If the layout is invalid, or the folder does not match it.
+    """
+    result = read(root, Layout.of(layout), dataset=dataset, date=date)
+    notes = {GEROD: _gerod_notes, DSC3D: _dsc3d_notes}[dataset](result.tiles)
+    return replace(result, notes=(*result.notes, *notes))
+
+
+def _gerod_notes(tiles: Sequence[Tile]) -> list[str]:
+    """Return notes on tiles that are not at the corner in their id (a wrong template or CRS) or missing."""
+    off = [tile.id for tile in tiles if not _is_at_id(tile)]
+    notes = [f"not at the corner given by the tile's name: {some(off)}; check layout and CRS"] if off else []
+    if len(tiles) != GEROD_TILES:
+        notes.append(f"{len(tiles)} of the dataset's {GEROD_TILES} tiles are here")
+    return notes
+
+
+def _is_at_id(tile: Tile) -> bool:
+    """Return whether the tile's south-west corner is the one in its id, to within one cell."""
+    corner = CORNER.fullmatch(tile.id)
+    # Some programs write rasters of points, which begin half a cell before the corner.
+    return (
+        corner is not None and math.dist(map(float, corner.groups()), tile.grid.bounds[:2]) <= tile.grid.cell
+    )
+
+
+def _dsc3d_notes(tiles: Sequence[Tile]) -> list[str]:
+    # The paper's reference takes roads from the filtered DSM and terrain from the refined DTM.
+    without = [tile.id for tile in tiles if tile.layer("reference") is None]
+    note = f"no reference for {some(without)}: the DTM is used instead, unlike in the paper"
+    return [note] if without else []
 
 
 def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = None) -> TilingResult:
@@ -117,9 +174,8 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
             by_layer[name], skipped = _files(root, name, layout)
             left_out += skipped
     if not by_layer["dsm"]:
-        raise CatalogError(
-            f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {_hint(root, left_out)}"
-        )
+        why = left_out[0] if left_out else there(root, "; describe them with --layout")
+        raise CatalogError(f"no usable file matches {layout.layers['dsm']!r} (dsm) below {root}; {why}")
     left_out += _without_metres(by_layer["dsm"])
     tiles = tuple(
         _tile(
@@ -225,13 +281,3 @@ def _lacking(tiles: Sequence[Tile], layout: Layout) -> list[str]:
             share = f"{len(lacking)} of {len(tiles)} tiles"
             notes.append(f"no {name} at {layout.layers[name]!r} for {share}: {some(lacking)}")
     return notes
-
-
-def _hint(root: Path, left_out: Sequence[str]) -> str:
-    """Return the end of the error for a folder without a DSM: the first skipped file, or those that exist."""
-    if left_out:
-        return left_out[0]
-    files = sorted(
-        islice((path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()), 100)
-    )
-    return f"there are {some(files)}; describe them with --layout" if files else "the folder is empty"

@@ -6,8 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog import CatalogError
-from flexroad.catalog.path_templates import Layout, read
-from flexroad.catalog.sources import dsc3d, gerod
+from flexroad.catalog.sources.templates import DSC3D, GEROD, Layout, index, read
 from tests.make_rasters import UTM, write
 
 FLAT = np.full((20, 20), 100, np.float32)
@@ -105,21 +104,21 @@ def test_read_crs_in_feet_raises_error(tmp_path):
 
 def test_gerod_tile_not_at_its_id_is_noted(tmp_path):
     write_tiles(tmp_path)
-    result = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
+    result = index(tmp_path, {"layers": TWO}, GEROD, date=datetime(2020, 5, 1))
     assert {tile.dataset for tile in result.tiles} == {"GeRoD"}
     assert result.notes == ("2 of the dataset's 240 tiles are here",)
     write(tmp_path / "rural" / "295000_5629250" / "dsm.tif", FLAT, 296000, 5629270)
-    moved = gerod.index(tmp_path, {"layers": TWO}, date=datetime(2020, 5, 1))
+    moved = index(tmp_path, {"layers": TWO}, GEROD, date=datetime(2020, 5, 1))
     assert "not at the corner given by the tile's name: 295000_5629250; check layout and CRS" in moved.notes
 
 
 def test_dsc3d_missing_reference_is_noted(tmp_path):
     write_tiles(tmp_path, ("dsm.tif", "dtm_1.tif", "truth.tif"), stratum="a")
     date = datetime(2023, 1, 1)
-    whole = dsc3d.index(tmp_path, {"layers": TWO | {"reference": "a/{tile}/truth.tif"}}, date=date)
+    whole = index(tmp_path, {"layers": TWO | {"reference": "a/{tile}/truth.tif"}}, DSC3D, date=date)
     assert whole.notes == ()
     assert {tile.dataset for tile in whole.tiles} == {"DSC3D"}
-    without = dsc3d.index(tmp_path, {"layers": TWO}, date=date)
+    without = index(tmp_path, {"layers": TWO}, DSC3D, date=date)
     assert without.notes == (
         "no reference for 295500_5629250, 295750_5629250: the DTM is used instead, unlike in the paper",
     )
