@@ -124,7 +124,7 @@ lint: $(STAMP) ## Check style and types
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP) ## Print the stages beside their floors, peers, starts and make reproduce; one other benchmark: make bench BENCH=scale
+bench: $(STAMP) ## Print the stages beside their floors, peers, starts and make reproduce; one other benchmark: make bench BENCH=ground
 	@$(BIN)/python -m tests.bench $(BENCH)
 
 speed: $(STAMP) ## Measure the tables and the plot of docs/results/speed.md anew

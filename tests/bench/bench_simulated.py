@@ -1,18 +1,14 @@
 """Tiles that return at once: what client, scheduler and workers cost per tile, and the client's memory.
 
-Then strong and weak scaling of production's tiles on one and two workers. CPU time can be trusted on a busy
-machine; wall times, and so the efficiencies, need as many quiet cores as workers and one for the client.
-
-Usage: ``python tests/bench/bench_simulated.py [TILES] [SCALED] [--json FILE]``; 100,000 tiles take an hour.
+The tiles are tiny parts of two large rasters and a mask. Usage:
+``python tests/bench/bench_simulated.py [TILES]``; 100,000 tiles take an hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
-import json
 import math
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,43 +16,73 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
+import rasterio
+from numpy.typing import NDArray
 
-from flexroad.catalog import Catalog
+from flexroad.catalog import Catalog, Grid
 from flexroad.catalog.sources import rasters
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import DaskExecutor
 from flexroad.pipeline.execute.executor import Probe
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
-from tests.bench.bench_scale import CONFIG, LAYERS, TILE_M, busy, survey
-from tests.bench.measure_stages import one_variant
+from flexroad.tasks.synthetic import SceneOptions, make_scene
 from tests.bench.timing import resident_mb
 from tests.made_result import done
 
-TILES, SCALED = 2000, 8
-"""Default numbers of simulated tiles, and of computed tiles on one worker."""
+TILES = 2000
+"""Default number of tiles."""
+TILE_M = 20
+PATCH_M = 400
+"""Size of the synthetic scene of which the rasters are repeated copies."""
 WORKERS = 2
 STARTED = 0.3
 """Share of the tiles after which CPU time counts: code is loaded."""
+LAYERS = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
+CONFIG = {
+    "fit": {"control_points": [12, 12], "iterations": 30},
+    "export": {"variants": ["flexroad"], "formats": ["glb", "npz"]},
+    "variants": {"flexroad": {}},
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tiles", type=int, nargs="?", default=TILES)
-    parser.add_argument("scaled", type=int, nargs="?", default=SCALED)
-    parser.add_argument("--json", type=Path, help="write the figures to this file, too")
     options = parser.parse_args()
-    print(
-        f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; wall times want quiet ones"
-    )
     with tempfile.TemporaryDirectory(prefix="simulated-") as scratch:
-        figures = simulated(Path(scratch), options.tiles)
-        if options.scaled:
-            figures["scaling"] = scaling(Path(scratch), options.scaled)
-    if options.json:
-        options.json.write_text(json.dumps(figures))
+        simulated(Path(scratch), options.tiles)
+
+
+def survey(folder: Path, side: int) -> None:
+    """Write three rasters of ``side`` x ``side`` tiles: repeated copies of one synthetic scene."""
+    grid = Grid("EPSG:25832", 300_000, 5_700_000, 1.0, PATCH_M, PATCH_M)
+    # Dense streets, so that every tile has one.
+    scene = make_scene(grid, 7, options=SceneOptions(block_m=20))
+    cells = side * TILE_M
+    write(folder / "dsm.tif", scene.dsm, cells)
+    write(folder / "dtm.tif", scene.dtm, cells)
+    write(folder / "road.tif", scene.reference_road.astype(np.uint8), cells)
+
+
+def write(path: Path, patch: NDArray[Any], cells: int) -> None:
+    """Write a raster of repeated copies of a patch."""
+    repeat = math.ceil(cells / PATCH_M)
+    data = np.tile(patch, (repeat, repeat))[:cells, :cells]
+    data = data.astype(np.float32) if data.dtype == np.float64 else data
+    layout = {"driver": "GTiff", "tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    place = {"crs": "EPSG:25832", "transform": rasterio.transform.from_origin(300_000, 5_700_000, 1, 1)}
+    with rasterio.open(
+        path, "w", height=cells, width=cells, count=1, dtype=data.dtype, **layout, **place
+    ) as raster:
+        raster.write(data, 1)
+
+
+def busy(processes: list[psutil.Process]) -> float:
+    times = [process.cpu_times() for process in processes]
+    return float(sum(time.user + time.system for time in times))
 
 
 @dataclass
@@ -120,39 +146,6 @@ def simulated(folder: Path, tiles: int) -> dict[str, Any]:
     grown = (late["client_mb"] - middle["client_mb"]) * 2**20 / (late["tiles"] - middle["tiles"])
     print(f"  growth of the client in the second half: {grown:.0f} bytes a tile", flush=True)
     return {"tiles": len(catalog.tiles), "per_tile": per_tile, "samples": executor.samples}
-
-
-def scaling(folder: Path, tiles: int) -> list[dict[str, float]]:
-    """Run production's tiles: as many on two workers as on one (strong), and twice as many (weak)."""
-    catalog = Catalog.read(write_scenes(folder / "scenes", 2 * tiles, seed=11))
-    # Code is compiled, or compiled code read, before anything is timed.
-    computed(folder / "warm", Catalog(catalog.tiles[:2]), 2)
-    cases = {"one worker": (1, tiles), "strong": (2, tiles), "weak": (2, 2 * tiles)}
-    rows = []
-    for name, (workers, number) in cases.items():
-        wall, cpu = computed(folder / name, Catalog(catalog.tiles[:number]), workers)
-        rows.append({"workers": workers, "tiles": number, "wall_s": wall, "cpu_s": cpu})
-        ideal = rows[0]["wall_s"] * number / tiles / workers
-        print(
-            f"  {name:11}{workers} workers, {number:3} tiles: {wall:6.1f} s on the wall, efficiency "
-            f"{ideal / wall:5.0%}; {1000 * cpu / number:6.0f} ms of CPU a tile with the start",
-            flush=True,
-        )
-    return rows
-
-
-def computed(folder: Path, catalog: Catalog, workers: int) -> tuple[float, float]:
-    """Compute tiles in a new run; return wall time and CPU time of all processes, with their start (s)."""
-    run = Run.create(folder, one_variant("production"), catalog)
-    start, before = time.perf_counter(), total_cpu()
-    run_tiles(run, DaskExecutor(workers))
-    return time.perf_counter() - start, total_cpu() - before
-
-
-def total_cpu() -> float:
-    """Return the CPU time of this process and of its ended children (s)."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
 
 
 if __name__ == "__main__":
