@@ -27,7 +27,7 @@ RUNS = {
     *(f"tasks/{name}" for name in ("compiled.py", "io", "load.py", "memory.py")),
     *(
         f"pipeline/{name}"
-        for name in ("cli", "config", "errors.py", "execute", "graph", "monitor", "run", "store", "worker")
+        for name in ("cli", "config", "errors.py", "execute", "graph", "run", "store", "worker")
     ),
 }
 """What reads and writes the files of a run; the stages are pure functions."""
@@ -43,7 +43,7 @@ AREAS = {
         "pipeline/store",
     },
     "photos": {"catalog", "tasks/acquire", "tasks/io", "pipeline/prepare"},
-    "readers": RUNS | {"pipeline/inspect", "tasks/acquire", "tasks/segment"},
+    "readers": RUNS | {"pipeline/check", "pipeline/results", "tasks/acquire", "tasks/segment"},
 }
 
 
