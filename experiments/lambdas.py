@@ -22,7 +22,7 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.graph import tile_graph
 from flexroad.pipeline.report.pictures import webp
-from flexroad.pipeline.reproduce.figures.layout import (
+from flexroad.pipeline.reproduce.layout import (
     DPI,
     FLEXROAD,
     PATH,

@@ -23,8 +23,8 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.graph import tile_graph
 from flexroad.pipeline.report.content import FIGURES
 from flexroad.pipeline.reproduce.bootstrap import Means
-from flexroad.pipeline.reproduce.literal import distances_of
 from flexroad.pipeline.reproduce.published import TABLE_II
+from flexroad.pipeline.reproduce.sections import distances_of
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.worker.evaluator import Evaluator
 from flexroad.tasks import sample

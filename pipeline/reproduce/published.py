@@ -1,8 +1,9 @@
-"""Tables I and II of the paper, as printed."""
+"""What the paper says: its Tables I and II, as printed, and the claims of its text about them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from flexroad.pipeline.report.content import FIGURES
 
@@ -77,3 +78,111 @@ def published(variant: str, dataset: str = GEROD) -> Row | None:
     """Return a variant's row, from Table II if it is in both tables; None if it is in neither."""
     rows = TABLE_I_DSC3D if dataset == DSC3D else (*TABLE_II, *TABLE_I)
     return next((row for row in rows if row.variant == variant), None)
+
+
+class Claim(NamedTuple):
+    """A claim of the text: variants are in ascending order of a figure, or the second changes it."""
+
+    text: str
+    where: str
+    """Section of the paper that makes the claim."""
+    figure: str
+    variants: tuple[str, ...]
+    """In ascending order; or two, of which the second is compared with the first."""
+    quoted: float | None = None
+    """Change in percent, as quoted in the paper's text; None if the claim is about the order."""
+    slack: float = 0.0
+    """Relative amount by which a value may exceed the next (for claims such as "without loss")."""
+    dataset: str = GEROD
+
+
+RESULTS, ABLATION, CONCLUSION = "Comparative Analysis", "Ablation Study", "Conclusion"
+ROAD, TERRAIN, MAD_ROAD, MAD_TERRAIN, T = FIGURES
+
+CLAIMS = (
+    Claim("RGT is the most accurate on roads, a plane the least", RESULTS, ROAD, ("rgt", BASE, "plane")),
+    Claim(
+        "FlexRoad is the most accurate on terrain, a plane the least",
+        RESULTS,
+        TERRAIN,
+        (BASE, "rgt", "plane"),
+    ),
+    Claim("A plane is the smoothest road, RGT the roughest", RESULTS, MAD_ROAD, ("plane", BASE, "rgt")),
+    Claim("A plane is the smoothest terrain, RGT the roughest", RESULTS, MAD_TERRAIN, ("plane", BASE, "rgt")),
+    Claim("A plane has the fewest triangles, RGT the most", RESULTS, T, ("plane", BASE, "rgt")),
+    Claim("On terrain, L2 is 81% below RGT's", RESULTS, TERRAIN, ("rgt", BASE), -81),
+    Claim("Terrain MAD falls from RGT's 22.191° to 3.019°", RESULTS, MAD_TERRAIN, ("rgt", BASE), -86),
+    Claim("Road L2 is only 16% above RGT's", RESULTS, ROAD, ("rgt", BASE), 16),
+    Claim("Road MAD is 93% below RGT's", RESULTS, MAD_ROAD, ("rgt", BASE), -93),
+    Claim("Triangles are 73% fewer than RGT's", RESULTS, T, ("rgt", BASE), -73),
+    Claim("Road L2 is 76% below a plane's", CONCLUSION, ROAD, ("plane", BASE), -76),
+    Claim(
+        "DSC3D: FlexRoad is the most accurate on roads", RESULTS, ROAD, (BASE, "rgt", "plane"), dataset=DSC3D
+    ),
+    Claim(
+        "DSC3D: FlexRoad is the most accurate on terrain",
+        RESULTS,
+        TERRAIN,
+        (BASE, "plane", "rgt"),
+        dataset=DSC3D,
+    ),
+    Claim("DSC3D: roads are 94% smoother than RGT's", RESULTS, MAD_ROAD, ("rgt", BASE), -94, dataset=DSC3D),
+    Claim(
+        "DSC3D: triangles are 11% fewer than RGT's (40K, 45K)", RESULTS, T, ("rgt", BASE), -11, dataset=DSC3D
+    ),
+    Claim("w/o ECSRC, road L2 rises by 111%", ABLATION, ROAD, (BASE, "wo_ecsrc"), 111),
+    Claim("w/o ECSRC, road MAD rises by 135%", ABLATION, MAD_ROAD, (BASE, "wo_ecsrc"), 135),
+    Claim("w/o DTM support, terrain L2 rises by 786%", ABLATION, TERRAIN, (BASE, "wo_dtm"), 786),
+    Claim("w/o NURBS, road MAD rises by 1507%", ABLATION, MAD_ROAD, (BASE, "wo_nurbs"), 1507),
+    Claim("w/o NURBS, triangles rise by 271%", ABLATION, T, (BASE, "wo_nurbs"), 271),
+    Claim("Dynamic sampling removes 73% of the triangles", ABLATION, T, ("wo_dynamic", BASE), -73),
+    Claim(
+        "Dynamic sampling keeps the road's accuracy (within 5%)",
+        ABLATION,
+        ROAD,
+        (BASE, "wo_dynamic"),
+        slack=0.05,
+    ),
+    Claim(
+        "Dynamic sampling keeps the terrain's accuracy (within 5%)",
+        ABLATION,
+        TERRAIN,
+        (BASE, "wo_dynamic"),
+        slack=0.05,
+    ),
+    Claim("θz = 0.1 m lowers road L2 by 4%", ABLATION, ROAD, (BASE, "theta_z_0_1"), -4),
+    Claim("θz = 0.1 m lowers road MAD by 19%", ABLATION, MAD_ROAD, (BASE, "theta_z_0_1"), -19),
+    Claim("Degree 2 lowers road L2 by 18%", ABLATION, ROAD, (BASE, "degree_2"), -18),
+    Claim("Degree 2 is rougher on roads than 3", ABLATION, MAD_ROAD, (BASE, "degree_2")),
+    Claim(
+        "Higher degrees are less accurate on roads than 3", ABLATION, ROAD, (BASE, "degree_5", "degree_10")
+    ),
+    Claim("Higher degrees are smoother on roads than 3", ABLATION, MAD_ROAD, ("degree_10", "degree_5", BASE)),
+    Claim("55 × 55 points lower road L2 by 19%", ABLATION, ROAD, (BASE, "grid_55"), -19),
+    Claim("55 × 55 points raise road MAD by 55%", ABLATION, MAD_ROAD, (BASE, "grid_55"), 55),
+    Claim(
+        "More control points are more accurate on roads",
+        ABLATION,
+        ROAD,
+        ("grid_55", "grid_45", BASE, "grid_25", "grid_15"),
+    ),
+    Claim(
+        "More control points are rougher on roads: the trade-off",
+        ABLATION,
+        MAD_ROAD,
+        ("grid_15", "grid_25", BASE, "grid_45", "grid_55"),
+    ),
+    Claim("Sampling at 0.5 m / 5 m lowers road MAD by 49%", ABLATION, MAD_ROAD, (BASE, "sampling_0_5"), -49),
+    Claim(
+        "Sampling at 0.5 m / 5 m doubles the triangles (four times in Table II)",
+        ABLATION,
+        T,
+        (BASE, "sampling_0_5"),
+        100,
+    ),
+    Claim("Sampling at 2 m / 20 m removes 75% of the triangles", ABLATION, T, (BASE, "sampling_2"), -75),
+    Claim("Sampling at 2 m / 20 m doubles the road's MAD", ABLATION, MAD_ROAD, (BASE, "sampling_2"), 100),
+    Claim("ECSRC contributes: road L2", CONCLUSION, ROAD, (BASE, "wo_ecsrc")),
+    Claim("DTM support contributes: terrain L2", CONCLUSION, TERRAIN, (BASE, "wo_dtm")),
+    Claim("NURBS contributes: road MAD", CONCLUSION, MAD_ROAD, (BASE, "wo_nurbs")),
+)

@@ -1,20 +1,51 @@
-"""Tables of the comparison with the paper, with cells formatted as text."""
+"""The tables of the comparison with the paper, with cells formatted as text."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
+from flexroad.catalog.text import count
 from flexroad.pipeline.report.content import FIGURES
-from flexroad.pipeline.reproduce.bootstrap import Means
-from flexroad.pipeline.reproduce.claims import Verdict
-from flexroad.pipeline.reproduce.published import Row
+from flexroad.pipeline.reproduce.bootstrap import LEVEL, Means, bootstrap
+from flexroad.pipeline.reproduce.claims import (
+    HELD,
+    NOT_DECIDED,
+    NOT_HELD,
+    NOT_TESTED,
+    STRONGER,
+    WEAKER,
+    Verdict,
+    decided,
+    percent,
+    strength,
+)
+from flexroad.pipeline.reproduce.metrics_data import MetricsData
+from flexroad.pipeline.reproduce.published import BASE, Row
 
 GROUPS = (("l2_road_m", "l2_terrain_m"), ("mad_road_deg", "mad_terrain_deg"), ("triangles",))
 """Figures that share a table; all five in one table would be wider than a page."""
+FIGURES_SCORED = ("l2_road_m", "l2_terrain_m", "mad_road_deg", "mad_terrain_deg")
+"""Without T, which depends on the mask and the sampling alone."""
+LEAST = 0.05
+"""Changes of the paper up to this size are not scored: their sign is no statement."""
+KINDS = {HELD: "within", WEAKER: "weaker", STRONGER: "stronger", NOT_HELD: "opposite or flat"}
+REASONS = {
+    ("wo_dynamic", "l2_road_m"): "The same surface, sampled at the same points on roads.",
+    ("wo_dynamic", "l2_terrain_m"): "The same surface, sampled at 1 m instead of 10 m: it is followed more "
+    "closely. That it becomes less accurate does not follow from the paper's text.",
+    ("wo_nurbs", "mad_terrain_deg"): "The DTM at 1 m against triangles of 10 m: the DTM of the benchmark is "
+    "smooth, so the triangles meet at larger angles.",
+    ("wo_dtm", "mad_terrain_deg"): "Without the DTM the regulariser alone shapes the terrain: it is flatter. "
+    "The paper does not say what shapes it there.",
+}
+"""Why a change of the benchmark has another sign than the paper's, by variant and figure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,3 +152,162 @@ def _with_interval(means: Means, variant: str, figure: str) -> str:
         format_figure(value, figure) for value in (means.mean[variant, figure], low, high)
     )
     return f"{mean} [{low_text}, {high_text}]"
+
+
+class _Change(NamedTuple):
+    """One cell of Table II as a change from the full pipeline, and ours."""
+
+    row: Row
+    figure: str
+    paper: float
+    """The paper's ratio to the full pipeline."""
+    ours: float
+    verdict: str
+    """`HELD`, `WEAKER`, `STRONGER` or `NOT_HELD`, by the rule for claims."""
+    certain: bool
+    """Whether enough resamples of the tiles give this verdict."""
+
+
+def changes(rows: tuple[Row, ...], means: Means) -> list[_Change]:
+    """Return the changes of Table II that exceed `LEAST` in the paper."""
+    base = next(row for row in rows if row.variant == BASE)
+    scored = []
+    for row in rows:
+        for figure in FIGURES_SCORED:
+            paper = row.value(figure) / base.value(figure)
+            if row is base or abs(paper - 1) <= LEAST:
+                continue
+            ours, resampled = means.ratio(row.variant, BASE, figure)
+            verdict = strength(ours, paper)
+            if verdict != NOT_TESTED:
+                certain = decided(verdict, paper, resampled)
+                scored.append(_Change(row, figure, paper, ours, verdict, certain))
+    return scored
+
+
+def score_sections(rows: tuple[Row, ...], means: Means) -> tuple[Section, ...]:
+    """Return the counts of the changes by figure, and the list of those that are opposite or flat."""
+    scored = changes(rows, means)
+    if not scored:
+        return ()
+    counts = pd.DataFrame([_counts(f"{label_without_unit(f)}", [c for c in scored if c.figure == f])
+                           for f in FIGURES_SCORED] + [_counts("all", scored)])  # fmt: skip
+    verdicts = Counter(change.verdict for change in scored)
+    kinds = ", ".join(f"{verdicts[kind]} {name}" for kind, name in KINDS.items())
+    line = (
+        f"{len(scored)} changes of L2 and MAD by more than {LEAST:.0%} in the paper: {kinds}. Within: the "
+        "logarithm of our ratio is between half and twice that of the paper's; weaker: below; stronger: "
+        "above; opposite or flat: no change or one of the other sign. Not decided: of these, the changes for "
+        f"which fewer than {LEVEL}% of the resamples give the same answer."
+    )
+    sections = [Section("Table II: how close the changes are", counts, line)]
+    opposite = [change for change in scored if change.verdict == NOT_HELD]
+    if opposite:
+        table = pd.DataFrame([_opposite(change) for change in opposite])
+        sections.append(Section("Table II: changes that are opposite or flat", table))
+    return tuple(sections)
+
+
+def _counts(name: str, scored: list[_Change]) -> dict[str, str]:
+    verdicts = Counter(change.verdict for change in scored)
+    undecided = sum(not change.certain for change in scored)
+    cells = {"figure": name, "changes": len(scored)}
+    cells |= {column: verdicts[kind] for kind, column in KINDS.items()} | {NOT_DECIDED: undecided}
+    return {column: str(value) for column, value in cells.items()}
+
+
+def _opposite(change: _Change) -> dict[str, str]:
+    return {
+        "variant": change.row.label,
+        "figure": label_without_unit(change.figure),
+        "paper": percent(change.paper),
+        "ours": percent(change.ours),
+        "reason": REASONS.get((change.row.variant, change.figure), "–"),
+    }
+
+
+def literal_column(data: MetricsData) -> dict[str, Means]:
+    """Return the means of the literal run by the name of its column; empty without such a run."""
+    return {_name(data): _means(data.literal)} if data.literal else {}
+
+
+def literal_notes(data: MetricsData) -> Iterator[str]:
+    """Yield the note that explains the second column, if there is one."""
+    if data.literal:
+        yield (
+            f"The column “{_name(data)}” has the paper read literally: the points S(u, v) lie in space where "
+            "the weights move them, weights are positive without bounds, and the last step of the fit is its "
+            f"result (configs/literal.yaml). {data.literal.line} It was not tuned."
+        )
+
+
+def literal_numbers(tables: Mapping[str, tuple[Row, ...]], data: MetricsData) -> list[pd.DataFrame]:
+    """Return every number of the second column, a table each; see `sections.numbers`."""
+    if not data.literal:
+        return []
+    means, run = _means(data.literal), data.literal
+    named = {
+        name: tuple(row for row in rows if row.variant in means.variants) for name, rows in tables.items()
+    }
+    return [
+        numbers(name, rows, run.classes[0], means, f"{run.dataset}; read literally")
+        for name, rows in named.items()
+    ]
+
+
+def literal_sections(rows: tuple[Row, ...], data: MetricsData) -> Iterator[Section]:
+    """Yield the factors between the paper's figures and those of both columns, on the tiles of both."""
+    if not data.literal or not rows:
+        return
+    literal = _means(data.literal)
+    tiles = data.literal.tiles.index[data.literal.tiles.complete]
+    part = replace(data, rows=data.rows[data.rows.tile_id.isin(tiles)])
+    columns = {"ours": _means(part), "literal": literal}
+    rows = tuple(row for row in rows if row.variant in literal.variants)
+    table = pd.DataFrame({"variant": [*(row.label for row in rows), "all"]})
+    for kind in ("figures", "changes"):
+        for name, means in columns.items():
+            distances = distances_of(rows, means, relative=kind == "changes")
+            table[f"{kind}, {name}"] = [_factor(row) for row in (*distances, distances.ravel())]
+    yield Section(
+        "Table II: factors from the paper",
+        table,
+        f"Typical factor between the paper and us over L2 and MAD of road and terrain, on "
+        f"{count(len(tiles), 'tile')}: the exponential of the mean absolute logarithm of the ratio, 1 if "
+        "equal. Figures: of the row itself. Changes: of the row relative to the full pipeline.",
+    )
+
+
+def distances_of(rows: tuple[Row, ...], means: Means, relative: bool) -> np.ndarray:
+    """Return the absolute logarithms of the ratios of our figures to the paper's, ``(rows, 4)``.
+
+    Parameters
+    ----------
+    rows : tuple of Row
+        Rows of Table II with the full pipeline.
+    means : Means
+        Our means.
+    relative : bool
+        Whether to compare the ratios to the full pipeline in place of the figures.
+    """
+    paper = np.array([[row.value(figure) for figure in FIGURES_SCORED] for row in rows])
+    ours = np.array([[means.mean[row.variant, figure] for figure in FIGURES_SCORED] for row in rows])
+    logs = np.log(ours / paper)
+    base = next(number for number, row in enumerate(rows) if row.variant == BASE)
+    return np.asarray(np.abs(logs - logs[base] if relative else logs))
+
+
+def _factor(distances: np.ndarray) -> str:
+    factor = math.exp(float(np.mean(distances)))
+    return f"{factor:.2f}" if factor < 100 else f"{factor:.0f}"
+
+
+def _means(data: MetricsData) -> Means:
+    return bootstrap(data.part(data.classes[0]))
+
+
+def _name(data: MetricsData) -> str:
+    if not data.literal:
+        raise ValueError("no literal run")
+    tiles, all_tiles = (int(part.tiles.complete.sum()) for part in (data.literal, data))
+    return "literal" if tiles == all_tiles else f"literal ({tiles} tiles)"

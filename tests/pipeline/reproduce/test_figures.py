@@ -15,18 +15,8 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.reproduce import figures
-from flexroad.pipeline.reproduce.figures import (
-    dataset,
-    maps,
-    profile,
-    renders,
-    roles,
-    tile_view,
-    trade_off,
-    trajectory,
-)
-from flexroad.pipeline.reproduce.figures.layout import DPI, SMALL_PX
+from flexroad.pipeline.reproduce import figures, tile_figures, tile_view, trajectory
+from flexroad.pipeline.reproduce.layout import DPI, SMALL_PX
 from flexroad.pipeline.reproduce.metrics_data import collect
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -51,7 +41,7 @@ ABLATION = {
         "two_things": {"fit": {"degree": 2, "control_points": [8, 8]}},
     },
 }
-ROLES = roles.Roles("flexroad", "flat", "cells", "mixed", "bare")
+ROLES = tile_view.Roles("flexroad", "flat", "cells", "mixed", "bare")
 
 
 def finished_run(folder, raw, survey) -> Run:
@@ -83,20 +73,20 @@ def row_of(rows, tile, variant):
 
 
 def test_roles_of_renamed_variants_follow_from_options(run):
-    assert roles.roles_of(run.config) == ROLES
+    assert tile_view.roles_of(run.config) == ROLES
 
 
 def test_roles_of_shipped_configurations_are_complete():
-    assert roles.roles_of(load_config("paper")) == roles.Roles("flexroad", "plane", "rgt")
-    ablation = roles.roles_of(load_config("ablation"))
-    assert ablation == roles.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
+    assert tile_view.roles_of(load_config("paper")) == tile_view.Roles("flexroad", "plane", "rgt")
+    ablation = tile_view.roles_of(load_config("ablation"))
+    assert ablation == tile_view.Roles("flexroad", "plane", "rgt", "wo_nurbs", "wo_ecsrc")
 
 
 def test_changes_lists_options_or_method(run):
     chains = run.config.chains
-    assert roles.changes(chains["flexroad"], chains["flexroad"]) == set()
-    assert roles.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
-    assert roles.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
+    assert tile_view.changes(chains["flexroad"], chains["flexroad"]) == set()
+    assert tile_view.changes(chains["sparse"], chains["flexroad"]) == {"sample.road_m", "sample.terrain_m"}
+    assert tile_view.changes(chains["mixed"], chains["flexroad"]) == {"fit.method", "sample.method"}
 
 
 def test_typical_tile_is_median_of_tiles_with_road():
@@ -113,7 +103,7 @@ def test_typical_tile_is_median_of_tiles_with_road():
 
 def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
     columns = {"Plane": "flat", "RGT": "cells", "FlexRoad": "flexroad"}
-    figure = maps.draw(tile, columns)
+    figure = tile_figures.draw_maps(tile, columns)
     axes = np.array(figure.axes[:6]).reshape(2, 3)
     for (upper, lower), (label, variant) in zip(axes.T, columns.items(), strict=True):
         row = row_of(rows, tile, variant)
@@ -138,13 +128,13 @@ def test_maps_show_values_of_metrics_table(run, rows, tile, made_survey):
 def test_along_is_bilinear_and_nan_next_to_nan():
     rows, cols = np.mgrid[:6, :7]
     at = np.array([0.25, 2.5, 4.75]), np.array([5.5, 0.0, 3.2])
-    np.testing.assert_allclose(profile.along(3.0 * rows - 2.0 * cols, *at), 3 * at[0] - 2 * at[1])
+    np.testing.assert_allclose(tile_figures.along(3.0 * rows - 2.0 * cols, *at), 3 * at[0] - 2 * at[1])
     with_hole = np.where((rows == 2) & (cols == 0), np.nan, 1.0)
-    assert np.isnan(profile.along(with_hole, *at)).tolist() == [False, True, False]
+    assert np.isnan(tile_figures.along(with_hole, *at)).tolist() == [False, True, False]
 
 
 def test_profile_shows_rasters_along_path(tile):
-    figure = profile.make_figure(tile, ROLES).figure
+    figure = tile_figures.road_profile(tile, ROLES).figure
     path, *_ = next(axes for axes in figure.axes if axes.images).lines
     east, north = tile.grid.west + path.get_xdata(), tile.grid.south + path.get_ydata()
     row, col = tile.grid.cells(east, north)
@@ -160,7 +150,7 @@ def test_profile_shows_rasters_along_path(tile):
     for line in errors.lines:
         whole = lines[line.get_label()].get_ydata()
         np.testing.assert_allclose(line.get_ydata(), whole - lines["reference surface"].get_ydata())
-    measured = profile.make_figure(replace(tile, against="the DTM"), ROLES).figure
+    measured = tile_figures.road_profile(replace(tile, against="the DTM"), ROLES).figure
     assert "DTM" in [line.get_label() for axes in measured.axes for line in axes.lines]
 
 
@@ -211,14 +201,14 @@ def test_trajectory_on_tiny_road_is_empty_or_short(cells):
 
 
 def test_vertex_colours_match_error_below(tile):
-    colours = renders.vertex_colours(tile, "cells")
+    colours = tile_figures.vertex_colours(tile, "cells")
     mesh = tile.results["cells"].mesh
     row, col = tile.grid.cells(mesh.vertices[:, 0] + mesh.origin[0], mesh.vertices[:, 1] + mesh.origin[1])
     error = tile.error("cells")[row, col]
-    colour = colormaps[renders.ERROR_COLOURS]
+    colour = colormaps[tile_figures.ERROR_COLOURS]
     worst = np.argmax(error)
-    assert tuple(colours[worst]) == colour(renders.ERROR_NORM(error[worst]), bytes=True)[:3]
-    exact = error < renders.ERROR_NORM.vmin
+    assert tuple(colours[worst]) == colour(tile_figures.ERROR_NORM(error[worst]), bytes=True)[:3]
+    exact = error < tile_figures.ERROR_NORM.vmin
     assert exact.any()
     assert (colours[exact] == colour(-1.0, bytes=True)[:3]).all(), "zero error is the lower end"
 
@@ -227,19 +217,19 @@ def test_busiest_is_square_with_most_dropped_cells():
     grid = Grid("EPSG:25832", 1000.0, 2250.0, 1.0, 250, 250)
     dropped = np.zeros(grid.shape, bool)
     dropped[10, 10] = dropped[200, 150:160] = True
-    west, south, east, north = renders.busiest(dropped, grid)
-    assert (east - west, north - south) == (renders.CLOSE_M, renders.CLOSE_M)
+    west, south, east, north = tile_figures.busiest(dropped, grid)
+    assert (east - west, north - south) == (tile_figures.CLOSE_M, tile_figures.CLOSE_M)
     assert west <= 1150 < 1160 <= east
     assert south <= 2049 < 2050 <= north
     small = Grid("EPSG:25832", 1000.0, 2060.0, 1.0, 60, 50)
-    assert renders.busiest(np.zeros(small.shape, bool), small) == (1000.0, 2010.0, 1050.0, 2060.0)
+    assert tile_figures.busiest(np.zeros(small.shape, bool), small) == (1000.0, 2010.0, 1050.0, 2060.0)
 
 
 # --- trade-off --------------------------------------------------------------------------------------------
 
 
 def test_trade_off_shows_means_of_metrics_table(run, rows):
-    figure = trade_off.make_figure(run.config, "flexroad", rows).figure
+    figure = figures.trade_off(run.config, "flexroad", rows).figure
     expected = {
         "Control grid": ["coarse", "flexroad", "fine"],
         "Degree p = q": ["quadratic", "flexroad"],
@@ -249,7 +239,7 @@ def test_trade_off_shows_means_of_metrics_table(run, rows):
     means = rows.groupby("variant")[["mad_road_deg", "l2_road_m"]].mean()
     for axes, variants in zip(figure.axes, expected.values(), strict=True):
         np.testing.assert_array_equal(axes.lines[0].get_xydata(), means.loc[variants].to_numpy())
-        red = [line.get_xydata()[0] for line in axes.lines[1:] if line.get_color() == trade_off.PATH]
+        red = [line.get_xydata()[0] for line in axes.lines[1:] if line.get_color() == figures.PATH]
         np.testing.assert_array_equal(red, [means.loc["flexroad"].to_numpy()])
     assert [text.get_text() for text in figure.axes[0].texts] == ["8×8", "10×10", "14×14"]
     assert [text.get_text() for text in figure.axes[2].texts] == ["1 / 10", "2 / 20"]
@@ -259,7 +249,7 @@ def test_trade_off_shows_means_of_metrics_table(run, rows):
 
 
 def test_statistics_match_rasters_and_metrics_table(run, rows, made_survey):
-    table = dataset.statistics(run, "flexroad", rows).set_index("tile_id")
+    table = figures.statistics(run, "flexroad", rows).set_index("tile_id")
     assert list(table.index) == [tile.id for tile in run.catalog.tiles]
     for tile in run.catalog.tiles:
         path, *_ = tile.paths(tile.layer("dsm"))
@@ -280,7 +270,7 @@ def test_dataset_figure_counts_every_tile():
             "height_range_m": [60.0, 30, 35, 80, np.nan, 20],
         }
     )
-    bars, roads, heights = dataset.draw(table).axes
+    bars, roads, heights = figures.draw_dataset(table).axes
     assert [label.get_text() for label in bars.get_xticklabels()] == ["urban", "rural", "harbour"]
     assert [bar.get_height() for bar in bars.patches] == [3, 2, 1]
     assert sum(bar.get_height() for bar in roads.patches) == 6
@@ -298,7 +288,9 @@ def quick_renders(monkeypatch):
     buffer = io.BytesIO()
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(buffer, format="png")
-    monkeypatch.setattr(renders, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes, buffer.getvalue()))
+    monkeypatch.setattr(
+        tile_figures, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes, buffer.getvalue())
+    )
 
 
 @pytest.mark.usefixtures("quick_renders")
@@ -321,7 +313,7 @@ def test_write_figures_twice_gives_equal_files(run, rows, tmp_path):
 
 
 def test_write_figures_without_opengl_leaves_out_renders(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(renders, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes))
+    monkeypatch.setattr(tile_figures, "render_meshes", lambda meshes, *_: dict.fromkeys(meshes))
     (note,) = figures.write_figures(run, tmp_path)
     assert "ablation_renders" in note
     assert "OpenGL" in note
@@ -355,10 +347,10 @@ def test_write_figures_unknown_tile_or_variant_raises(run, tmp_path):
     with pytest.raises(CatalogError, match="0_0"):
         figures.write_figures(run, tmp_path, "0_0")
     with pytest.raises(ConfigError, match="no variant 'nobody'"):
-        figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad", plane="nobody"))
+        figures.write_figures(run, tmp_path, roles=tile_view.Roles("flexroad", plane="nobody"))
 
 
 def test_write_figures_leaves_run_unchanged(run, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*")}
-    figures.write_figures(run, tmp_path, roles=roles.Roles("flexroad"))
+    figures.write_figures(run, tmp_path, roles=tile_view.Roles("flexroad"))
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*")} == before

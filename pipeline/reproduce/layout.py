@@ -1,4 +1,4 @@
-"""Page size, fonts and colours shared by all figures, and how figures are saved."""
+"""Page size, fonts, colours and scales shared by all figures, and how figures are saved."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
 from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.report.pictures import webp
+from flexroad.tasks.types import Floats
 
 WIDTH_IN = 7.0
 """Width of a figure: the text width of a page (inches)."""
@@ -44,6 +47,12 @@ STYLE: dict[RcKeyType, Any] = {
     # Embeds TrueType fonts: text in the PDF stays text.
     "pdf.fonttype": 42,
 }
+ERROR_COLOURS, ERROR_NORM = "magma_r", LogNorm(0.01, 10)
+"""Scale of errors (m); logarithmic, because errors on one tile range from a centimetre to several metres."""
+ANGLE_COLOURS, ANGLE_NORM = "viridis_r", LogNorm(0.1, 60)
+"""Scale of angles (degrees), logarithmic."""
+LEAST = 1e-9
+"""Replaces zeros, which have no logarithm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +86,8 @@ def save(figure: Figure, folder: Path, name: str) -> None:
         files[kind] = buffer.getvalue()
         write(folder / f"{name}.{kind}", files[kind])
     write(folder / f"{name}.webp", webp(files["png"], SMALL_PX))
+
+
+def drawable(values: Floats) -> np.ma.MaskedArray[tuple[int, ...], np.dtype[np.float64]]:
+    """Return values with NaN masked and values below `LEAST` raised to `LEAST`."""
+    return np.ma.masked_invalid(np.maximum(values, LEAST))
