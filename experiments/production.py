@@ -65,9 +65,9 @@ def run_stages(tile: Tile, name: str, halo: bool = True) -> Result:
     if not halo:
         chain["load"] = chain["load"].model_copy(update={"halo_m": 0.0})
     results: dict[str, object] = {}
-    for stage in STAGES[: STAGE_NAMES.index("evaluate") + 1]:
-        inputs = [results[i] for i in stage.inputs] or [tile]
-        results[stage.name] = stage_function(stage.name, chain[stage.name])(*inputs, chain[stage.name])
+    for stage in STAGE_NAMES[: STAGE_NAMES.index("evaluate") + 1]:
+        inputs = [results[name] for name in STAGES[stage]] or [tile]
+        results[stage] = stage_function(stage, chain[stage])(*inputs, chain[stage])
     data, core = results["load"], tile.grid
     surface, metrics = results["fit"], results["evaluate"]
     figures = {

@@ -10,7 +10,7 @@ from flexroad.catalog import Tile
 from flexroad.catalog.text import count
 from flexroad.pipeline.check.catalog import expected_failures
 from flexroad.pipeline.check.reasons import Kind, reason
-from flexroad.pipeline.execute.adaptive import Estimate, decision, workers_of
+from flexroad.pipeline.execute.adaptive import decision, workers_of
 from flexroad.pipeline.graph.borders import STAGE as BORDER
 from flexroad.pipeline.graph.graph import Node, TileGraph, layers_read
 from flexroad.pipeline.graph.stages import STAGE_NAMES
@@ -65,8 +65,8 @@ def plan(run: Run, tiles: Iterable[Tile], verbose: bool = False, workers: int | 
     numbers = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
     yield f"{count(reasons.total(), 'tile')}: {numbers}"
     if todo and not run.config.cluster.needs_workers:
-        tile_time = Estimate(statistics.median(times) if times else None)
-        yield f"  {decision(len(todo), tile_time, workers_of(workers or run.config.cluster.workers))}"
+        tile_s = statistics.median(times) if times else None
+        yield f"  {decision(len(todo), workers_of(workers or run.config.cluster.workers), tile_s)}"
     for stage in (*STAGE_NAMES, BORDER):
         counts = ", ".join(f"{n} {state}" for (name, state), n in sorted(totals.items()) if name == stage)
         if counts:

@@ -102,9 +102,9 @@ def run(
 
         chosen = load_config(config, settings or ())
         selection = Selection(tile or (), bbox, options.read_area(area, area_layer))
-        selected = selection.of(path, source, allow or (), chosen)
-        planned = Run.planned(path, chosen, selected.run, root, checksum)
-        for line in plan(planned, selected.tiles.tiles, verbose, workers):
+        tiles, selected = selection.of(path, source, allow or (), chosen)
+        planned = Run.planned(path, chosen, tiles, root, checksum)
+        for line in plan(planned, selected.tiles, verbose, workers):
             echo(line)
         return
     with report_outcome(path, on_failure, prometheus) as outcome:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic
 
@@ -49,42 +49,22 @@ class Jobs(Generic[J]):
         return self.source
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """The estimated time of one more job."""
+def estimate(times: Sequence[float], known_s: float | None) -> tuple[float | None, bool]:
+    """Return the CPU time of one more job (s), None if unknown, and whether `ENOUGH` jobs were measured.
 
-    job_s: float | None
-    """CPU time (s), None if unknown."""
-    sure: bool = False
-    """Whether `ENOUGH` jobs were measured."""
-
-
-class Pace:
-    """CPU times of the jobs done in this process.
-
-    The first job also loads libraries, so it is not counted. A later one may load what the first did not
-    need, so the longest is not counted either: one job alone never decides.
+    Parameters
+    ----------
+    times : sequence of float
+        CPU times (s) of the jobs done in this process, in their order. The first job also loads libraries, so
+        it is not counted. A later one may load what the first did not need, so the longest is not counted
+        either: one job alone never decides.
+    known_s : float, optional
+        Median time in an earlier run (s), which holds before jobs were measured.
     """
-
-    def __init__(self, job_s: float | None) -> None:
-        self.known_s = job_s
-        """Median time in an earlier run (s), None if there was none."""
-        self.times: list[float] = []
-        """CPU times (s), in the order of the jobs."""
-
-    def run(self, function: Callable[[J], R], job: J) -> R:
-        """Do a job and measure it."""
-        start = time.process_time()
-        result = function(job)
-        self.times.append(time.process_time() - start)
-        return result
-
-    def estimate(self) -> Estimate:
-        """Return the mean time of the jobs that count, or the known time before there are any."""
-        measured = sorted(self.times[1:])
-        if len(measured) < 2:
-            return Estimate(self.known_s)
-        return Estimate(sum(measured[:-1]) / (len(measured) - 1), len(measured) >= ENOUGH)
+    measured = sorted(times[1:])
+    if len(measured) < 2:
+        return known_s, False
+    return sum(measured[:-1]) / (len(measured) - 1), len(measured) >= ENOUGH
 
 
 def workers_of(asked: int | None) -> int:
@@ -93,23 +73,19 @@ def workers_of(asked: int | None) -> int:
     return min(asked or cores, cores)
 
 
-def workers_pay(number: int, estimate: Estimate, workers: int) -> bool:
-    """Return whether ``workers`` processes are worth their start for ``number`` jobs."""
-    if number > MANY:
-        return True
-    if estimate.job_s is None:
-        return False
-    saved_s = number * estimate.job_s * (1 - 1 / workers)
-    return saved_s > (MARGIN if estimate.sure else UNSURE_MARGIN) * START_S
+def workers_pay(number: int, workers: int, job_s: float | None, sure: bool = False) -> bool:
+    """Return whether worker processes are worth their start for jobs of a time (s) from `estimate`."""
+    if number > MANY or job_s is None:
+        return number > MANY
+    return number * job_s * (1 - 1 / workers) > (MARGIN if sure else UNSURE_MARGIN) * START_S
 
 
-def decision(number: int, estimate: Estimate, workers: int) -> str:
+def decision(number: int, workers: int, job_s: float | None, sure: bool = False) -> str:
     """Return one line on where ``number`` jobs run, and why."""
-    job_s = estimate.job_s
     what = count(number, "tile") + (f" of about {job_s:.2g} s" if job_s is not None else "")
     if number > MANY:
         return f"worker processes: {what}"
-    if workers_pay(number, estimate, workers):
+    if workers_pay(number, workers, job_s, sure):
         return (
             f"worker processes: {what}; {workers} of them save more than their start of about {START_S:g} s"
         )
@@ -149,18 +125,21 @@ class AdaptiveExecutor:
             return
         if not jobs.number:
             return
-        rest, left, pace = iter(jobs), jobs.number, Pace(jobs.job_s)
-        self._tell(jobs, left, pace)
-        while not workers_pay(left, pace.estimate(), self.workers):
+        rest, left, times = iter(jobs), jobs.number, list[float]()
+        self._tell(jobs, left, times)
+        while not workers_pay(left, self.workers, *estimate(times, jobs.job_s)):
             if left == 0:
                 return
             left -= 1
-            yield pace.run(function, next(rest))
+            start = time.process_time()
+            result = function(next(rest))
+            times.append(time.process_time() - start)
+            yield result
         if left < jobs.number:
-            self._tell(jobs, left, pace)
+            self._tell(jobs, left, times)
         yield from self.parallel.map(function, rest, lost, probe)
 
-    def _tell(self, jobs: Jobs[J], left: int, pace: Pace) -> None:
-        line = decision(left, pace.estimate(), self.workers)
+    def _tell(self, jobs: Jobs[J], left: int, times: Sequence[float]) -> None:
+        line = decision(left, self.workers, *estimate(times, jobs.job_s))
         jobs.log(line)
         self.say(line)

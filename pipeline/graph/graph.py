@@ -39,7 +39,6 @@ from flexroad.pipeline.graph.sources import (
 from flexroad.pipeline.graph.stages import (
     STAGE_NAMES,
     STAGES,
-    Stage,
     model_files,
     stage_function,
     stage_head,
@@ -169,11 +168,11 @@ class Pattern:
         variants: dict[str, dict[str, int]] = {}
         for variant, chain in config.chains.items():
             by_stage: dict[str, int] = {}
-            for stage in STAGES:
-                inputs = tuple(by_stage[name] for name in stage.inputs)
+            for stage, before in STAGES.items():
+                inputs = tuple(by_stage[name] for name in before)
                 step = _step(stage, chain, inputs, variant in config.export.variants)
                 key = step.head, inputs
-                by_stage[stage.name] = numbers.setdefault(key, len(numbers))
+                by_stage[stage] = numbers.setdefault(key, len(numbers))
                 if key not in steps or step.stored:
                     steps[key] = step
             variants[variant] = by_stage
@@ -268,20 +267,18 @@ def _product_sources(tile: Tile, export: Export) -> tuple[Layer, ...]:
     return tuple(layer for layer in reaching if layer)
 
 
-def _step(stage: Stage, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
-    options = chain[stage.name]
+def _step(stage: str, chain: Chain, inputs: tuple[int, ...], keep_mesh: bool) -> Step:
+    options = chain[stage]
     module = stage_module(options)
-    stored = {"load": False, "sample": keep_mesh}.get(stage.name, getattr(module, "STORED", True))
+    stored = {"load": False, "sample": keep_mesh}.get(stage, getattr(module, "STORED", True))
     reads = getattr(module, "READS", ())
-    head = to_json(stage_head(stage.name, options))[1:-1]
+    head = to_json(stage_head(stage, options))[1:-1]
     shared = has_borders(chain["fit"])
-    borders = BorderPattern.of(chain) if shared and stage.name == "fit" else None
+    borders = BorderPattern.of(chain) if shared and stage == "fit" else None
     # A second fit and the mesh of a tile take the frame of its surface.
     refit = chain["fit"] if getattr(options, "holdout", 0) else None
-    framed = inputs[stage.inputs.index("fit")] if shared and (refit or stage.name == "sample") else None
-    return Step(
-        stage.name, options, head, inputs, reads, model_files(options), stored, borders, framed, refit
-    )
+    framed = inputs[STAGES[stage].index("fit")] if shared and (refit or stage == "sample") else None
+    return Step(stage, options, head, inputs, reads, model_files(options), stored, borders, framed, refit)
 
 
 def _border_nodes(tile: Tile, step: Step, sources: SourceFiles, grid: str) -> list[Node]:

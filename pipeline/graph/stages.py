@@ -17,35 +17,23 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from flexroad.tasks.options import Options
 
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of the paper."""
-
-    name: str
-    inputs: tuple[str, ...]
-    """Stages whose results are the arguments of its function, in that order."""
-
-
-STAGES = (
-    Stage("load", ()),
-    Stage("segment", ("load",)),
-    Stage("ecsrc", ("load", "segment")),
-    Stage("fit", ("load", "ecsrc")),
-    Stage("sample", ("fit", "segment", "ecsrc")),
-    Stage("evaluate", ("sample", "load", "segment")),
-    Stage("assess", ("load", "segment", "ecsrc", "fit")),
-)
-
-
-STAGE_NAMES = tuple(stage.name for stage in STAGES)
+STAGES: dict[str, tuple[str, ...]] = {
+    "load": (),
+    "segment": ("load",),
+    "ecsrc": ("load", "segment"),
+    "fit": ("load", "ecsrc"),
+    "sample": ("fit", "segment", "ecsrc"),
+    "evaluate": ("sample", "load", "segment"),
+    "assess": ("load", "segment", "ecsrc", "fit"),
+}
+"""The stages of the paper, in its order, and the stages whose results their functions take, in that order."""
+STAGE_NAMES = tuple(STAGES)
 
 
 def stage_module(options: Options) -> ModuleType:

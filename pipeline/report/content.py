@@ -17,7 +17,7 @@ from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
-from flexroad.pipeline.store.database import TileState
+from flexroad.pipeline.store.records import TileState
 from flexroad.pipeline.store.tables import METRICS, metrics_frame, read_metrics
 
 FIGURES = {

@@ -9,7 +9,6 @@ import shlex
 import signal
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,22 +21,16 @@ urllib3 = lazy("urllib3")
 
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the request is repeated."""
+COMMAND_S = 120.0
+"""Time limit of a command (s)."""
+ANSWER_S = 10.0
+"""Time limit of an answer of a web server (s)."""
+RETRIES = 2
+PAUSE_S = 1.0
+"""Pause before the first retry (s); doubled before each further one."""
 
 
-@dataclass(frozen=True)
-class RetryPolicy:
-    """Time limits and retries of a notification."""
-
-    command_s: float = 120
-    """Time limit of a command (s)."""
-    answer_s: float = 10
-    """Time limit of an answer of a web server (s)."""
-    retries: int = 2
-    pause_s: float = 1
-    """Pause before the first retry (s); doubled before each further one."""
-
-
-def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None = None) -> str | None:
+def notify(target: str, summary: Mapping[str, Any]) -> str | None:
     """Send a summary to the target.
 
     Parameters
@@ -48,8 +41,6 @@ def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None =
         the variable FLEXROAD_SUMMARY. The file is removed when the command ends.
     summary : mapping
         The content, serialisable as JSON.
-    policy : RetryPolicy, optional
-        Time limits and retries.
 
     Returns
     -------
@@ -57,21 +48,20 @@ def notify(target: str, summary: Mapping[str, Any], policy: RetryPolicy | None =
         The reason of a failure; None on success. Nothing is raised: a run does not depend on its alert.
     """
     text = json.dumps(summary, indent=1)
-    policy = policy or RetryPolicy()
     if re.match(r"https?://", target, re.IGNORECASE):
-        return _post(target, text, policy)
-    return _run_command(target, text, policy)
+        return _post(target, text)
+    return _run_command(target, text)
 
 
-def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
+def _post(url: str, text: str) -> str | None:
     try:
         # The rest of the address is often a secret: messages name only the host.
         scheme, host = urlsplit(url).scheme, urlsplit(url).hostname
     except ValueError:
         return "the web address cannot be read"
     retry = urllib3.Retry(
-        policy.retries,
-        backoff_factor=policy.pause_s / 2,
+        RETRIES,
+        backoff_factor=PAUSE_S / 2,
         status_forcelist=BUSY,
         allowed_methods=None,
         # The header may request a pause of an hour.
@@ -85,7 +75,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
                 url,
                 text.encode(),
                 headers={"Content-Type": "application/json"},
-                timeout=policy.answer_s,
+                timeout=ANSWER_S,
                 allow_redirects=False,
             )
         except (requests.RequestException, ValueError) as error:
@@ -93,7 +83,7 @@ def _post(url: str, text: str, policy: RetryPolicy) -> str | None:
     return None if answer.status_code // 100 == 2 else f"{host} answered {answer.status_code}"
 
 
-def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
+def _run_command(command: str, text: str) -> str | None:
     try:
         with ScratchFolder() as folder:
             path = Path(folder) / "summary.json"
@@ -107,7 +97,7 @@ def _run_command(command: str, text: str, policy: RetryPolicy) -> str | None:
                 env={**os.environ, "FLEXROAD_SUMMARY": str(path)},
                 start_new_session=True,
             )
-            return _wait(process, text, policy, _program(command))
+            return _wait(process, text, _program(command))
     except (OSError, ValueError) as error:
         # The message of an error may have the complete command.
         reason = (isinstance(error, OSError) and error.strerror) or type(error).__name__
@@ -124,12 +114,12 @@ def _program(command: str) -> str:
     return f"`{program} ...`" if re.fullmatch(r"[\w./+-]{1,100}", program) else "the command"
 
 
-def _wait(process: subprocess.Popen[bytes], text: str, policy: RetryPolicy, name: str) -> str | None:
+def _wait(process: subprocess.Popen[bytes], text: str, name: str) -> str | None:
     try:
-        process.communicate(text.encode(), policy.command_s)
+        process.communicate(text.encode(), COMMAND_S)
     except subprocess.TimeoutExpired:
         # The complete process group: the command may have started others.
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        return f"{name} took more than {policy.command_s:g} s and was killed"
+        return f"{name} took more than {COMMAND_S:g} s and was killed"
     return f"{name} ended with exit code {process.returncode}" if process.returncode else None

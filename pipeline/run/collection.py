@@ -29,8 +29,7 @@ from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import open_database, recorded
-from flexroad.pipeline.store.database import TileState
-from flexroad.pipeline.store.records import DONE, TileRecord
+from flexroad.pipeline.store.records import DONE, TileRecord, TileState
 from flexroad.pipeline.worker.exports import (
     COLLECTION,
     EXTENSIONS,

@@ -68,8 +68,17 @@ class Selection:
     bbox: Bounds | None = None
     area: Area | None = None
 
-    def of(self, path: Location, catalog: Location, allow: Sequence[Any], config: Config) -> Selected:
+    def of(
+        self, path: Location, catalog: Location, allow: Sequence[Any], config: Config
+    ) -> tuple[Catalog, Catalog]:
         """Read a catalog and select tiles for the run at ``path``.
+
+        Returns
+        -------
+        run : Catalog
+            The tiles of the run, also those of earlier partial runs.
+        selected : Catalog
+            The tiles to bring up to date.
 
         Raises
         ------
@@ -84,20 +93,10 @@ class Selection:
         if not selected.tiles:
             raise ConfigError(f"catalog {catalog} has no tiles")
         some = self.tiles or self.bbox is not None or self.area
-        return Selected(_merged_catalog(path, whole, selected) if some else whole, selected)
+        return _merged_catalog(path, whole, selected) if some else whole, selected
 
 
 ALL = Selection()
-
-
-@dataclass(frozen=True)
-class Selected:
-    """Tiles of a catalog."""
-
-    run: Catalog
-    """The tiles of the run, also those of earlier partial runs."""
-    tiles: Catalog
-    """The tiles to bring up to date."""
 
 
 @dataclass(frozen=True)
@@ -153,11 +152,11 @@ def created(
     """
     observer = observer or Observer()
     with observer.working(f"reading {catalog}"):
-        selected = selection.of(path, catalog, allow, config)
+        tiles, selected = selection.of(path, catalog, allow, config)
     with _locked(path, observer, create=True) as died:
         with observer.working(f"preparing {path}"):
-            run = Run.create(path, config, selected.run, store, checksum)
-        only = rerun_filter(run, [tile.id for tile in selected.tiles.tiles], failed=False)
+            run = Run.create(path, config, tiles, store, checksum)
+        only = rerun_filter(run, [tile.id for tile in selected.tiles], failed=False)
         yield Prepared(run, only, _executor(run, workers, died, observer), observer)
 
 

@@ -39,8 +39,8 @@ from flexroad.pipeline.run.status import (
     tile_statuses,
 )
 from flexroad.pipeline.run.summary import Summary, read_summary, summarise, write_summary
-from flexroad.pipeline.store.database import RunDatabase, TileState
-from flexroad.pipeline.store.records import DONE, Failure, TileRecord, utc_now
+from flexroad.pipeline.store.database import RunDatabase
+from flexroad.pipeline.store.records import DONE, Failure, TileRecord, TileState, utc_now
 from flexroad.pipeline.store.tables import METRICS, PREVIOUS, write_tables
 from flexroad.pipeline.worker.shared_files import SharedFiles
 from flexroad.pipeline.worker.tile import (

@@ -25,7 +25,7 @@ from flexroad.pipeline.run.lock import Owner, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.summary import MAX_FAILURES, Summary, read_summary, summarise
 from flexroad.pipeline.store import checked_json
-from flexroad.pipeline.store.database import NAME, RunDatabase, TileState
+from flexroad.pipeline.store.database import NAME, RunDatabase
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import (
     DONE,
@@ -33,6 +33,7 @@ from flexroad.pipeline.store.records import (
     Failure,
     MarkerStat,
     TileRecord,
+    TileState,
     from_failed,
     from_item,
 )
@@ -127,16 +128,16 @@ def _status(
     run: Run, tile: Tile, entry: TileRecord | None, files: dict[str, FileStat], stat_file: Stat
 ) -> TileStatus:
     """Return the state of one tile that has this entry in the database and whose folder has ``files``."""
-    record = _last_record(run.folder(tile.id), entry, files)
+    record = last_record(run.folder(tile.id), entry, files)
     graph = run.graph(tile, stat_file)
-    current, from_marker = _matches(record, graph, files), record is not entry
+    current, from_marker = matches(record, graph, files), record is not entry
     if record is None or current or not any_file_missing(graph):
         return TileStatus(graph, record, current, current, from_marker)
     graph = run.graph(tile, stat_file, record.sources)
-    return TileStatus(graph, record, _matches(record, graph, files), False, from_marker)
+    return TileStatus(graph, record, matches(record, graph, files), False, from_marker)
 
 
-def _last_record(
+def last_record(
     folder: TileProducts, entry: TileRecord | None, files: dict[str, FileStat]
 ) -> TileRecord | None:
     """Return a tile's last record: the database entry if it is of the current marker, else the marker's."""
@@ -156,7 +157,7 @@ def _from_marker(folder: TileProducts, marker: MarkerStat) -> TileRecord | None:
         return None
 
 
-def _matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileStat]) -> bool:
+def matches(record: TileRecord | None, graph: TileGraph, files: dict[str, FileStat]) -> bool:
     """Return whether a record has the graph's fingerprint and all its products exist in their full size."""
     if record is None or record.fingerprint != graph.fingerprint:
         return False
@@ -198,7 +199,7 @@ def open_database(run: Run, write: bool = False) -> RunDatabase:
 
 def _read_marker(run: Run, tile_id: str) -> TileRecord | None:
     folder = run.folder(tile_id)
-    return _last_record(folder, None, folder.files())
+    return last_record(folder, None, folder.files())
 
 
 def tile_states(

@@ -12,8 +12,7 @@ from typing import Any
 
 from flexroad.catalog.storage.paths import Location, read, write
 from flexroad.pipeline.store import checked_json
-from flexroad.pipeline.store.database import TileState
-from flexroad.pipeline.store.records import Failure
+from flexroad.pipeline.store.records import Failure, TileState
 
 NAME = "summary.json"
 MAX_FAILURES = 1000

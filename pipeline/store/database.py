@@ -27,11 +27,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from operator import xor
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.staging import StagedFile
-from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord
+from flexroad.pipeline.store.records import Failure, MetricsRow, TileRecord, TileState
 from flexroad.pipeline.store.sqlite_file import (
     Damage,
     create,
@@ -43,8 +43,6 @@ from flexroad.pipeline.store.sqlite_file import (
 
 NAME = "database.sqlite"
 VERSION = 3
-TileState = Literal["cached", "done", "failed", "pending"]
-"""cached: already done when the last run started; pending: no result for the current files and options."""
 Recover = Callable[[str], TileRecord | None]
 """Returns the record in a tile's marker, by the tile's id."""
 

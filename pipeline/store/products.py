@@ -12,7 +12,6 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import FileStat, Location
-from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.records import DONE, FAILED
 
@@ -42,22 +41,6 @@ class TileProducts:
         """Return the files of the folder by name; none if it is a link."""
         linked = isinstance(self.path, Path) and self.path.is_symlink()
         return {} if linked else paths.listing(self.path)
-
-    def done(self, graph: TileGraph) -> dict[str, Any] | None:
-        """Return the tile's item, None unless it has the graph's fingerprint and all products exist."""
-        item = self._read(DONE)
-        try:
-            if item is None or item["properties"]["flexroad:fingerprint"] != graph.fingerprint:
-                return None
-            # A marker without rows is damaged.
-            iter(item["properties"]["flexroad:rows"])
-            files = self.files()
-            complete = all(
-                files[asset["href"]].size == asset["file:size"] for asset in item["assets"].values()
-            )
-        except (OSError, KeyError, TypeError, AttributeError):
-            return None
-        return item if complete else None
 
     def nodes(self, variant: str) -> dict[str, str]:
         """Return the fingerprint of each stage of a variant when the tile was last finished."""

@@ -12,13 +12,14 @@ from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]
 """One row of metrics.parquet, by column."""
-State = Literal["done", "failed"]
+TileState = Literal["cached", "done", "failed", "pending"]
+"""cached: already done when the last run started; pending: no result for the current files and options."""
 MarkerStat = tuple[str, int, int | str]
 """Name, size (bytes) and version (time or ETag) of a tile's marker file."""
 
 DONE, FAILED = "item.json", "failed.json"
-MARKERS: dict[State, str] = {"done": DONE, "failed": FAILED}
-"""Name of the marker file of each state."""
+MARKERS: dict[TileState, str] = {"done": DONE, "failed": FAILED}
+"""Name of the marker file of each state that has one."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class TileRecord:
     """The result of a tile's last attempt."""
 
     tile_id: str
-    state: State
+    state: TileState
+    """``done`` or ``failed``."""
     fingerprint: str
     """Fingerprint of the graph that was computed."""
     rows: tuple[MetricsRow, ...]

@@ -57,18 +57,6 @@ class Product:
     """Vertical CRS of heights, None if it is not known."""
 
 
-@dataclass(frozen=True)
-class Reference:
-    """What the products of a tile share, besides its results."""
-
-    origin: tuple[float, float]
-    """Whole-metre (easting, northing) that mesh translations are relative to."""
-    vertical: str | None
-    """Vertical CRS of heights, None if it is not known."""
-    texture: glb.Texture | None
-    """The photo on the mesh, None if it has none."""
-
-
 GLB = Kind("mesh", glb.NAME, glb.MEDIA_TYPE, "Mesh for viewers: small coordinates, Y up")
 PLY = Kind("ply", ply.NAME, ply.MEDIA_TYPE, "Mesh in coordinates of the CRS, with class and support per face")
 HEIGHT = Kind("height", cog.NAME_HEIGHT, cog.MEDIA_TYPE, "Height of the surface", cog.HEIGHT)
@@ -115,35 +103,44 @@ def products(
         The photo on the mesh.
     """
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
-    reference = Reference(origin, vertical, texture)
     files: dict[str, Product] = {}
     for variant in graph.export.variants:
         for name in graph.export.formats:
-            for kind, data in _ENCODERS[name](graph, graph.variants[variant], evaluate, reference).items():
+            nodes = graph.variants[variant]
+            if name == "glb":
+                encoded = _glb(nodes, evaluate, origin, texture)
+            elif name == "ply":
+                encoded = _ply(nodes, evaluate)
+            elif name == "cog":
+                encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
+            else:
+                encoded = _npz(nodes, evaluate)
+            for kind, data in encoded.items():
                 known = vertical if kind is HEIGHT else None
                 files[file_name(graph.tile.id, variant, kind)] = Product(kind, variant, data, known)
     return files
 
 
 def _glb(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+    nodes: dict[str, str],
+    evaluate: Callable[[str], Any],
+    origin: tuple[float, float],
+    texture: glb.Texture | None,
 ) -> dict[Kind, bytes]:
     mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
-    return {GLB: glb.encode(mesh, (*reference.origin, 0.0), reference.texture, surface)}
+    return {GLB: glb.encode(mesh, (*origin, 0.0), texture, surface)}
 
 
-def _ply(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
-) -> dict[Kind, bytes]:
+def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
     mesh = evaluate(nodes["sample"])
     support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
     return {PLY: ply.encode(mesh, support)}
 
 
 def _cog(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
+    core: Grid, nodes: dict[str, str], evaluate: Callable[[str], Any], vertical: str | None
 ) -> dict[Kind, bytes]:
-    core, road, surface = graph.tile.grid, evaluate(nodes["segment"]), evaluate(nodes["fit"])
+    road, surface = evaluate(nodes["segment"]), evaluate(nodes["fit"])
     window = road.grid.window(core)
     heights = surface.lattice(core.eastings, core.northings)
     heights[road.outside[window]] = float("nan")
@@ -152,21 +149,16 @@ def _cog(
     # Without a common one, GDAL's environment is set up and cleared for each call.
     with rasterio.Env():
         return {
-            HEIGHT: cog.encode_height(heights, core, reference.vertical),
+            HEIGHT: cog.encode_height(heights, core, vertical),
             ROAD: cog.encode_mask(kept, core),
             SUPPORT: cog.encode_support(support, core),
         }
 
 
-def _npz(
-    graph: TileGraph, nodes: dict[str, str], evaluate: Callable[[str], Any], reference: Reference
-) -> dict[Kind, bytes]:
+def _npz(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
     surface = evaluate(nodes["fit"])
     # Planes and rasters have no NURBS form, and their npz would only repeat the input.
     return {NPZ: npz.encode(surface)} if isinstance(surface, NurbsSurface) else {}
-
-
-_ENCODERS = {"glb": _glb, "ply": _ply, "cog": _cog, "npz": _npz}
 
 
 def assets(files: Mapping[str, Product], variants: tuple[str, ...], grid: Grid) -> dict[str, Any]:

@@ -17,15 +17,9 @@ MOUNT = "mount it there under the same path"
 """Remedy for a worker that has other files."""
 
 
-@dataclass(frozen=True)
-class Proof:
-    """What a worker has found and written."""
-
-    name: str
-    """Name of the file that it has written into each folder."""
-    different: dict[str, FileStat | None]
-    """Size and version, as the worker has them, of the source files that differ from those in the tile's
-    graph."""
+Proof = tuple[str, dict[str, FileStat | None]]
+"""Name of the file that a worker has written into each folder; size and version, as the worker has them, of
+the source files that differ from those in the tile's graph."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ class SharedFiles:
         try:
             for folder in self.folders:
                 self._meet(folder, own)
-            return Proof(own, _different(job))
+            return own, _different(job)
         except OSError:
             self._remove(own)
             raise
@@ -87,11 +81,12 @@ class SharedFiles:
         OSError
             If not.
         """
-        missing = [folder for folder in self.folders if not _arrived(folder, proof.name)]
-        self._remove(proof.name)
+        name, different = proof
+        missing = [folder for folder in self.folders if not _arrived(folder, name)]
+        self._remove(name)
         if missing:
             raise OSError(f"what it writes to {missing[0]} does not arrive here; {MOUNT}")
-        for file, there in proof.different.items():
+        for file, there in different.items():
             # A file may have changed since the graph was made: then it differs here, too.
             if paths.stat(parse_location(file)) != there:
                 what = "does not exist" if there is None else "has another size or time"

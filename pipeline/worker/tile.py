@@ -10,7 +10,7 @@ import os
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 from flexroad.catalog.index import item
 from flexroad.catalog.storage.paths import parse_location, stat
@@ -23,8 +23,8 @@ from flexroad.pipeline.store.records import (
     Failure,
     MarkerStat,
     MetricsRow,
-    State,
     TileRecord,
+    TileState,
     from_item,
     no_nan,
     to_failed,
@@ -37,7 +37,6 @@ from flexroad.tasks.types import Metrics, Quality
 
 QUALITY = tuple(name for name, kind in Quality.__annotations__.items() if kind == "float")
 """Columns of a row that are computed without ground truth."""
-Status = Literal["done", "failed", "cached"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class TileResult:
     """The result of one tile in this run, as returned by a worker."""
 
     entry: TileRecord
-    status: Status
+    status: TileState
     """``cached`` if the tile was up to date before."""
     spans: dict[str, StageCost] = field(default_factory=dict)
     """Cost of each stage."""
@@ -99,11 +98,6 @@ class TileResult:
     def computed(self) -> dict[str, int]:
         """Stage -> number of nodes computed in this run."""
         return {stage: span.computed for stage, span in self.spans.items() if span.computed}
-
-    @property
-    def reused(self) -> dict[str, int]:
-        """Stage -> number of nodes read from the store."""
-        return {stage: span.reused for stage, span in self.spans.items() if span.reused}
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -172,7 +166,7 @@ def record_failure(
     return replace(entry, marker=marker)
 
 
-def marker_stat(folder: TileProducts, state: State) -> MarkerStat | None:
+def marker_stat(folder: TileProducts, state: TileState) -> MarkerStat | None:
     """Return name, size and version of a tile's marker, None if it does not exist."""
     file = stat(folder.path / MARKERS[state])
     return (MARKERS[state], file.size, file.version) if file else None
@@ -204,7 +198,7 @@ def _row(graph: TileGraph, variant: str, evaluator: Evaluator) -> MetricsRow:
     return no_nan(_head(graph, variant, "done") | metrics | status)
 
 
-def _head(graph: TileGraph, variant: str, status: Status) -> MetricsRow:
+def _head(graph: TileGraph, variant: str, status: TileState) -> MetricsRow:
     fit = graph.chain(variant)[STAGE_NAMES.index("fit")]
     return {
         "tile_id": graph.tile.id,

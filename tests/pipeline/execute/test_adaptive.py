@@ -11,7 +11,6 @@ from flexroad.pipeline.execute.adaptive import (
     MARGIN,
     START_S,
     UNSURE_MARGIN,
-    Estimate,
     decision,
     workers_of,
     workers_pay,
@@ -160,8 +159,8 @@ def test_jobs_of_unknown_number_run_on_workers():
 @pytest.mark.parametrize(("sure", "margin"), [(True, MARGIN), (False, UNSURE_MARGIN)])
 def test_workers_pay_from_the_break_even_on(sure, margin):
     """With two workers, half of the work is saved."""
-    job = Estimate(2 * margin * START_S / 100, sure)
-    assert not workers_pay(99, job, 2)
-    assert workers_pay(101, job, 2)
-    assert "no worker processes" in decision(99, job, 2)
+    job = 2, 2 * margin * START_S / 100, sure
+    assert not workers_pay(99, *job)
+    assert workers_pay(101, *job)
+    assert "no worker processes" in decision(99, *job)
     assert workers_of(1) == 1

@@ -69,19 +69,19 @@ def reference_fingerprints(graph, config) -> dict[str, dict[str, str]]:
     tile, names = graph.tile, {}
     for variant, chain in config.chains.items():
         by_stage = names[variant] = {}
-        for stage in STAGES:
-            options = chain[stage.name]
+        for stage, inputs in STAGES.items():
+            options = chain[stage]
             module = stage_module(options)
             hashed = [
-                stage.name,
+                stage,
                 module.VERSION,
                 options.model_dump(mode="json"),
-                [by_stage[name] for name in stage.inputs] or asdict(tile.grid),
+                [by_stage[name] for name in inputs] or asdict(tile.grid),
                 [source for source in graph.sources if source[0] in getattr(module, "READS", ())],
                 [],
             ]
             text = json.dumps(hashed, sort_keys=True, separators=(",", ":"))
-            by_stage[stage.name] = hashlib.sha256(text.encode()).hexdigest()[:32]
+            by_stage[stage] = hashlib.sha256(text.encode()).hexdigest()[:32]
     return names
 
 

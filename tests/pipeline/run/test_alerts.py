@@ -6,10 +6,16 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from flexroad.pipeline.run.alerts import RetryPolicy, notify
+from flexroad.pipeline.run import alerts
+from flexroad.pipeline.run.alerts import notify
 
 SUMMARY = {"exit_code": 1, "failed": 3}
-QUICK = RetryPolicy(command_s=1, answer_s=1, pause_s=0.01)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    for name, value in (("COMMAND_S", 1), ("ANSWER_S", 1), ("PAUSE_S", 0.01)):
+        monkeypatch.setattr(alerts, name, value)
 
 
 @pytest.fixture
@@ -46,7 +52,7 @@ def test_notify_command_fails_or_hangs_returns_reason(tmp_path):
     assert "ended with exit code 127" in notify("no-such-command", SUMMARY)
     # A background process of the shell must be killed, too.
     hanging = f"(sleep 60; touch {tmp_path}/late) & wait"
-    assert "more than 1 s" in notify(hanging, SUMMARY, QUICK)
+    assert "more than 1 s" in notify(hanging, SUMMARY)
     assert notify("exec 0<&-; exit 0", {"long": "x" * 1_000_000}) is None
 
 
@@ -57,28 +63,28 @@ def test_notify_url_gets_summary_as_json(server):
 
 def test_notify_busy_server_retries(server):
     server.answers += [503, 429]
-    assert notify(server.url, SUMMARY, QUICK) is None
+    assert notify(server.url, SUMMARY) is None
     assert len(server.received) == 3
     server.answers += [500] * 9
-    assert notify(server.url, SUMMARY, QUICK) == "127.0.0.1 answered 500"
+    assert notify(server.url, SUMMARY) == "127.0.0.1 answered 500"
     assert len(server.received) == 6
 
 
 def test_notify_rejected_request_is_not_repeated_and_hides_address(server):
     server.answers += [404]
-    assert notify(server.url, SUMMARY, QUICK) == "127.0.0.1 answered 404"
+    assert notify(server.url, SUMMARY) == "127.0.0.1 answered 404"
     assert len(server.received) == 1
 
 
 def test_notify_unreachable_server_returns_reason():
-    reason = notify("http://127.0.0.1:9/hook/secret", SUMMARY, QUICK)
+    reason = notify("http://127.0.0.1:9/hook/secret", SUMMARY)
     assert reason == "127.0.0.1 cannot be reached: ConnectionError"
-    assert "cannot be reached" in notify("http://", SUMMARY, QUICK)
-    assert notify("http://[::1/secret", SUMMARY, QUICK) == "the web address cannot be read"
+    assert "cannot be reached" in notify("http://", SUMMARY)
+    assert notify("http://[::1/secret", SUMMARY) == "the web address cannot be read"
 
 
 def test_notify_address_in_upper_case_is_an_address(server):
-    assert notify(server.url.replace("http:", "HTTP:"), SUMMARY, QUICK) is None
+    assert notify(server.url.replace("http:", "HTTP:"), SUMMARY) is None
     assert server.received == [("/hook/secret", "application/json", SUMMARY)]
 
 
@@ -95,6 +101,6 @@ def test_notify_address_in_upper_case_is_an_address(server):
     ],
 )
 def test_notify_failed_command_names_only_the_program(command, name):
-    reason = notify(command, SUMMARY, QUICK)
+    reason = notify(command, SUMMARY)
     assert reason.startswith(name)
     assert "s3cret" not in reason

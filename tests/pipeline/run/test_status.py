@@ -6,12 +6,15 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from flexroad.catalog import Catalog
-from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.loading import compose, load_config
+from flexroad.pipeline.graph.graph import tile_graph
 from flexroad.pipeline.run.lock import Owner, owner, run_lock
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import progress
+from flexroad.pipeline.run.status import last_record, matches, progress
 from flexroad.pipeline.store.database import NAME, RunDatabase
+from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import Failure, TileRecord
+from tests.conftest import QUICK
 
 
 @pytest.fixture
@@ -58,3 +61,28 @@ def test_status_of_active_run_shows_counts_and_owner(run, flexroad):
         assert f"pid {holder.pid} on {holder.host} at work since {holder.since}" in output
         assert f"  {one}: load: TaskError: gone" in output
     assert "at work" not in flexroad("status", run.path).out
+
+
+def done(folder, graph) -> bool:
+    files = folder.files()
+    record = last_record(folder, None, files)
+    return record is not None and record.state == "done" and matches(record, graph, files)
+
+
+def test_tile_with_other_graph_or_incomplete_product_is_not_done(survey, tmp_path):
+    graph = tile_graph(Catalog.read(survey).tiles[0], compose(QUICK, "x"))
+    folder = TileProducts.of(tmp_path, graph.tile.id)
+    item = {
+        "id": graph.tile.id,
+        "properties": {"flexroad:fingerprint": graph.fingerprint, "flexroad:rows": []},
+        "assets": {"mesh": {"href": "mesh.glb", "file:size": 3}},
+    }
+    folder.finish(item, {"mesh.glb": b"abc"})
+    assert done(folder, graph)
+    (folder.path / "mesh.glb").write_bytes(b"ab")
+    assert not done(folder, graph)
+    (folder.path / "mesh.glb").write_bytes(b"abc")
+    other = tile_graph(graph.tile, compose({**QUICK, "sample": {"road_m": 2}}, "x"))
+    assert not done(folder, other)
+    (folder.path / "item.json").write_text("{")
+    assert not done(folder, graph)

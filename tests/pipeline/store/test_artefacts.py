@@ -135,24 +135,6 @@ def test_write_failed_keeps_existing_file(tmp_path, monkeypatch):
     assert [p.name for p in path.parent.iterdir()] == ["b.json"]
 
 
-def test_done_with_other_graph_or_incomplete_product_is_none(survey, tmp_path):
-    graph = tile_graph(Catalog.read(survey).tiles[0], compose(CONFIG, "x"))
-    folder = TileProducts.of(tmp_path, graph.tile.id)
-    item = {
-        "properties": {"flexroad:fingerprint": graph.fingerprint, "flexroad:rows": []},
-        "assets": {"mesh": {"href": "mesh.glb", "file:size": 3}},
-    }
-    folder.finish(item, {"mesh.glb": b"abc"})
-    assert folder.done(graph) == item
-    (folder.path / "mesh.glb").write_bytes(b"ab")
-    assert folder.done(graph) is None
-    (folder.path / "mesh.glb").write_bytes(b"abc")
-    other = tile_graph(graph.tile, compose({**CONFIG, "sample": {"road_m": 2}}, "x"))
-    assert folder.done(other) is None
-    (folder.path / "item.json").write_text("{")
-    assert folder.done(graph) is None
-
-
 def test_tile_id_becomes_safe_folder_name(tmp_path):
     for odd in ("../up", "a/b", "..", "", "ä b"):
         folder = TileProducts.of(tmp_path, odd).path

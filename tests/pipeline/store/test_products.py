@@ -11,6 +11,7 @@ from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.pipeline.run.status import last_record, matches
 from flexroad.pipeline.store.products import TileProducts, file_entry
 from tests.conftest import QUICK
 from tests.faulty_files import intercepted
@@ -72,7 +73,7 @@ def _finish(folder: TileProducts, content: bytes) -> None:
     products = {"a.glb": content, "a.tif": content * 2}
     assets = {name: file_entry(name, data, "") for name, data in products.items()}
     properties = {"flexroad:fingerprint": content.hex(), "flexroad:rows": []}
-    folder.finish({"properties": properties, "assets": assets}, products, flushed=True)
+    folder.finish({"id": "a", "properties": properties, "assets": assets}, products, flushed=True)
 
 
 @pytest.mark.parametrize("interrupted", [False, True], ids=["finished before", "interrupted before"])
@@ -90,7 +91,9 @@ def test_finish_power_failure_leaves_no_item_with_products_of_another(interrupte
         write_state(state, root, tmp_path / str(number))
         after = TileProducts.of(tmp_path / str(number), "a")
         graphs = (SimpleNamespace(fingerprint=content.hex()) for content in (b"old", b"new"))
-        done = [after.done(graph) is not None for graph in graphs]
+        files = after.files()
+        record = last_record(after, None, files)
+        done = [matches(record, graph, files) for graph in graphs]
         assert not any(done) or after.verified(), f"state {number}"
         kinds.add(tuple(done))
     assert len(kinds) == (2 if interrupted else 3)
