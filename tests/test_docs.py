@@ -74,6 +74,12 @@ def test_links_have_targets(page):
             assert section in anchors(linked), f"{page.name} links to {target}#{section}"
 
 
+def test_readme_and_docs_stay_short():
+    """Pages of results and of the archive, in folders of their own, do not count."""
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+    assert sum(len(page.read_text().split()) for page in (ROOT / "docs").glob("*.md")) <= 32_000
+
+
 def test_options_are_those_of_the_models():
     assert options_page.PAGE.read_text() == options_page.page(), "run python -m tests.options_page"
 
