@@ -12,6 +12,7 @@ from tests.make_backbone import save_backbone
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+LIVE = [page for page in PAGES if page.parent in (ROOT, ROOT / "docs")]
 NAMED_TEST = re.compile(r"`(test_\w+\.py)::(test_\w+)`")
 
 
@@ -84,10 +85,18 @@ def test_options_are_those_of_the_models():
     assert options_page.PAGE.read_text() == options_page.page(), "run python -m tests.options_page"
 
 
-def test_development_names_existing_files():
+@pytest.mark.parametrize("page", LIVE, ids=lambda page: page.name)
+def test_named_files_and_modules_exist(page):
+    text = page.read_text()
+    files = re.findall(r"(?<![\w./])(?:catalog|pipeline|tasks|tests|experiments|configs)/[\w/]+\.\w+", text)
+    assert [name for name in files if "NAME" not in name and not (ROOT / name).exists()] == []
+    modules = re.findall(r"flexroad\.((?:catalog|pipeline|tasks)\.[\w.]+)", text)
+    folders = [ROOT / name.rpartition(".")[0].replace(".", "/") for name in modules]
+    assert [str(path) for path in folders if not (path.exists() or path.with_suffix(".py").exists())] == []
+
+
+def test_way_of_one_tile_is_short():
     text = (ROOT / "docs" / "development.md").read_text()
-    named = re.findall(r"(?<![\w./])(?:catalog|pipeline|tasks|tests)/[\w/]+\.py", text)
-    assert [name for name in named if "NAME" not in name and not (ROOT / name).exists()] == []
     way = text.partition("## The way of one tile")[2].partition("\n## ")[0]
     assert 30 <= len(re.findall(r"^ *\w+/\S+\.py ", way, flags=re.MULTILINE)) <= 35
 
