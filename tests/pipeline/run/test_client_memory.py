@@ -44,6 +44,7 @@ def traced_bytes() -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.soak("runs")
 def test_memory_of_client_does_not_grow_with_tiles_done(made_survey, tmp_path):
     first = Catalog.read(made_survey / "catalog.parquet").tiles[0]
     west = [first.grid.west + number * first.grid.width * first.grid.cell for number in range(TILES)]

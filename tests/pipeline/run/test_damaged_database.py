@@ -229,6 +229,7 @@ KINDS: list[Callable[[bytearray, random.Random], bytes]] = [
 
 
 @pytest.mark.slow
+@pytest.mark.soak("runs")
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_any_damage_of_database_changes_no_figure(kind, run, no_fsync):
     path = run.path / NAME
