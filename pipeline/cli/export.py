@@ -121,8 +121,7 @@ def export(
     from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
     from flexroad.pipeline.export.driver import check_formats
     from flexroad.pipeline.export.driver import export as write
-    from flexroad.pipeline.export.options import Options
-    from flexroad.pipeline.export.source import select
+    from flexroad.pipeline.export.source import Options, select
     from flexroad.pipeline.run.progress import StepProgress
 
     datum = _datum(vertical, geoid, height_offset)

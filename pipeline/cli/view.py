@@ -92,7 +92,7 @@ def view(
 
 
 def _serve(folder: Path, port: int) -> None:
-    from flexroad.pipeline.export.serving import server
+    from flexroad.pipeline.export.viewer import server
 
     try:
         web = server(folder, port)

@@ -1,9 +1,13 @@
-"""Write exports of a run in several formats, and the manifest that says what they are."""
+"""Write exports of a run in several formats, and the manifest that says what they are.
+
+The folder lies outside the run, and one export at a time writes it; existing files of others stay.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 from hashlib import sha256
@@ -11,15 +15,26 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from flexroad.catalog.storage.paths import Location, read, write
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.paths import (
+    PROBE,
+    Location,
+    absolute,
+    check_writable,
+    exists,
+    listing,
+    read,
+    visible_entry,
+    write,
+)
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.output import MANIFEST, file_sizes, held, remove_unfinished
 from flexroad.pipeline.export.photo import check_photos
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.source import Options, Source
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.errors import TaskError
 
@@ -29,6 +44,9 @@ DATUM_REMEDY = (
     "needs heights above the ellipsoid of WGS 84, and the heights of a run are above a vertical datum; say "
     "which: --vertical EPSG:N (PROJ needs its grid), --geoid FILE (.gtx or .tif), or --height-offset METRES"
 )
+MANIFEST = "export.json"
+BEGUN = ".flexroad-export"
+"""File with the formats of the folder: written first, so that an interrupted export is known, too."""
 
 
 def export(
@@ -164,3 +182,95 @@ def check_formats(names: Sequence[str], options: Options) -> dict[str, Format]:
     if lacking and options.datum is None:
         raise ConfigError(f"{lacking[0]} {DATUM_REMEDY}")
     return chosen
+
+
+@contextmanager
+def held(out: Location, run: Run, formats: Collection[str], notify: Callable[[str], None]) -> Iterator[None]:
+    """Make the folder and hold its lock; a context manager.
+
+    Parameters
+    ----------
+    formats : collection of str
+        The formats to write, each into a folder of its name.
+    notify : callable
+        Receives one line when the lock of a dead process is taken over.
+
+    Raises
+    ------
+    ConfigError
+        If the folder is the run, its store or inside one of them, has existing files that would be replaced,
+        or another process writes there.
+    OSError
+        If it, or its manifest, cannot be written.
+    """
+    for folder in (run.path, run.store):
+        inside = [str(absolute(place)) for place in (out, *out.parents)]
+        if str(absolute(folder)) in inside:
+            raise ConfigError(f"--output {out} lies in the run ({folder}); choose a folder outside")
+    begun = _begun(out, formats)
+    check_writable(out)
+    if isinstance(out, Path):
+        output_file(out / MANIFEST)
+    with run_lock(out, notify):
+        remove_unfinished(out)
+        names = "".join(f"{name}\n" for name in sorted(begun)).encode()
+        if not exists(out / BEGUN) or read(out / BEGUN) != names:
+            write(out / BEGUN, names)
+        yield
+
+
+def _begun(out: Location, formats: Collection[str]) -> set[str]:
+    """Return the formats of the folder that this or an earlier export has written or begun.
+
+    Raises
+    ------
+    ConfigError
+        If the manifest, or a file in the folder of a format, is not of an earlier export.
+    """
+    own = _formats(out)
+    if own is None and exists(out / MANIFEST):
+        raise _foreign(out / MANIFEST)
+    earlier = own or set()
+    for name in formats:
+        other = None if name in earlier else visible_entry(out / name)
+        if other is not None:
+            raise _foreign(out / name / other)
+    return {*earlier, *formats}
+
+
+def _formats(out: Location) -> set[str] | None:
+    """Return the formats of earlier exports into the folder, None if there was none."""
+    if exists(out / BEGUN):
+        return set(read(out / BEGUN).decode(errors="replace").split())
+    try:
+        # An export of an earlier version.
+        manifest = json.loads(read(out / MANIFEST)) if exists(out / MANIFEST) else {}
+        return set(manifest["formats"]) if manifest["flexroad"] else None
+    except (IsADirectoryError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _foreign(file: Location) -> ConfigError:
+    return ConfigError(
+        f"{file} is not of an earlier `flexroad export` and would be replaced; "
+        "choose another folder with -o, or move that file away"
+    )
+
+
+def remove_unfinished(folder: Location, below: bool = False) -> None:
+    """Remove temporary files that an export which was killed has left in a folder; a bucket has none.
+
+    Parameters
+    ----------
+    below : bool
+        Whether folders inside it are searched, too.
+    """
+    if isinstance(folder, Path):
+        for file in folder.rglob(".*") if below else folder.glob(".*"):
+            if file.suffix == ".tmp" or file.name.startswith(PROBE):
+                file.unlink(missing_ok=True)
+
+
+def file_sizes(folder: Location) -> dict[str, int]:
+    """Return the size of each file of a format (bytes), without those that only an export reads."""
+    return {path: stat.size for path, stat in listing(folder).items() if not path.startswith(".")}

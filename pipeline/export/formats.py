@@ -9,6 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from flexroad.catalog.grid import Bounds
+from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, remove, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
@@ -16,21 +20,116 @@ from flexroad.pipeline.export import (
     along_roads,
     height_fields,
     mosaic,
-    per_tile,
     road_lines,
     terrain_tiles,
     tiles3d,
 )
 from flexroad.pipeline.export.network import network
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.photo import Photographed
-from flexroad.pipeline.export.pieces import Encode, figures, write_joined, write_pieces
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.photo import photographed, texture_of
+from flexroad.pipeline.export.pieces import Encode, Piece, figures, part_name, write_joined, write_pieces
+from flexroad.pipeline.export.source import Options, Source, TileItem
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
 from flexroad.tasks.export import road_lines as line_file
+from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tasks.spline.surface import NurbsSurface
+
+MATERIALS = "materials.mtl"
+"""Name of the file of materials that all OBJ files share."""
+NO_PHOTO = "no orthophoto, in plain colours"
+
+
+@dataclass(frozen=True)
+class CityPlace:
+    """What the header of a CityJSON file says, on which the parts of all tiles depend."""
+
+    crs: str
+    origin: tuple[float, float, float]
+    vertical: str | None
+
+
+def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
+    """Return the part of a LandXML file."""
+    part = landxml.part(tile.mesh, project.joined).encode()
+    return Piece({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
+
+
+def cityjson_part(tile: FinishedTile, place: CityPlace) -> Piece:
+    """Return the lines of a CityJSON file."""
+    lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
+    return Piece({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
+
+
+def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
+    return _obj(tile, vertical, MATERIALS, None)
+
+
+def draped_obj_piece(item: TileItem, vertical: str | None) -> Piece:
+    """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
+    tile, name = item.tile, safe_name(item.id)
+    image = texture_of(tile).image
+    materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
+    piece = _obj(tile, vertical, materials, image.bounds if image else None)
+    if image is None:
+        return Piece({**piece.files, materials: obj.encode_materials()}, piece.row | {"note": NO_PHOTO})
+    return Piece({**piece.files, materials: obj.encode_materials(photo), photo: image.jpeg}, piece.row)
+
+
+def _obj(tile: FinishedTile, vertical: str | None, materials: str, photo: Bounds | None) -> Piece:
+    mesh, name = tile.mesh, safe_name(tile.id)
+    place = obj.georeference(mesh, vertical)
+    files = {
+        f"{name}{obj.NAME}": obj.encode(mesh, materials, vertical, photo),
+        f"{name}.json": place.sidecar(obj.AXES),
+        f"{name}.prj": place.prj(),
+    }
+    return Piece(files, {"height_error_m": _error_m(tile, 10**-obj.DECIMALS)})
+
+
+def _error_m(tile: FinishedTile, unit_m: float) -> float:
+    """Return the largest vertical distance of a file's vertices from the surface through the mesh's (m).
+
+    A coordinate that is rounded in plan may be in another cell, with another step. Between the two places the
+    surface therefore counts without its steps.
+
+    Parameters
+    ----------
+    unit_m : float
+        Of this unit the coordinates of a file are multiples (m).
+    """
+    points = tile.mesh.vertices + tile.mesh.origin
+    written = np.rint(points / unit_m) * unit_m
+    west, south, east, north = tile.tile.grid.bounds
+    heights = without_steps(tile.surface).height
+    here, there = (
+        heights(np.clip(x, west, east), np.clip(y, south, north)) for x, y, _ in (points.T, written.T)
+    )
+    errors = (written[:, 2] - points[:, 2]) - (there - here)
+    return float(np.nanmax(np.abs(errors), initial=0.0))
+
+
+def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return the surface as STEP, cut to the tile, and its place as JSON."""
+    surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
+    if not isinstance(surface, NurbsSurface):
+        raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
+    files = {
+        f"{name}{step.NAME}": step.encode(surface, source.grid.bounds, tile.id, source.datetime, vertical),
+        f"{name}{step.NAME_SIDECAR}": step.georeference(surface, vertical).sidecar(step.AXES),
+    }
+    return Piece(files, {})
+
+
+def rhino_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+    """Return surface and mesh as 3DM."""
+    surface = tile.surface
+    nurbs = surface if isinstance(surface, NurbsSurface) else None
+    data = rhino.encode(tile.mesh, nurbs, tile.tile.grid.bounds, vertical)
+    return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, {})
+
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
 """Writes a format of the tiles into a folder; returns what the manifest says of it besides, if anything."""
@@ -68,14 +167,14 @@ def write_landxml(
             landxml.join(file, decoded, project, local.parent, options.compress)
 
     file = folder / f"{source.run.path.name}{name}"
-    return write_joined(source, tiles, file, landxml.VERSION, per_tile.landxml_part, project, executor, join)
+    return write_joined(source, tiles, file, landxml.VERSION, landxml_part, project, executor, join)
 
 
 def write_cityjson(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
     """Write all meshes as one CityJSONSeq file."""
-    place = per_tile.CityPlace(source.crs, (*source.origin, 0.0), source.vertical)
+    place = CityPlace(source.crs, (*source.origin, 0.0), source.vertical)
 
     def join(local: Path, parts: Iterator[bytes]) -> None:
         with local.open("wb") as file:
@@ -83,7 +182,7 @@ def write_cityjson(
             file.writelines(parts)
 
     file = folder / f"{source.run.path.name}{cityjson.NAME}"
-    return write_joined(source, tiles, file, cityjson.VERSION, per_tile.cityjson_part, place, executor, join)
+    return write_joined(source, tiles, file, cityjson.VERSION, cityjson_part, place, executor, join)
 
 
 def write_obj(
@@ -91,10 +190,10 @@ def write_obj(
 ) -> dict[str, Any]:
     """Write each mesh as OBJ: all with one file of materials, or each with its own and a photo."""
     if not options.drape:
-        write(folder / per_tile.MATERIALS, obj.encode_materials())
-        return _write_each(obj.VERSION, per_tile.obj_piece, source, tiles, folder, options, executor)
-    remove(folder / per_tile.MATERIALS)
-    items, encode = map(Photographed, tiles), per_tile.draped_obj_piece
+        write(folder / MATERIALS, obj.encode_materials())
+        return _write_each(obj.VERSION, obj_piece, source, tiles, folder, options, executor)
+    remove(folder / MATERIALS)
+    items, encode = map(photographed, tiles), draped_obj_piece
     return figures(write_pieces(items, folder, obj.VERSION, encode, source.vertical, executor))
 
 
@@ -140,12 +239,12 @@ FORMATS = {
     "heightfield": Format(
         "16-bit height fields, for game engines", height_fields.write_fields, height_fields.VERSION, None
     ),
-    "step": _per_tile("STEP AP214, for CAD", step.VERSION, per_tile.step_piece, 1e-9),
+    "step": _per_tile("STEP AP214, for CAD", step.VERSION, step_piece, 1e-9),
     "mosaic": Format("GeoTIFFs over the run, for GIS", mosaic.write_mosaics, mosaic.VERSION, 0.0005),
     "pmtiles": Format(
         "Map tiles of heights", terrain_tiles.write_tiles, terrain_tiles.VERSION, 0.002, check=_needs_pmtiles
     ),
-    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, per_tile.rhino_piece, 1e-4, _needs_rhino),
+    "3dm": _per_tile("3DM, for Rhino", rhino.VERSION, rhino_piece, 1e-4, _needs_rhino),
     "crg": _along_roads("OpenCRG 1.2, for tyres and vehicles", opencrg.VERSION, along_roads.write_crg),
     "xodr": _along_roads("OpenDRIVE 1.8, for driving simulators", opendrive.VERSION, along_roads.write_xodr),
     "lines": _along_roads("Road lines as GeoPackage, for GIS", line_file.VERSION, road_lines.write_lines),

@@ -11,9 +11,8 @@ from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import Piece, figures, write_pieces
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import heightfield

@@ -18,8 +18,7 @@ from flexroad.catalog.headers.vectors import opened
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.source import Options, Source
 from flexroad.tasks import types
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from flexroad.catalog import Tile
 from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.export.source import OfTile, layer_state
+from flexroad.pipeline.export.source import TileItem, layer_state
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.texture import TileTexture, tile_texture
@@ -35,14 +35,9 @@ def check_photos(tiles: Iterable[Tile]) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Photographed(OfTile):
-    """A finished tile whose files have its photo."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Name of its files by what they are made of."""
-        return f"{self.tile.fingerprint} {layer_state(self.tile.tile, 'dop')}"
+def photographed(tile: FinishedTile) -> TileItem:
+    """Return a finished tile whose files have its photo."""
+    return TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}")
 
 
 def texture_of(tile: FinishedTile) -> TileTexture:

@@ -16,13 +16,19 @@ from flexroad.catalog.storage.paths import Location, read
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.along_roads import RouteUnit, Work, reference_line, write_units
+from flexroad.pipeline.export.along_roads import (
+    NO_ROAD,
+    RouteUnit,
+    Work,
+    reference_line,
+    totals,
+    with_line,
+    write_units,
+)
 from flexroad.pipeline.export.ground import Ground
 from flexroad.pipeline.export.network import network
-from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.pieces import MARKERS, Piece, Row, write_whole
-from flexroad.pipeline.export.road_report import NO_ROAD, totals, with_line
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import road_lines
 from flexroad.tasks.export.road_lines import RoadLine

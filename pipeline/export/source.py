@@ -1,13 +1,15 @@
-"""What an export is made of: the finished tiles of a run, with their surfaces and meshes."""
+"""What an export is made of: the finished tiles of a run, with their surfaces and meshes, and its options."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
+from flexroad.catalog.ellipsoidal import Datum
 from flexroad.catalog.storage.paths import Location, stat
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import (
@@ -23,11 +25,37 @@ from flexroad.pipeline.run.status import Track, untracked
 from flexroad.tasks.io.vertical import vertical_crs
 
 
+@dataclass(frozen=True)
+class Options:
+    """Options of an export."""
+
+    datum: Datum | None = None
+    """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
+    compress: bool = False
+    """Whether text formats of the complete run are compressed with gzip."""
+    resolution_m: float | None = None
+    """Cell size of rasters over the run (m); None: that of the run."""
+    nodes: Literal["power", "unreal"] = "power"
+    """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""
+    drape: bool = False
+    """Whether meshes of 3D Tiles and OBJ have the orthophoto, also if those of the run have none."""
+    roads: str | None = None
+    """File of centre lines for formats along roads; None for the roads of the run's catalog."""
+    roads_layer: str | None = None
+    """Layer of that file; needed if it has several."""
+    left_hand: bool = False
+    """Whether traffic keeps left."""
+    formats: frozenset[str] = frozenset()
+    """Names of the formats that are written together: some refer to files of other formats."""
+
+
 @dataclass(frozen=True, eq=False)
-class OfTile:
-    """What has the id and the name of a finished tile; sent to a worker."""
+class TileItem:
+    """A finished tile whose files are made of more than its mesh, such as its photo; sent to a worker."""
 
     tile: FinishedTile
+    fingerprint: str
+    """Name of its files by what they are made of."""
 
     @property
     def id(self) -> str:

@@ -23,8 +23,7 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.storage.staging import atomic_file
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import Source
+from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import terrarium
 from flexroad.tasks.export.terrarium import SIZE

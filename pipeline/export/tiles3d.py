@@ -1,58 +1,176 @@
-"""3D Tiles of a run: its GLB files unchanged, coarse meshes of larger areas, and tilesets over both."""
+"""3D Tiles of a run: its GLB files unchanged, coarse meshes of larger areas, and tilesets over both.
+
+Coarse meshes are made level by level: each from small records of the tiles or meshes below it. A record is a
+`Relief` with its image, in a file of the folder ``.coarse``. A worker reads those of one area, so that memory
+does not depend on the size of a run, and an interrupted export goes on.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import zipfile
+import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
 from typing import Any
 
+import numpy as np
+
+from flexroad.catalog.ellipsoidal import Datum, Ellipsoidal
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location, exists, listing, parse_location, read, remove, write
 from flexroad.catalog.text import count
+from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export import coarse
-from flexroad.pipeline.export.coarse import LEVELS, Branch, Place, branch_piece
-from flexroad.pipeline.export.options import Options
 from flexroad.pipeline.export.photo import aerial_of, texture_of
 from flexroad.pipeline.export.pieces import Piece, Row, write_pieces
-from flexroad.pipeline.export.source import OfTile, Source, layer_state
+from flexroad.pipeline.export.source import Options, Source, TileItem, layer_state
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.pipeline.worker.texture import TileTexture
 from flexroad.tasks.export import glb, tiles3d
 from flexroad.tasks.meshing import aerial, relief
+from flexroad.tasks.meshing.aerial import Aerial
+from flexroad.tasks.meshing.relief import Relief
 
+RECORDS, MESHES = ".coarse", "coarse"
+"""Folders of records, and of GLB files."""
+PREFIX = "coarse_"
+"""Start of the ids of coarse meshes, which keeps them apart from those of tiles."""
+QUALITY = 85
+"""Quality of JPEG images."""
+SHARP = 8
+"""Geometric error of a mesh in pixels of its image, at least: programs show errors of up to 16 pixels of the
+screen (the default of CesiumJS), so that a pixel of the image covers at most two of the screen."""
+DAMAGED = (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 VERSION = tiles3d.VERSION
 NAMED = 5
 """Largest number of tiles that a note names."""
 
 
-@dataclass(frozen=True, eq=False)
-class Leaf(OfTile):
-    """A finished tile whose mesh is placed on the Earth."""
+@dataclass(frozen=True)
+class Level:
+    """How coarse meshes of one size are."""
 
-    drape: bool
-    """Whether its mesh is to have the orthophoto, even if that of the run has none."""
+    side_m: float
+    """Side of their areas (m)."""
+    spacing_m: float
+    """Distance of vertices (m)."""
+    pixel_m: float
+    """Size of pixels of the image (m)."""
+
+
+TILE = Level(0.0, 4.0, 2.0)
+"""Records of tiles; they are shown only as parts of coarser ones."""
+LEVELS = (Level(1000.0, 16.0, 2.0), Level(2000.0, 32.0, 4.0), Level(4000.0, 64.0, 8.0))
+"""From fine to coarse; each side is twice the one before."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What the place of a tile's mesh is computed of."""
+
+    run: str
+    crs: str
+    origin: tuple[float, float]
+    datum: Datum
 
     @property
-    def own(self) -> bool:
-        """Whether the GLB file of the run is taken, if there is one."""
-        return self.tile.place.pattern.export.texture or not self.drape
+    def conversion(self) -> Ellipsoidal:
+        """From the CRS and the heights of the run to WGS 84."""
+        return Ellipsoidal(self.crs, self.datum)
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A coarse mesh to be written; sent to a worker."""
+
+    id: str
+    level: Level
+    cell: tuple[int, int]
+    """Column and row of its area, in sides of the finest level."""
+    parts: tuple[Row, ...]
+    """Rows of the tiles or coarse meshes that it replaces from afar."""
+    folder: str
 
     @property
-    def photo(self) -> bool:
-        """Whether its mesh has the orthophoto, if there is one."""
-        return self.drape or self.tile.place.pattern.export.texture
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"area {self.id.removeprefix(PREFIX)}"
 
     @property
     def fingerprint(self) -> str:
-        """Name of its files by what they are made of."""
-        photo = layer_state(self.tile.tile, "dop") if self.photo else ""
-        return f"{self.tile.fingerprint} {self.tile.snapshot.fingerprint} {self.own} {photo}"
+        """Name of the mesh by what it is made of."""
+        made_of = [(row["record"], row["digest"], row["error_m"]) for row in self.parts]
+        return sha256(f"{self.level} {made_of}".encode()).hexdigest()
+
+
+def record(name: str, ground: Relief, image: Aerial) -> tuple[dict[str, bytes], Row]:
+    """Return a record as file, and the part of a row that refers to it."""
+    arrays: Mapping[str, Any] = {
+        "bounds": np.array(ground.bounds),
+        "heights": ground.heights,
+        "cells": ground.cells,
+        "error_m": np.float64(ground.error_m),
+        "colour": np.rint(image.colour).astype(np.uint8),
+        "share": np.rint(image.share * 255).astype(np.uint8),
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    data, path = buffer.getvalue(), f"{RECORDS}/{name}.npz"
+    return {path: data}, {"record": path, "digest": sha256(data).hexdigest()}
+
+
+def branch_piece(branch: Branch, place: Place) -> Piece:
+    """Return the GLB file of a coarse mesh, its record, and its row."""
+    folder, level = parse_location(branch.folder), branch.level
+    parts = [_read(folder, row) for row in branch.parts]
+    ground = relief.joined([part for part, _ in parts], level.spacing_m)
+    image = aerial.joined([part for _, part in parts], ground.bounds, level.pixel_m)
+    # Neighbours of the same level differ by less than twice the error.
+    sheet = relief.sheet(ground, max(2 * ground.error_m, level.pixel_m))
+    uri = f"{MESHES}/{branch.id.removeprefix(PREFIX)}{glb.NAME}"
+    placed, local = tiles3d.sheet_placed(uri, sheet.points, place.conversion)
+    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY))
+    error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
+    files, referred = record(branch.id, ground, image)
+    row = row_of(branch.id, branch.cell, placed, error_m) | {"vertical_m": ground.error_m}
+    return Piece({uri: data, **files}, row | referred)
+
+
+def row_of(name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: float) -> Row:
+    """Return the row of a tile or coarse mesh, without its record."""
+    return {
+        "id": name,
+        "cell": cell,
+        "uri": placed.uri,
+        "transform": placed.transform,
+        "region": placed.region,
+        "error_m": error_m,
+    }
+
+
+def _read(folder: Location, row: Row) -> tuple[Relief, Aerial]:
+    data = read(folder / row["record"])
+    try:
+        if sha256(data).hexdigest() != row["digest"]:
+            raise ValueError("its checksum differs")
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        west, south, east, north = arrays["bounds"].tolist()
+        bounds = west, south, east, north
+        ground = Relief(bounds, arrays["heights"], arrays["cells"], float(arrays["error_m"]))
+        return ground, Aerial(bounds, arrays["colour"].astype(np.float64), arrays["share"] / 255)
+    except DAMAGED as error:
+        raise ConfigError(
+            f"{folder / row['record']} is damaged ({error}); remove it and export again"
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +202,9 @@ def write_tilesets(
     """
     assert options.datum is not None  # the command checks it
     place = Place(str(source.run.path), source.crs, source.origin, options.datum)
-    leaves = (Leaf(tile, options.drape) for tile in tiles)
-    nodes = [Node(row) for row in write_pieces(leaves, folder, VERSION, leaf_piece, place, executor)]
+    leaves = (_leaf(tile, options.drape) for tile in tiles)
+    encode = partial(leaf_piece, drape=options.drape)
+    nodes = [Node(row) for row in write_pieces(leaves, folder, VERSION, encode, place, executor)]
     nodes.sort(key=lambda node: str(node.row["id"]))
     bare = [node.row["id"] for node in nodes if node.row["bare"]]
     children, named = [], set[str]()
@@ -132,7 +251,7 @@ def _raised(
         if len(parts) == 1 and (parts[0].children or number + 1 < len(LEVELS)):
             raised += parts
             continue
-        name = f"{coarse.PREFIX}{LEVELS[number].side_m:.0f}_{cell[0]}_{cell[1]}"
+        name = f"{PREFIX}{LEVELS[number].side_m:.0f}_{cell[0]}_{cell[1]}"
         below[name] = tuple(parts)
         rows = tuple(part.row for part in parts)
         branches.append(Branch(name, LEVELS[number], parts[0].row["cell"], rows, str(folder)))
@@ -147,35 +266,50 @@ def _cell(node: Node, number: int) -> tuple[int, int]:
     return column >> number, line >> number
 
 
-def leaf_piece(leaf: Leaf, place: Place) -> Piece:
-    """Return the GLB file of a tile, a record for coarse meshes, and its row."""
+def _leaf(tile: FinishedTile, drape: bool) -> TileItem:
+    own, photo = _choice(tile, drape)
+    state = layer_state(tile.tile, "dop") if photo else ""
+    return TileItem(tile, f"{tile.fingerprint} {tile.snapshot.fingerprint} {own} {state}")
+
+
+def _choice(tile: FinishedTile, drape: bool) -> tuple[bool, bool]:
+    """Return whether the GLB file of the run is taken, if there is one, and whether meshes have the photo."""
+    textured = tile.place.pattern.export.texture
+    return textured or not drape, textured or drape
+
+
+def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
+    """Return the GLB file of a tile, a record for coarse meshes, and its row.
+
+    With ``drape`` its mesh has the orthophoto, even if that of the run has none.
+    """
     tile = leaf.tile
-    mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if leaf.photo else TileTexture()
+    own, draped = _choice(tile, drape)
+    mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if draped else TileTexture()
     points = mesh.vertices + mesh.origin
     heights = float(points[:, 2].min()), float(points[:, 2].max())
     name = safe_name(tile.id)
     uri = f"tiles/{name}{glb.NAME}"
     placed = tiles3d.placed(uri, grid.bounds, heights, place.origin, place.conversion)
-    pixel_m = coarse.TILE.pixel_m
-    ground = relief.of_mesh(points, mesh.faces, coarse.TILE.spacing_m)
+    pixel_m = TILE.pixel_m
+    ground = relief.of_mesh(points, mesh.faces, TILE.spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
     image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
     if texture.image:
         photo = aerial.joined([aerial_of(texture.image, pixel_m)], ground.bounds, pixel_m)
         image = replace(photo, share=image.share)
-    files, referred = coarse.record(name, ground, image)
+    files, referred = record(name, ground, image)
     side = LEVELS[0].side_m
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
-    row = coarse.row_of(tile.id, cell, placed, 0.0) | {"bare": leaf.photo and not texture.image}
-    return Piece({uri: _glb(leaf, place, texture), **files}, row | referred)
+    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture.image}
+    return Piece({uri: _glb(tile, own, place, texture), **files}, row | referred)
 
 
-def _glb(leaf: Leaf, place: Place, texture: TileTexture) -> bytes:
+def _glb(tile: FinishedTile, own: bool, place: Place, texture: TileTexture) -> bytes:
     """Return the GLB file of the run, or a new one if the run has none that fits."""
-    tile = leaf.tile
     file = TileProducts.of(parse_location(place.run), tile.id).file(file_name(tile.id, tile.variant, GLB))
-    if (leaf.own or not texture.image) and exists(file):
+    if (own or not texture.image) and exists(file):
         data = read(file)
         tile.check_unchanged()
         return data

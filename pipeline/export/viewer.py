@@ -5,26 +5,44 @@ The page is written last, and an earlier one is removed first: a folder with a p
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexroad.catalog import Bounds, Tile
-from flexroad.catalog.crs import in_plan, name, short
+from flexroad.catalog.crs import in_plan, name, short, transformer
 from flexroad.catalog.ids import safe_name
+from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.links import contained
 from flexroad.catalog.storage.paths import Location, absolute, exists, read, remove, visible_entry, write
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.pieces import write_pieces
-from flexroad.pipeline.export.viewer_tile import Look, Shown, piece
+from flexroad.pipeline.export.pieces import Piece, write_pieces
+from flexroad.pipeline.export.source import TileItem, layer_state
 from flexroad.pipeline.run.finished import FinishedTile, RunPlace, snapshots
 from flexroad.pipeline.run.record import Run, check_links
 from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
+from flexroad.pipeline.worker.texture import tile_photo
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import glb, viewer
 from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.load import layer_source
 from flexroad.tasks.roads import rasterise
+from flexroad.tasks.roads.centre_lines import read_centre_lines
+from flexroad.tasks.roads.rasterise import DEFAULTS
+from flexroad.tasks.roads.rasterise import Options as RoadOptions
+from flexroad.tasks.roads.routes import CentreLine
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats
+
+shapely = lazy("shapely")
 
 VERSION = 100 * viewer.VERSION + glb.VERSION
 PAGE = "index.html"
@@ -50,6 +68,13 @@ MEASURES = {
 """Title and unit of the columns of metrics.parquet that colour the map; % marks shares."""
 DIGITS = 4
 """Digits of the figures in the index."""
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+WGS84 = "EPSG:4326"
+QUALITY = 82
+"""Quality of the photos' JPEG."""
+SIMPLIFIED_M = 0.05
+"""Largest distance of a simplified road line from the given one (m)."""
 
 
 @dataclass(frozen=True)
@@ -171,11 +196,13 @@ def _claim(out: Location, run: Run) -> None:
     remove(out / PAGE)
 
 
-def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[Shown]:
+def _finished(run: Run, done: Sequence[Tile], variant: str) -> Iterator[TileItem]:
     place = RunPlace.of(run)
     for tile, snapshot in snapshots(run, done, variant):
         if snapshot:
-            yield Shown(FinishedTile(tile, variant, snapshot, place))
+            photo_and_lines = (layer_state(tile, name) for name in ("dop", "roads"))
+            made_of = " ".join((snapshot.nodes["assess"], *photo_and_lines))
+            yield TileItem(FinishedTile(tile, variant, snapshot, place), made_of)
 
 
 def _index(run: Run, tiles: Sequence[Tile], variant: str) -> tuple[dict[str, Any], list[Tile]]:
@@ -236,3 +263,138 @@ def _figure(value: Any) -> float | None:
     if value is None or not math.isfinite(value):
         return None
     return float(f"{value:.{DIGITS}g}")
+
+
+class _Files(SimpleHTTPRequestHandler):
+    """Files of a folder, for requests to this computer by its own name."""
+
+    def send_head(self) -> Any:
+        # Else a page of the web could read the folder, by a name of its own that leads here.
+        host = self.headers.get("Host", "").rpartition(":")[0]
+        if host not in NAMES:
+            self.send_error(403)
+            return None
+        try:
+            contained(Path(self.translate_path(self.path)), Path(self.directory))
+        except (OSError, ValueError):
+            # A link that leads out of the folder, or no name of a file, such as /%00.
+            self.send_error(404)
+            return None
+        return super().send_head()
+
+    def list_directory(self, path: Any) -> Any:
+        self.send_error(404)
+
+    def end_headers(self) -> None:
+        # The folder may be written again while it is served.
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+def server(folder: Path, port: int) -> ThreadingHTTPServer:
+    """Return a server of a folder on this computer's loopback address.
+
+    Parameters
+    ----------
+    port : int
+        0 for any free one.
+
+    Raises
+    ------
+    OSError
+        If the port is in use.
+    """
+    return ThreadingHTTPServer((LOOPBACK, port), partial(_Files, directory=str(folder)))
+
+
+@dataclass(frozen=True)
+class Look:
+    """Options of the tiles' scripts."""
+
+    origin: tuple[float, float]
+    """Whole-metre (easting, northing) that meshes of the run are relative to."""
+    photo_px: int
+    """Largest width and height of a photo (pixels)."""
+    roads: RoadOptions = DEFAULTS
+    """Selection of the road lines."""
+
+
+def piece(item: TileItem, look: Look) -> Piece:
+    """Return the script of a tile; its row has its picture, and names what could not be read."""
+    tile = item.tile
+    source, notes = tile.tile, list[str]()
+    photo = _photo(source, look.photo_px, notes)
+    quality, surface = tile.quality, tile.surface
+    try:
+        data, (estimate, _) = tile.data, tile.cell_errors
+    except ConfigError as error:
+        dsm = dtm = estimate = None
+        seen = ""
+        notes.append(f"no scan and terrain model to compare with: {error}")
+    else:
+        window = data.grid.window(data.core)
+        dsm, dtm = data.dsm[window], data.dtm[window]
+        height = surface.lattice(data.core.eastings, data.core.northings)
+        height[tile.road.outside[window]] = np.nan
+        small = viewer.picture(height, tile.road.mask[window], data.core.cell)
+        seen = base64.b64encode(small).decode("ascii")
+    scene = viewer.TileScene(
+        tile.id,
+        glb.encode(tile.mesh, (*look.origin, 0.0), photo, surface),
+        source.grid,
+        corners(source),
+        quality.support,
+        dsm,
+        dtm,
+        estimate,
+        surface if isinstance(surface, NurbsSurface) else None,
+        _lines(source, look.roads, notes),
+    )
+    name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"
+    return Piece({name: viewer.encode_tile(scene)}, {"tile": tile.id, "notes": notes, "picture": seen})
+
+
+def corners(tile: Tile) -> Floats:
+    """Return longitude and latitude of a tile's corners, ``(4, 2)``: SW, SE, NW, NE (degrees)."""
+    west, south, east, north = tile.grid.bounds
+    places = transformer(tile.grid.crs, WGS84).transform(
+        [west, east, west, east], [south, south, north, north]
+    )
+    return np.column_stack(places)
+
+
+def _photo(tile: Tile, largest_px: int, notes: list[str]) -> glb.Texture | None:
+    layer = tile.layer("dop")
+    layer = layer and layer.reaching(tile.grid.bounds)
+    if not layer:
+        return None
+    try:
+        photo = tile_photo(tile, layer, largest_px)
+    except TaskError as error:
+        notes.append(f"no photo: {error}")
+        return None
+    return glb.texture(photo, QUALITY) if photo else None
+
+
+def _lines(tile: Tile, options: RoadOptions, notes: list[str]) -> tuple[CentreLine, ...]:
+    """Return the centre lines of the catalog on a tile, cut at its edges."""
+    layer = tile.layer("roads")
+    source = layer and layer_source(replace(tile, layers=(layer,)), layer.name)
+    if not source:
+        return ()
+    bounds = tile.grid.bounds
+    try:
+        lines = read_centre_lines(source, bounds, tile.grid.crs, options).lines
+    except TaskError as error:
+        notes.append(f"no road lines: {error}")
+        return ()
+    parts = []
+    for line in lines:
+        cut = shapely.LineString(line.points).simplify(SIMPLIFIED_M).intersection(shapely.box(*bounds))
+        for part in shapely.get_parts(cut):
+            if part.geom_type == "LineString" and part.length > 0:
+                parts.append(replace(line, points=shapely.get_coordinates(part)))
+    return tuple(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -9,16 +10,15 @@ import yaml
 
 from flexroad.catalog.storage.paths import exists
 from flexroad.catalog.text import count
-from flexroad.pipeline.report.meshes import mesh_checks
 from flexroad.pipeline.report.quality import held_out, highest_error_estimates, over_tiles
-from flexroad.pipeline.report.results import Results, add_results
-from flexroad.pipeline.report.steps import EdgeSteps, edge_steps
+from flexroad.pipeline.report.steps import EdgeSteps, Results, add_results, edge_steps
 from flexroad.pipeline.run.lock import exit_reason, owner
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import TileStatus, Track, open_database, recorded, summary, untracked
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.store.records import TileState
 from flexroad.pipeline.store.tables import METRICS, metrics_frame, read_metrics
+from flexroad.tasks.errors import MeshFault
 
 FIGURES = {
     "l2_road_m": "L2 road (m)",
@@ -41,6 +41,14 @@ WITH_ROADS = "with roads"
 """Column with the number of tiles that the figures of roads are over; only if it is not that of all tiles."""
 WORST = 10
 """Rows in the tables of the worst tiles."""
+MESH_COLUMNS = ["method", "meshes", "faces", "meshes with faults", "result"]
+MESHES = (
+    "A mesh has no fault if all numbers are finite, all faces have an area and look up, no faces overlap in "
+    "plan, edges meet at vertices only, and no vertex is unused or there twice. A tile that has a mesh with "
+    "faults is failed; the faces are those of the other meshes."
+)
+FAULT = f"evaluate: {MeshFault.__name__}: "
+"""Start of the error of a row whose mesh has a fault."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,3 +218,16 @@ def _reference(run: Run, done: set[str]) -> str:
     )
     data = "; ".join(sorted({tile.dataset for tile in tiles if tile.dataset}))
     return f"{f'Data: {data}. ' if data else ''}{heights}; {classes}."
+
+
+def mesh_checks(rows: pd.DataFrame, variants: Iterable[str]) -> pd.DataFrame:
+    """Return one row per variant that has meshes, columns `MESH_COLUMNS`, from the rows of a run."""
+    table = []
+    for variant in variants:
+        own = rows[rows.variant == variant]
+        faces = own.triangles[own.status == "done"]
+        faulty = int(own.error.fillna("").str.startswith(FAULT).sum())
+        if meshes := len(faces) + faulty:
+            result = f"error: {faulty} of {meshes} meshes have faults" if faulty else "no fault"
+            table.append((variant, meshes, int(faces.sum()), faulty, result))
+    return pd.DataFrame(table, columns=MESH_COLUMNS)

@@ -14,8 +14,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from flexroad.catalog.text import printable
-from flexroad.pipeline.report import meshes, quality
-from flexroad.pipeline.report.content import Content
+from flexroad.pipeline.report import quality
+from flexroad.pipeline.report.content import MESHES, Content
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.places import Place
 
@@ -87,7 +87,7 @@ def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         (WORST_ESTIMATES, content.worst_estimates, quality.MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
         ("Error estimates at withheld squares", content.held_out, quality.HOLDOUT),
-        ("Meshes", content.meshes, meshes.MEANING),
+        ("Meshes", content.meshes, MESHES),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
         ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),
         ("Failures", content.failures, ""),

@@ -10,10 +10,15 @@ from PIL import Image
 
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.content import Content
-from flexroad.pipeline.report.estimate_picture import estimate_picture
 from flexroad.pipeline.report.mesh_pictures import render_meshes
 from flexroad.pipeline.report.pages import TilePictures
-from flexroad.pipeline.report.render import error_map, filter_picture, hillshade, support_picture
+from flexroad.pipeline.report.render import (
+    error_map,
+    estimate_picture,
+    filter_picture,
+    hillshade,
+    support_picture,
+)
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked

@@ -16,11 +16,31 @@ import pandas as pd
 
 from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.graph.borders import has_borders
-from flexroad.pipeline.report.results import Results, find_results
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
-from flexroad.pipeline.run.status import Track, untracked
+from flexroad.pipeline.run.status import TileStatus, Track, peek_statuses, untracked
 from flexroad.tasks.types import Floats, RoadMask, Surface
+
+Results = dict[str, dict[str, tuple[str, str]]]
+"""Finished tile -> exported variant -> fingerprints of its surface and of its road mask: not graphs, of which
+thousands would be large."""
+
+
+def add_results(results: Results, status: TileStatus) -> None:
+    """Add the results of a tile if it is finished."""
+    if status.done:
+        graph = status.graph
+        exported = ((variant, graph.variants[variant]) for variant in graph.export.variants)
+        results[graph.tile.id] = {name: (stages["fit"], stages["segment"]) for name, stages in exported}
+
+
+def find_results(run: Run, tiles: Iterable[Tile]) -> Results:
+    """Return the results of those tiles that are finished; checks each of them."""
+    results: Results = {}
+    for status in peek_statuses(run, tiles):
+        add_results(results, status)
+    return results
+
 
 MEAN, LARGEST, ON_ROAD, ANGLE = "mean step (m)", "largest step (m)", "on road, mean (m)", "largest angle (°)"
 COLUMNS = ["variant", "tile", "neighbour", MEAN, LARGEST, ON_ROAD, ANGLE]

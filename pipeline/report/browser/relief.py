@@ -14,7 +14,7 @@ from PIL import Image
 
 from flexroad.catalog import Tile
 from flexroad.pipeline.report.render import SUN_ALTITUDE_DEG, SUN_AZIMUTH_DEG
-from flexroad.pipeline.report.results import Results
+from flexroad.pipeline.report.steps import Results
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked

@@ -11,7 +11,7 @@ from flexroad.catalog.ellipsoidal import Datum
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.options import Options
+from flexroad.pipeline.export.source import Options
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 

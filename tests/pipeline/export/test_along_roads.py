@@ -15,10 +15,8 @@ from pyproj import CRS
 
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export import ground, pieces
-from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.output import BEGUN
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.driver import BEGUN, export
+from flexroad.pipeline.export.source import Options, select
 from flexroad.tasks.spline.stepped import without_steps
 from tests import validators
 from tests.make_city import TILE_M, bend, make_city, south_west, write_lines

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.driver import BEGUN, export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.output import BEGUN
 from flexroad.pipeline.export.source import select
 from flexroad.pipeline.run.lock import run_lock
 from tests.permissions import permissions_enforced

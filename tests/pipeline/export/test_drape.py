@@ -14,8 +14,7 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 
 from .conftest import contents

@@ -18,8 +18,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import pieces
 from flexroad.pipeline.export.driver import check_formats, export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from tests.read_exports import OFFSET_M, heightfields, off_surface, true_heights, vertices

@@ -12,8 +12,7 @@ from PIL import Image
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from tests import validators
 
 READER = Path(__file__).parents[2] / "validators" / "cast_rays.py"

@@ -19,8 +19,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import mosaic
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from tests import validators
 
 NAMES = ("height", "normal", "road", "support")

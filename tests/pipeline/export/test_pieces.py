@@ -6,10 +6,8 @@ import pytest
 
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import pieces
-from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.output import BEGUN
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.driver import BEGUN, export
+from flexroad.pipeline.export.source import Options, select
 from flexroad.tasks.export import cityjson, landxml
 
 from .conftest import contents

@@ -10,11 +10,9 @@ from flexroad.catalog import Catalog
 from flexroad.catalog.storage.paths import read
 from flexroad.pipeline.config.loading import compose
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.driver import BEGUN, export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.output import BEGUN
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 

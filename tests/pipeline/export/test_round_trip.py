@@ -12,8 +12,7 @@ from pyproj import Transformer
 from flexroad.catalog.ellipsoidal import Datum
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 from flexroad.pipeline.run.record import Run
 from flexroad.tasks.spline.stepped import without_steps
 from tests.make_city import CRS, TILE_M, make_city, south_west

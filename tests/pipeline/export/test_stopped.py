@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from flexroad.pipeline.execute import DaskExecutor
-from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.driver import BEGUN, export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.output import BEGUN
 from flexroad.pipeline.export.source import select
 from tests import command_line
 from tests.faulty_files import Operation, intercepted

@@ -13,8 +13,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
-from flexroad.pipeline.export.options import Options
-from flexroad.pipeline.export.source import select
+from flexroad.pipeline.export.source import Options, select
 
 WORLD = 2 * np.pi * 6378137
 SIZE = 512

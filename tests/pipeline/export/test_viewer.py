@@ -24,8 +24,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import viewer
-from flexroad.pipeline.export.serving import server
-from flexroad.pipeline.export.viewer import MARK, PAGE, write_viewer
+from flexroad.pipeline.export.viewer import MARK, PAGE, server, write_viewer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from flexroad.catalog import Grid
@@ -225,3 +226,27 @@ def test_render_meshes_failing_child_gives_none_and_warns(tmp_path, monkeypatch,
         assert mesh_pictures.render_meshes({"a": sheet(), "b": sheet()}) == {"a": None, "b": None}
     (record,) = caplog.records
     assert re.search(f"a, b: .*{reason}", record.getMessage())
+
+
+TILE = Grid("EPSG:25832", 500_000.0, 5_600_250.0, 1.0, 250, 250)
+
+
+def labels(places):
+    axes = Figure().subplots()
+    render._circles(axes, TILE, places)
+    return {text.get_text(): text.xy for text in axes.texts}
+
+
+def test_labels_of_near_places_do_not_overlap():
+    east, north = 500_120.0, 5_600_140.0
+    places = {"spike": (east, north), "patch": (east + 3, north + 1), "loose": (east + 6, north + 3)}
+    (_, first), (_, second), (_, third) = (labels(places)[name] for name in places)
+    assert first == 140
+    assert second - first >= render.LINE * 250 - 1e-9
+    assert third - second >= render.LINE * 250 - 1e-9
+
+
+def test_labels_of_far_places_and_flags_of_one_place_stay_where_they_are():
+    places = {"spike": (500_020.0, 5_600_100.0), "patch": (500_230.0, 5_600_101.0)}
+    assert labels(places) == {"spike": (20, 100), "patch": (230, 101)}
+    assert labels(dict.fromkeys(("spike", "patch"), (500_020.0, 5_600_100.0))) == {"spike, patch": (20, 100)}

@@ -18,8 +18,7 @@ from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.graph.graph import Pattern
 from flexroad.pipeline.report.browser.relief import relief
 from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.results import find_results
-from flexroad.pipeline.report.steps import edge_steps
+from flexroad.pipeline.report.steps import edge_steps, find_results
 from flexroad.pipeline.run.conductor import rerun_filter
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles

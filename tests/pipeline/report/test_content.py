@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from flexroad.pipeline.report.meshes import COLUMNS, mesh_checks
+from flexroad.pipeline.report.content import MESH_COLUMNS, mesh_checks
 from flexroad.pipeline.store.tables import metrics_frame
 
 FAULT = "evaluate: MeshFault: the mesh has 2 inverted faces (the first at 1.000, 2.000)"
@@ -29,6 +29,6 @@ def row(variant, triangles=None, error=""):
 def test_mesh_checks_count_meshes_faces_and_faults(rows, expected):
     pd.testing.assert_frame_equal(
         mesh_checks(metrics_frame(rows), ["a", "b", "c"]),
-        pd.DataFrame(expected, columns=COLUMNS),
+        pd.DataFrame(expected, columns=MESH_COLUMNS),
         check_dtype=False,
     )
