@@ -1,4 +1,4 @@
-"""Entries of catalog files: their schema, and the tiles in them.
+"""Entries of catalog files, and the tiles in them.
 
 A tile is made of each entry. If an entry cannot be used, its tile has a `Tile.fault`: it keeps its id, or
 gets one such as ``entry-17`` if that is at fault, too.
@@ -11,11 +11,10 @@ import struct
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from flexroad.catalog import crs, ids
 from flexroad.catalog.errors import CatalogError
@@ -38,73 +37,17 @@ MAX_FAULTS = 10_000
 
 MAX_LABEL = 200
 """Longest stratum and name of a dataset."""
-Text = Annotated[str, Field(max_length=MAX_MESSAGE * 100)]
-Label = Annotated[str, Field(max_length=MAX_LABEL)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Value = Annotated[int, Field(ge=-(2**31), lt=2**32)]
-WORDS = {
-    "model_type": "not an object",
-    "string_type": "not a text",
-    "string_unicode": "not a text in Unicode",
-    "list_type": "not a list",
-    "int_type": "not a whole number",
-    "float_type": "not a number",
-    "bool_type": "neither true nor false",
-    "finite_number": "not a finite number",
-}
-"""What a value is, by pydantic's type of its error."""
-
-
-class _Schema(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore")
-
-
-class _Asset(_Schema):
-    files: list[Text] = Field(alias="flexroad:files", min_length=1)
-    values: list[Value] = Field(alias="flexroad:values")
-    crs: Text | None = Field(None, alias="flexroad:crs")
-    extents: Any = Field(None, alias="flexroad:extents")
-    reproject: bool | None = Field(None, alias="flexroad:reproject")
-    height_unit: Text | None = Field(None, alias="flexroad:height_unit")
-    sublayer: Text | None = Field(None, alias="flexroad:sublayer")
-
-
-class _Assets(_Schema):
-    dsm: _Asset | None = None
-    dtm: _Asset | None = None
-    road_height: _Asset | None = None
-    dop: _Asset | None = None
-    road_mask: _Asset | None = None
-    reference: _Asset | None = None
-    reference_road: _Asset | None = None
-    bridges: _Asset | None = None
-    roads: _Asset | None = None
-
-
-class _Properties(_Schema):
-    datetime: Any
-    code: Text | None = Field(None, alias="proj:code")
-    wkt2: Text | None = Field(None, alias="proj:wkt2")
-    shape: list[int] = Field(alias="proj:shape", min_length=2, max_length=2)
-    transform: list[Number] = Field(alias="proj:transform", min_length=6, max_length=9)
-    # Older catalogs do not have all of these fields.
-    root: Text | None = Field(None, alias="flexroad:root")
-    datetime_assumed: bool | None = Field(None, alias="flexroad:datetime_assumed")
-    stratum: Label | None = Field(None, alias="flexroad:stratum")
-    dataset: Label | None = Field(None, alias="flexroad:dataset")
-
-
-class _Entry(_Schema):
-    assets: _Assets
-    properties: _Properties
+WORDS = {dict: "not an object", list: "not a list", bool: "neither true nor false"}
+"""What a value of another type is."""
+PROPERTIES = "properties."
 
 
 class _Names(dict[str, str]):
     """The names of files of a catalog: neighbouring tiles list the same files, so each is checked once."""
 
     def __missing__(self, name: str) -> str:
-        if not _is_text(name):
-            raise TypeError
+        if type(name) is not str or not _is_unicode(name):
+            raise CatalogError(f"{shown(name)} is not a text in Unicode")
         if not name or "\0" in name:
             raise CatalogError(f"{shown(name)} is not the name of a file")
         self[name] = name
@@ -114,7 +57,7 @@ class _Names(dict[str, str]):
 class TileReader:
     """Makes the tiles of a catalog's entries.
 
-    Types are checked by hand, which is several times as fast as pydantic; the schema then names the mistake.
+    Values are checked by hand, which is several times as fast as pydantic.
 
     Parameters
     ----------
@@ -172,11 +115,12 @@ class TileReader:
             tile_id = entry["id"]
             if known := _known_fault(entry):
                 return faulty(tile_id, known, self._folder)
-            return self._usable(tile_id, entry["properties"], entry["assets"])
+            return self._usable(tile_id, _field(entry, "properties", dict), _field(entry, "assets", dict))
         except CatalogError as error:
             reason = str(error)
         except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-            reason = _mistake(entry) or repr(error)
+            # No mistake that is known, but one entry must not cost the others.
+            reason = repr(error)
         fault = f"{self._kind} {number} of {self._file}: {printable(reason)[:MAX_MESSAGE]}; "
         return faulty(tile_id, fault + "correct it, or make the catalog again", self._folder)
 
@@ -189,42 +133,52 @@ class TileReader:
             grid=grid,
             layers=layers,
             root=self._root(properties) or self._folder,
-            datetime=_date(properties["datetime"]),
-            datetime_assumed=_assumed(properties),
+            datetime=_date(properties),
+            datetime_assumed=bool(_optional(properties, "flexroad:datetime_assumed", bool, PROPERTIES)),
             stratum=_label(properties, "flexroad:stratum"),
             dataset=_label(properties, "flexroad:dataset"),
             nearby=nearby,
             allowed=self._allowed,
         )
 
-    def _layer(self, name: str, asset: dict[str, Any]) -> Layer:
-        names, values, system = asset["flexroad:files"], asset["flexroad:values"], asset.get("flexroad:crs")
-        if type(names) is not list or not names or type(values) is not list:
-            raise TypeError
-        if values and not all(type(value) is int and -(2**31) <= value < 2**32 for value in values):
-            raise TypeError
+    def _layer(self, name: str, asset: Any) -> Layer:
+        _typed(asset, f"assets.{name}", dict)
         try:
+            names = _field(asset, "flexroad:files", list)
+            if not names:
+                raise CatalogError("flexroad:files: it is empty")
+            values = _field(asset, "flexroad:values", list)
+            if not all(type(value) is int and -(2**31) <= value < 2**32 for value in values):
+                raise CatalogError(f"flexroad:values: {shown(values)} are not values of a raster")
+            system = _optional(asset, "flexroad:crs", str)
             if system is not None:
                 _check_crs(system, "flexroad:crs")
-            files = self._files(names)
-            extents = _extents(asset, len(names))
-            reproject, unit = _conversion(asset)
-            return Layer(name, files, tuple(values), system, extents, reproject, _sublayer(asset), unit)
+            return Layer(
+                name,
+                self._named(names, "flexroad:files"),
+                tuple(values),
+                system,
+                _extents(asset, len(names)),
+                bool(_optional(asset, "flexroad:reproject", bool)),
+                _optional(asset, "flexroad:sublayer", str),
+                _height_unit(asset),
+            )
         except CatalogError as error:
             raise CatalogError(f"assets.{name}.{error}") from error
 
-    def _files(self, names: list[str]) -> tuple[str, ...]:
+    def _named(self, names: list[Any], field: str) -> tuple[str, ...]:
+        """Return the names of files or folders in a field, checked."""
         try:
             return tuple(map(self._names.__getitem__, names))
         except CatalogError as error:
-            raise CatalogError(f"flexroad:files: {error}") from error
+            raise CatalogError(f"{field}: {error}") from error
+        except TypeError as error:
+            # A list or an object.
+            raise CatalogError(f"{field}: {shown(names)} is not a list of texts") from error
 
     def _root(self, properties: dict[str, Any]) -> str:
-        root: str | None = properties.get("flexroad:root")
-        try:
-            return self._names[root] if root else ""
-        except CatalogError as error:
-            raise CatalogError(f"properties.flexroad:root: {error}") from error
+        root = properties.get("flexroad:root")
+        return self._named([root], "properties.flexroad:root")[0] if root else ""
 
 
 def _known_fault(entry: dict[str, Any]) -> str:
@@ -234,17 +188,54 @@ def _known_fault(entry: dict[str, Any]) -> str:
     return printable(fault)[: 2 * MAX_MESSAGE] if isinstance(fault, str) else ""
 
 
+def _field(fields: dict[str, Any], name: str, kind: type, place: str = "") -> Any:
+    """Return a field's value; raise an error that names it if it is missing or of another type."""
+    value = fields.get(name)
+    if type(value) is kind and kind is not str:
+        return value
+    if name not in fields:
+        raise CatalogError(f"{place}{name}: missing")
+    return _typed(value, place + name, kind)
+
+
+def _optional(fields: dict[str, Any], name: str, kind: type, place: str = "") -> Any:
+    """Return a field's value, None if it has none: older catalogs do not have all fields."""
+    return None if fields.get(name) is None else _field(fields, name, kind, place)
+
+
+def _typed(value: Any, name: str, kind: type) -> Any:
+    """Return the value; raise an error that names the field if the value is of another type."""
+    if kind is str:
+        if type(value) is not str:
+            raise CatalogError(f"{name}: {shown(value)} is not a text")
+        if not _is_unicode(value):
+            raise CatalogError(f"{name}: {shown(value)} is not a text in Unicode")
+    elif type(value) is not kind:
+        raise CatalogError(f"{name}: {shown(value)} is {WORDS[kind]}")
+    return value
+
+
+def _is_unicode(text: str) -> bool:
+    """Return whether a text has no lone surrogates."""
+    try:
+        return text.isascii() or bool(text.encode())
+    except UnicodeEncodeError:
+        return False
+
+
 def _grid(properties: dict[str, Any]) -> Grid:
     field = "proj:code" if properties.get("proj:code") else "proj:wkt2"
-    system = properties.get(field)
+    system = _optional(properties, field, str, PROPERTIES)
     if not system:
         raise CatalogError("proj:code: missing, and proj:wkt2 as well")
     _check_metric(system, field)
-    cell, west, north = _placed(properties["proj:transform"])
-    shape = properties["proj:shape"]
+    cell, west, north = _placed(_field(properties, "proj:transform", list, PROPERTIES))
+    shape = _field(properties, "proj:shape", list, PROPERTIES)
+    if len(shape) != 2:
+        raise CatalogError(f"properties.proj:shape: {shown(shape)} are not two numbers")
     height, width = shape
     if type(height) is not int or type(width) is not int:
-        raise TypeError
+        raise CatalogError(f"properties.proj:shape: {shown(shape)} are not whole numbers")
     if width < 1 or height < 1:
         raise CatalogError(f"proj:shape: {shown(shape)} is not at least one cell")
     if width * height > MAX_CELLS:
@@ -257,12 +248,16 @@ def _grid(properties: dict[str, Any]) -> Grid:
 
 def _placed(transform: list[Any]) -> tuple[float, float, float]:
     """Return cell size, west and north of a transform (m)."""
-    if type(transform) is not list or not 6 <= len(transform) <= 9:
-        raise TypeError
-    if not set(map(type, transform)) <= {float, int} or not all(map(math.isfinite, transform)):
-        raise TypeError
-    # JSON may hold whole numbers; fingerprints are of the text of numbers.
-    cell, row_turn, west, column_turn, down, north = map(float, transform[:6])
+    if not 6 <= len(transform) <= 9 or not set(map(type, transform)) <= {float, int}:
+        raise CatalogError(f"properties.proj:transform: {shown(transform)} are not six numbers")
+    try:
+        # JSON may hold whole numbers; fingerprints are of the text of numbers.
+        numbers = list(map(float, transform))
+    except OverflowError:
+        numbers = [math.inf]
+    if not all(map(math.isfinite, numbers)):
+        raise CatalogError(f"properties.proj:transform: {shown(transform)} are not finite numbers")
+    cell, row_turn, west, column_turn, down, north = numbers[:6]
     if row_turn or column_turn:
         raise CatalogError(f"proj:transform: {shown(transform)} is rotated")
     if not MIN_CELL_M <= cell <= MAX_CELL_M:
@@ -275,8 +270,6 @@ def _placed(transform: list[Any]) -> tuple[float, float, float]:
 
 @lru_cache(maxsize=256)
 def _check_crs(text: str, field: str) -> None:
-    if not _is_text(text):
-        raise TypeError
     if "\0" in text:
         # PROJ reads the text before it.
         raise CatalogError(f"{field}: unknown CRS {shown(text)}")
@@ -294,7 +287,10 @@ def _check_metric(text: str, field: str) -> None:
         raise CatalogError(f"{field}: {crs.short(text)} is in {unit}, not in metres")
 
 
-def _date(value: Any) -> datetime:
+def _date(properties: dict[str, Any]) -> datetime:
+    if "datetime" not in properties:
+        raise CatalogError("properties.datetime: missing")
+    value = properties["datetime"]
     try:
         date = value if isinstance(value, datetime) else datetime.fromisoformat(value)
         date = (date if date.tzinfo else date.replace(tzinfo=UTC)).astimezone(UTC)
@@ -305,21 +301,11 @@ def _date(value: Any) -> datetime:
     return date
 
 
-def _assumed(properties: dict[str, Any]) -> bool:
-    assumed = properties.get("flexroad:datetime_assumed")
-    if assumed is not None and type(assumed) is not bool:
-        raise TypeError
-    return bool(assumed)
-
-
 def _label(properties: dict[str, Any], name: str) -> str:
-    # Older catalogs do not have all of these fields.
-    text = properties.get(name)
-    if text is None:
-        return ""
-    if not _is_text(text) or len(text) > MAX_LABEL:
-        raise TypeError
-    return str(text)
+    text: str = _optional(properties, name, str, PROPERTIES) or ""
+    if len(text) > MAX_LABEL:
+        raise CatalogError(f"properties.{name}: {shown(text)} has more than {MAX_LABEL} characters")
+    return text
 
 
 def _extents(asset: dict[str, Any], files: int) -> tuple[Bounds, ...]:
@@ -346,46 +332,9 @@ def _unpacked(edges: bytes) -> tuple[Bounds, ...]:
     return tuple(struct.iter_unpack("=4d", edges))
 
 
-def _conversion(asset: dict[str, Any]) -> tuple[bool, str | None]:
-    """Return whether files are reprojected, and the unit of their heights if they declare none."""
-    # Older catalogs do not have these fields.
-    reproject, unit = asset.get("flexroad:reproject"), asset.get("flexroad:height_unit")
-    if reproject is not None and type(reproject) is not bool:
-        raise TypeError
-    if unit is not None and type(unit) is not str:
-        raise TypeError
+def _height_unit(asset: dict[str, Any]) -> str | None:
+    """Return the unit of heights of files that declare none."""
+    unit: str | None = _optional(asset, "flexroad:height_unit", str)
     if unit is not None and unit not in HEIGHT_UNITS:
         raise CatalogError(f"flexroad:height_unit: {shown(unit)} is not one of {', '.join(HEIGHT_UNITS)}")
-    return bool(reproject), unit
-
-
-def _sublayer(asset: dict[str, Any]) -> str | None:
-    # Older catalogs do not have this field.
-    name = asset.get("flexroad:sublayer")
-    if name is not None and not _is_text(name):
-        raise TypeError
-    return name
-
-
-def _is_text(value: Any) -> bool:
-    """Return whether a value is a text without lone surrogates."""
-    if type(value) is not str:
-        return False
-    try:
-        return value.isascii() or bool(value.encode())
-    except UnicodeEncodeError:
-        return False
-
-
-def _mistake(entry: Any) -> str:
-    """Return field and reason of the first value that the schema does not accept, ``""`` if there is none."""
-    try:
-        _Entry.model_validate(entry)
-    except ValidationError as errors:
-        error = errors.errors(include_url=False)[0]
-        field, kind = ".".join(map(str, error["loc"])), error["type"]
-        if kind == "missing":
-            return f"{field}: missing"
-        reason = f" is {WORDS[kind]}" if kind in WORDS else f": {error['msg'][:1].lower()}{error['msg'][1:]}"
-        return f"{field}: {shown(error['input'])}{reason}"
-    return ""
+    return unit
