@@ -44,16 +44,10 @@ def write_comparison(
     ----------
     run : Run
         A run with variants named as in configs/ablation.yaml; missing variants are left out.
-    true : Run, optional
-        The same run with ``evaluate.classes: reference``.
     folder : Path
         Folder for the files.
-    dsc3d : Run, optional
-        A run over DSC3D or its stand-in, for the DSC3D rows.
-    dsc3d_true : Run, optional
-        A run over the same scenes, measured against the true surface.
-    literal : Run, optional
-        A run with configs/literal.yaml over the same tiles or some of them, for a second column.
+    true, dsc3d, dsc3d_true, literal : Run, optional
+        The runs that `collect` takes.
 
     Raises
     ------

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_vector import ERRORS
@@ -32,22 +31,6 @@ MAX_POINTS = 10_000_000
 """Largest number of points of the profiles of one command: their table takes gigabytes."""
 MILLIMETRES = ("distance_m", "easting", "northing")
 """Columns that are written with three decimals; other numbers have nine digits."""
-
-
-@dataclass(frozen=True, eq=False)
-class Stations:
-    """n points along lines, in equal steps from the start of each line, and at its end."""
-
-    line: NDArray[np.intp]
-    """``(n,)``, number of the line, from 1."""
-    distance: Floats
-    """``(n,)``, distance from the start of the line in plan (m)."""
-    easting: Floats
-    northing: Floats
-    """``(n,)``, m."""
-    direction: Floats
-    """``(n, 2)``, unit vectors: east and north components of the line's direction; at a vertex that of the
-    part that begins there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,19 +150,21 @@ def along_lines(ground: Ground, lines: list[Floats], step_m: float) -> AnswerTab
         If there are too many points, or a result of a tile is missing.
     """
     points = stations(lines, step_m)
-    answer = ground.at(points.easting, points.northing)
+    easting, northing = points.easting.to_numpy(), points.northing.to_numpy()
+    answer = ground.at(easting, northing)
     # A normal is (-dz/dx, -dz/dy, 1), scaled to length 1.
-    slope = -(answer.normal[:, :2] * points.direction).sum(axis=1) / answer.normal[:, 2]
-    place = {"distance_m": points.distance, "easting": points.easting, "northing": points.northing}
-    heights = {"height_m": answer.height, "grade_percent": 100 * slope}
-    table = pd.DataFrame(place | heights | _columns(answer))
-    if len(lines) > 1:
-        table.insert(0, "line", points.line)
-    return AnswerTable(table, points.easting, points.northing, crs_of(ground), answer)
+    slope = -(answer.normal[:, :2] * points[["east", "north"]].to_numpy()).sum(axis=1) / answer.normal[:, 2]
+    table = points.drop(columns=["east", "north"] if len(lines) > 1 else ["line", "east", "north"])
+    columns = _columns(answer)
+    table = table.assign(height_m=columns.pop("height_m"), grade_percent=100 * slope, **columns)
+    return AnswerTable(table, easting, northing, crs_of(ground), answer)
 
 
-def stations(lines: list[Floats], step_m: float) -> Stations:
+def stations(lines: list[Floats], step_m: float) -> pd.DataFrame:
     """Return the points every ``step_m`` along lines, and at the end of each.
+
+    The columns are line (from 1), distance_m (in plan, from the start of the line), easting, northing (m),
+    and east, north: the unit vector of the line's direction, at a vertex that of the part that begins there.
 
     Raises
     ------
@@ -192,8 +177,11 @@ def stations(lines: list[Floats], step_m: float) -> Stations:
         raise ConfigError(f"--step {step_m:g}: about {count(round(number), 'point')}; at most {MAX_POINTS}")
     parts = [_along(line, step_m) for line in lines]
     numbers = np.repeat(np.arange(1, len(parts) + 1), [len(part) for part in parts])
-    distance, easting, northing, east, north = np.concatenate(parts).T
-    return Stations(numbers, distance, easting, northing, np.column_stack([east, north]))
+    table = pd.DataFrame(
+        np.concatenate(parts), columns=["distance_m", "easting", "northing", "east", "north"]
+    )
+    table.insert(0, "line", numbers)
+    return table
 
 
 def _along(line: Floats, step_m: float) -> Floats:
