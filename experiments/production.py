@@ -27,7 +27,6 @@ import laspy
 import numpy as np
 import pandas as pd
 import rasterio
-from filter import NOISE_M, PAVED, Case, with_scars
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
@@ -44,6 +43,9 @@ TILES, SEED = 4, 1
 OVER_M = 2.0
 """A road cell counts as hidden if the DSM is this much above the true road (m)."""
 BLOCK_M = 50
+NOISE_M, SCAR_M, SCAR_SHARE_M2 = 0.1, 0.5, 2500
+"""Degraded DTM: white noise (m), depth of a scar (m), area per scar (m2)."""
+PAVED = 1
 FOOT_M = 0.3048
 CHAINS = {name: load_config(name).chains["flexroad"] for name in ("paper", "production")}
 
@@ -169,19 +171,25 @@ def write_degraded(folder: Path, patterns: dict[str, str]) -> None:
     with rasterio.open(paths["dtm"]) as raster:
         profile = {**raster.profile, "driver": "GTiff", "dtype": "float64", "nodata": -9999.0}
     dsm, dtm, canopy = (_read(paths[layer]) for layer in ("dsm", "dtm", "canopy"))
-    scarred = with_scars(_as_case(dtm), np.random.default_rng(0))
+    scarred = with_scars(dtm, np.random.default_rng(0))
     with_canopies = np.fmax(dsm, dtm + np.nan_to_num(canopy))
     for name, heights in (("spoiled_dsm.tif", with_canopies), ("spoiled_dtm.tif", scarred)):
         with rasterio.open(folder / name, "w", **profile) as raster:
             raster.write(np.nan_to_num(heights, nan=-9999.0), 1)
 
 
-def _as_case(dtm: Floats) -> Case:
-    from flexroad.catalog import Grid
-
-    grid = Grid("EPSG:25832", 0.0, float(dtm.shape[0]), 1.0, dtm.shape[1], dtm.shape[0])
-    nothing = np.zeros(dtm.shape, bool)
-    return Case(TileData("", grid, grid, dtm, dtm), RoadMask(grid, grid, nothing, nothing), nothing)
+def with_scars(dtm: Floats, rng: np.random.Generator) -> Floats:
+    """Return a DTM with noise and with tilted, shifted patches of 8 to 20 m, as left by removed houses."""
+    dtm = dtm + NOISE_M * rng.standard_normal(dtm.shape)
+    row, col = np.indices(dtm.shape)
+    for _ in range(dtm.size // SCAR_SHARE_M2):
+        i, j = rng.uniform(0, 1, 2) * dtm.shape
+        turn, (length, width) = rng.uniform(0, np.pi), rng.uniform(4, 10, 2)
+        u = (col - j) * np.cos(turn) + (row - i) * np.sin(turn)
+        v = (row - i) * np.cos(turn) - (col - j) * np.sin(turn)
+        off = rng.normal(0, SCAR_M) + rng.normal(0, SCAR_M / 2) * u / length
+        dtm += np.where((np.abs(u) < length) & (np.abs(v) < width), off, 0)
+    return dtm
 
 
 def _read(path: Path) -> Floats:
