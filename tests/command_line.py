@@ -1,7 +1,6 @@
 """The command line, run in this process or in a new one."""
 
 import contextlib
-import functools
 import io
 import os
 import signal
@@ -13,7 +12,6 @@ from typing import NamedTuple
 from unittest import mock
 
 import pytest
-import typer
 
 from flexroad.pipeline.cli.main import main
 
@@ -23,8 +21,6 @@ FORKED_S = 600
 """Longest time of a function in a copy of this process (s)."""
 RAISED = 99
 """Exit code of a copy of this process in which the function raised an error."""
-built = functools.cache(typer.main.get_command)
-"""The commands of an app, which each call of it would build anew: that takes longer than many a command."""
 
 
 class Said(NamedTuple):
@@ -64,7 +60,6 @@ def call(*words) -> Said:
     out, err = io.StringIO(), io.StringIO()
     with (
         same_signals(),
-        mock.patch("typer.main.get_command", built),
         mock.patch.object(sys, "argv", ["flexroad", *map(str, words)]),
         mock.patch.dict(os.environ, COLUMNS="200"),
         contextlib.redirect_stdout(out),

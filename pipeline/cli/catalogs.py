@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog import Catalog, CatalogError
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.text import count
+from flexroad.catalog.tiling import Conversion, TilingResult
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.check.catalog import check
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.command import MIN_COVER_HELP, Command
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.graph.layers import fitting_config
 
-if TYPE_CHECKING:
-    from flexroad.catalog.tiling import TilingResult
-
-catalogs = typer.Typer(no_args_is_help=True, help="Make, show and check catalogs of tiles.")
+app = group("catalog", "Make, show and check catalogs of tiles.")
 
 Output = Annotated[
     Path,
@@ -69,7 +73,7 @@ MinCover = Annotated[
         min=0,
         max=1,
         metavar="SHARE",
-        help=MIN_COVER_HELP,
+        help=options.MIN_COVER_HELP,
         rich_help_panel=options.TILES,
     ),
 ]
@@ -84,7 +88,7 @@ Strict = Annotated[
 Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
 
 
-@catalogs.command("rasters", cls=Command)
+@app.command("rasters", cls=Command)
 def catalog_rasters(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters.")],
     dsm: Annotated[str, _files("Surface model: 'dsm/*.tif' in ROOT, or '/data/dsm/*.tif'.")],
@@ -122,9 +126,6 @@ def catalog_rasters(
     strict: Strict = False,
 ) -> None:
     """Cut folders of GeoTIFF, ASC, XYZ or VRT into tiles."""
-    from flexroad.catalog.sources import rasters
-    from flexroad.catalog.tiling import Conversion
-
     patterns = {
         "dsm": dsm,
         "dtm": dtm,
@@ -150,7 +151,7 @@ def catalog_rasters(
     _write_catalog(result, output, strict)
 
 
-@catalogs.command("nrw", cls=Command)
+@app.command("nrw", cls=Command)
 def catalog_nrw(
     root: Annotated[
         Path,
@@ -172,8 +173,6 @@ def catalog_nrw(
 
     Files keep their original names, such as dom1_32_356_5699_1_nw_2020.tif, dgm1, dop, 3dm.
     """
-    from flexroad.catalog.sources import nrw
-
     result = nrw.index(
         root,
         road_mask=road_mask,
@@ -190,7 +189,7 @@ def catalog_nrw(
     _write_catalog(result, output, strict)
 
 
-@catalogs.command("gerod", cls=Command)
+@app.command("gerod", cls=Command)
 def catalog_gerod(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of the paper's GeRoD dataset.")],
     output: Output,
@@ -199,14 +198,11 @@ def catalog_gerod(
     strict: Strict = False,
 ) -> None:
     """List the tiles of the GeRoD dataset."""
-    from flexroad.catalog.sources import templates
-    from flexroad.pipeline.config.loading import load_config
-
     result = templates.index(root, load_config(layout).dataset, templates.GEROD, date=date)
     _write_catalog(result, output, strict, layout)
 
 
-@catalogs.command("dsc3d", cls=Command)
+@app.command("dsc3d", cls=Command)
 def catalog_dsc3d(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder of rasters of DSC3D's scenes.")],
     output: Output,
@@ -215,16 +211,11 @@ def catalog_dsc3d(
     strict: Strict = False,
 ) -> None:
     """List the scenes of the DSC3D dataset, one tile each."""
-    from flexroad.catalog.sources import templates
-    from flexroad.pipeline.config.loading import load_config
-
     result = templates.index(root, load_config(layout).dataset, templates.DSC3D, date=date)
     _write_catalog(result, output, strict, layout)
 
 
 def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str | None = None) -> None:
-    from flexroad.catalog import Catalog, CatalogError
-
     for note in result.notes:
         echo(f"note: {note}", err=True)
     for line in result.left_out:
@@ -241,7 +232,7 @@ def _write_catalog(result: TilingResult, output: Path, strict: bool, config: str
         raise typer.Exit(1)
 
 
-@catalogs.command("synthetic", cls=Command)
+@app.command("synthetic", cls=Command)
 def catalog_synthetic(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write.")],
     preset: Annotated[
@@ -261,19 +252,14 @@ def catalog_synthetic(
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""
-    from flexroad.catalog import Catalog
-    from flexroad.pipeline.benchmark.scenes import write_scenes
-
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
     echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 
 
-@catalogs.command("show", cls=Command)
+@app.command("show", cls=Command)
 def catalog_show(path: options.CatalogFile) -> None:
     """List the tiles of a catalog."""
-    from flexroad.catalog import Catalog
-
     catalog = Catalog.read(path)
     for tile in catalog.tiles:
         if tile.fault:
@@ -287,7 +273,7 @@ def catalog_show(path: options.CatalogFile) -> None:
     echo(f"{count(len(catalog.tiles), 'tile')}, {', '.join(crs[:60] for crs in systems)}")
 
 
-@catalogs.command("check", cls=Command)
+@app.command("check", cls=Command)
 def catalog_check(
     path: options.CatalogFile,
     config: Annotated[
@@ -304,11 +290,6 @@ def catalog_check(
 
     Prints layers, what would fail in a run, and the shift between photo and heights.
     """
-    from flexroad.catalog import Catalog
-    from flexroad.pipeline.check.catalog import check
-    from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.graph.layers import fitting_config
-
     catalog, faults = Catalog.read(path, allow or ()), 0
     for remark in check(catalog, load_config(config or fitting_config(catalog))):
         echo(f"warning: {remark.text}" if remark.fault else remark.text)

@@ -7,12 +7,22 @@ from typing import Annotated
 
 import typer
 
+from flexroad.catalog.storage.paths import absolute, parse_location
+from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.pipeline.run.record import Run, check_links
+from flexroad.pipeline.run.store_users import runs_using, unregister
+
+app = group()
 
 
+@app.command(cls=Command)
 def clean(
     path: options.Run,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files, delete nothing.")] = False,
@@ -26,12 +36,6 @@ def clean(
 
     These are unused stage results, files of removed tiles and products, and temporary files.
     """
-    from flexroad.catalog.storage.paths import absolute, parse_location
-    from flexroad.catalog.storage.scratch import abandoned, remove_abandoned
-    from flexroad.pipeline.run.garbage import MEANING, delete, exclusive, find_garbage
-    from flexroad.pipeline.run.lock import run_lock
-    from flexroad.pipeline.run.record import Run, check_links
-    from flexroad.pipeline.run.store_users import runs_using, unregister
 
     def say(line: str) -> None:
         echo(f"note: {line}", err=True)

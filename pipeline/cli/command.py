@@ -1,4 +1,4 @@
-"""Typer command class: options with several values, help pages with headings, a notification if invalid."""
+"""Typer command class: options with several values, help pages with headings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from flexroad.pipeline.cli.lifecycle import notify_invalid_command
 from flexroad.pipeline.cli.options import HEADINGS
 
 OTHERS = "Options"
@@ -21,7 +20,10 @@ RANGES = (
 MAX_NAME = 30
 """Longest name of an option, with its values, beside which a help page writes the meaning."""
 
-MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
+
+def group(name: str | None = None, help: str | None = None) -> typer.Typer:
+    """Return what a module registers its commands with: a group of the program if it has a name."""
+    return typer.Typer(name=name, help=help, no_args_is_help=True, rich_markup_mode=None)
 
 
 def _in_words(text: str) -> str:
@@ -39,15 +41,7 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words of a command line."""
-        try:
-            return super().parse_args(ctx, self._repeated(args))
-        except typer.TyperException:
-            # Resilient parsing returns the valid options and raises nothing.
-            lenient = {"resilient_parsing": True, "ignore_unknown_options": True}
-            params = self.make_context(ctx.info_name, [*args], ctx.parent, **lenient).params
-            if target := params.get("on_failure"):
-                notify_invalid_command(params.get("out") or params.get("path"), target)
-            raise
+        return super().parse_args(ctx, self._repeated(args))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments and options of the help page, by their `rich_help_panel`.

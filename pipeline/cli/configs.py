@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated
 
 import typer
+import yaml
 
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.command import Command
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, echo_document
+from flexroad.pipeline.config.loading import load_config, shipped
+from flexroad.pipeline.config.schema import schema, template
 
-configs = typer.Typer(no_args_is_help=True, help="Show configurations.")
+app = group("config", "Show configurations.")
 
 
-@configs.command("show", cls=Command)
+@app.command("show", cls=Command)
 def config_show(
     name: Annotated[
         str | None,
@@ -24,10 +28,6 @@ def config_show(
     settings: options.Settings = None,
 ) -> None:
     """Show every option of every variant of a configuration."""
-    import yaml
-
-    from flexroad.pipeline.config.loading import load_config, shipped
-
     if name is None:
         for shipped_name, path in shipped().items():
             echo(f"{shipped_name:10} {path.read_text().splitlines()[0].lstrip('# ')}")
@@ -41,19 +41,13 @@ def config_show(
     echo_document(yaml.safe_dump({**sections, "variants": chains}, sort_keys=False))
 
 
-@configs.command("template")
+@app.command("template")
 def config_template() -> None:
     """Print every option with its default and its meaning."""
-    from flexroad.pipeline.config.schema import template
-
     echo_document(template())
 
 
-@configs.command("schema")
+@app.command("schema")
 def config_schema() -> None:
     """Print the JSON schema of a configuration, for editors."""
-    import json
-
-    from flexroad.pipeline.config.schema import schema
-
     echo_document(json.dumps(schema(), indent=1))

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from rich.console import Console
 
+from flexroad.catalog.area import Area
+from flexroad.catalog.ellipsoidal import Datum
+from flexroad.catalog.storage.paths import Location, parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.lifecycle import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.export.driver import check_formats
+from flexroad.pipeline.export.driver import export as write
+from flexroad.pipeline.export.source import Options, select
+from flexroad.pipeline.run.progress import StepProgress
 
-if TYPE_CHECKING:
-    from flexroad.catalog.ellipsoidal import Datum
-    from flexroad.catalog.storage.paths import Location
+app = group()
 
 
+@app.command(cls=Command)
 def export(
     path: options.Run,
     formats: Annotated[
@@ -115,15 +124,6 @@ def export(
 
     The same command goes on after an interruption. FOLDER/export.json says what was written.
     """
-    from rich.console import Console
-
-    from flexroad.catalog.storage.paths import parse_location
-    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-    from flexroad.pipeline.export.driver import check_formats
-    from flexroad.pipeline.export.driver import export as write
-    from flexroad.pipeline.export.source import Options, select
-    from flexroad.pipeline.run.progress import StepProgress
-
     datum = _datum(vertical, geoid, height_offset)
     if roads_layer and not roads:
         raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
@@ -141,7 +141,7 @@ def export(
                 tile or (),
                 bbox,
                 allow=[str(place) for place in allow or ()],
-                area=options.read_area(area, area_layer),
+                area=Area.read(area, area_layer) if area else None,
                 track=track,
             )
             if source.left_out:
@@ -171,8 +171,6 @@ def _note(line: str) -> None:
 
 
 def _datum(vertical: str | None, geoid: Path | None, offset: float | None) -> Datum | None:
-    from flexroad.catalog.ellipsoidal import Datum
-
     given = {
         "crs": vertical,
         "geoid": None if geoid is None else str(geoid),

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import shlex
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from flexroad.pipeline.check.downloads import MAX_FILES, Download, Proposal, look, proposals
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from flexroad.pipeline.check.downloads import Download, Proposal
+app = group()
 
 MAX_SHOWN = 5
 """Number of files of a kind that are described."""
@@ -37,6 +37,7 @@ TITLES = {
 """Heading of each kind of download, in the order shown."""
 
 
+@app.command(cls=Command)
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of downloads.")] = Path(),
     write: Annotated[
@@ -48,8 +49,6 @@ def init(
 
     Asks what is unclear. The commands make a catalog of the files and run it.
     """
-    from flexroad.pipeline.check.downloads import MAX_FILES, look, proposals
-
     found, more = look(folder)
     if more:
         echo(f"note: only the first {MAX_FILES} files of {folder} were looked at; name a smaller folder")

@@ -9,22 +9,22 @@ import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import typer
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.storage.paths import Location, absolute
 from flexroad.catalog.text import count
+from flexroad.pipeline.cli.command import Command
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
-
-if TYPE_CHECKING:
-    from flexroad.pipeline.run.prometheus import Textfile
-    from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.run.alerts import notify
+from flexroad.pipeline.run.prometheus import Textfile
+from flexroad.pipeline.run.summary import Summary, read_summary
 
 CANNOT_START = 2
 INTERRUPTED = 130
-ON_FAILURE = "FLEXROAD_ON_FAILURE"
-"""Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
 
 
 @dataclass
@@ -66,8 +66,6 @@ def report_outcome(run: Location, on_failure: str | None, prometheus: Path | Non
     ConfigError
         If the file for Prometheus cannot be written.
     """
-    from flexroad.pipeline.run.summary import read_summary
-
     before = read_summary(run)
     outcome = Outcome()
     with signals_interrupt(), contextlib.ExitStack() as stack:
@@ -87,10 +85,22 @@ def report_outcome(run: Location, on_failure: str | None, prometheus: Path | Non
                 outcome.textfile.ended(outcome.exit_code, outcome.summary)
 
 
-def notify_invalid_command(run: Path | None, target: str) -> None:
-    """Notify the operator that the command line of a run is invalid."""
-    text = "the command line could not be read; `flexroad run --help` shows it"
-    _notify(Outcome(CANNOT_START, text), run or Path(), {}, target)
+class RunCommand(Command):
+    """A command with --on-failure, which also gets a notification if the command line is invalid."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words of a command line."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.TyperException:
+            # Resilient parsing returns the valid options and raises nothing.
+            lenient = {"resilient_parsing": True, "ignore_unknown_options": True}
+            params = self.make_context(ctx.info_name, [*args], ctx.parent, **lenient).params
+            if target := params.get("on_failure"):
+                text = "the command line could not be read; `flexroad run --help` shows it"
+                run = params.get("out") or params.get("path") or Path()
+                _notify(Outcome(CANNOT_START, text), run, {}, target)
+            raise
 
 
 @contextlib.contextmanager
@@ -122,8 +132,6 @@ def signals_interrupt() -> Iterator[None]:
 def _textfile(stack: contextlib.ExitStack, run: Location, path: Path | None) -> Textfile | None:
     if path is None:
         return None
-    from flexroad.pipeline.run.prometheus import Textfile
-
     try:
         return stack.enter_context(Textfile(path, str(absolute(run))))
     except OSError as error:
@@ -141,9 +149,6 @@ def _notify(outcome: Outcome, run: Location, before: dict[str, Any], target: str
     """Send the outcome to the target if the exit code is not 0."""
     if not target or not outcome.exit_code:
         return
-    from flexroad.pipeline.run.alerts import notify
-    from flexroad.pipeline.run.summary import read_summary
-
     after = read_summary(run)
     message = {
         # Chat services show this key.

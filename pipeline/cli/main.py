@@ -2,31 +2,67 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
+import importlib.metadata
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.text import one_line
 from flexroad.pipeline.cli import limits
-from flexroad.pipeline.cli.catalogs import catalogs
-from flexroad.pipeline.cli.clean import clean
-from flexroad.pipeline.cli.command import Command
-from flexroad.pipeline.cli.configs import configs
-from flexroad.pipeline.cli.export import export
-from flexroad.pipeline.cli.init import init
-from flexroad.pipeline.cli.prepare import prepare
-from flexroad.pipeline.cli.query import query
-from flexroad.pipeline.cli.results import figures, report, tables
-from flexroad.pipeline.cli.run import rerun, run, status
 from flexroad.pipeline.cli.stdio import echo
-from flexroad.pipeline.cli.train import train
-from flexroad.pipeline.cli.view import view
 from flexroad.pipeline.errors import ConfigError
 
+COMMANDS = {
+    "init": ("init", "Say what a folder of downloads has, and which commands fit."),
+    "run": ("run", "Bring every tile of a run up to date."),
+    "rerun": ("run", "Bring tiles of a run up to date again."),
+    "status": ("run", "Show the state of a run and the failures of its tiles."),
+    "clean": ("clean", "Delete files that no run needs."),
+    "report": ("results", "Write a report on a run: failures, places, figures."),
+    "query": ("query", "Print heights, normals and classes at points or along lines."),
+    "export": ("export", "Write finished tiles in the formats of other programs."),
+    "view": ("view", "Write a run as a page for browsers: map and surface in 3D."),
+    "tables": ("results", "Write the paper's tables and claims beside the values of a run."),
+    "figures": ("results", "Draw the paper's figures from a run."),
+    "train": ("train", "Train the head of `segment: dinov2` on labelled tiles."),
+    "catalog": ("catalogs", "Make, show and check catalogs of tiles."),
+    "prepare": ("prepare", "Make rasters and a catalog of points, meshes or photographs."),
+    "config": ("configs", "Show configurations."),
+}
+"""The module of each command, whose `app` has it, and the first line of its help."""
+
+
+class Commands(TyperGroup):
+    """The commands of the program; the module of a command is imported when the command is called."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = {name: TyperCommand(name, help=text) for name, (_, text) in COMMANDS.items()}
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, None if there is no such one; the limits of this process suffice for it."""
+        limits.check(cmd_name)
+        return _imported(cmd_name) if cmd_name in COMMANDS else None
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands of the help page, without importing them."""
+        TyperGroup(commands=dict(self.commands)).format_commands(ctx, formatter)
+
+
+@functools.cache
+def _imported(name: str) -> Any:
+    group = typer.main.get_group(importlib.import_module(f"flexroad.pipeline.cli.{COMMANDS[name][0]}").app)
+    return group if group.name == name else group.commands[name]
+
+
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -34,11 +70,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Turn aerial geodata into smooth, light, georeferenced 3D road surfaces, for many tiles at once.",
 )
-app.add_typer(catalogs, name="catalog")
-app.add_typer(prepare, name="prepare")
-app.add_typer(configs, name="config")
-for command in (init, run, rerun, status, clean, report, query, export, view, tables, figures, train):
-    app.command(cls=Command)(command)
 
 
 def main() -> None:
@@ -86,15 +117,11 @@ def _reason(error: Exception) -> str | None:
 
 @app.callback(invoke_without_command=True)
 def _root(
-    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
 ) -> None:
     if version:
-        import importlib.metadata
-
         echo(importlib.metadata.version("flexroad"))
         raise typer.Exit
-    limits.check(context.invoked_subcommand)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,12 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from flexroad.catalog import Catalog
+from flexroad.catalog.allowlist import needed
+from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.graph.layers import fitting_config
+from flexroad.pipeline.run.record import check_inputs
 
 
 def after_catalog(path: Path, config: str | None = None) -> str:
@@ -18,12 +23,6 @@ def after_catalog(path: Path, config: str | None = None) -> str:
     config : str, optional
         The configuration; default: the one for production that fits the catalog's layers.
     """
-    from flexroad.catalog import Catalog
-    from flexroad.catalog.allowlist import needed
-    from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.graph.layers import fitting_config
-    from flexroad.pipeline.run.record import check_inputs
-
     catalog = Catalog.read(path)
     name = config or fitting_config(catalog)
     settings = load_config(name)

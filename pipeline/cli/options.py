@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
-
-from flexroad.pipeline.cli.lifecycle import ON_FAILURE
-from flexroad.pipeline.errors import ConfigError
-
-if TYPE_CHECKING:
-    from flexroad.catalog.area import Area as CatalogArea
 
 INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
 METHOD, VALIDATION = "Method", "Split into training and validation"
@@ -32,17 +26,9 @@ HEADINGS = (
 """In the order of a help page."""
 
 
-def _address(value: str | None) -> str | None:
-    """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
-    from flexroad.pipeline.execute.dask import check_address
-
-    if value is not None:
-        try:
-            check_address(value)
-        except ConfigError as error:
-            raise typer.BadParameter(str(error)) from error
-    return value
-
+ON_FAILURE = "FLEXROAD_ON_FAILURE"
+"""Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
+MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
@@ -87,15 +73,6 @@ MostWorkers = Annotated[
         metavar="N",
         help="At most N worker processes; default: one per core.",
         rich_help_panel=WORK,
-    ),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="A running Dask scheduler: tcp://host:8786, tls://host:8786.",
-        rich_help_panel=WORK,
-        callback=_address,
     ),
 ]
 Executor = Annotated[
@@ -158,16 +135,3 @@ WorkerSettings = Annotated[
         rich_help_panel=WORK,
     ),
 ]
-
-
-def read_area(path: Path | None, layer: str | None) -> CatalogArea | None:
-    """Return the polygons of --area, None without it.
-
-    Raises
-    ------
-    CatalogError
-        If the file has no polygons that can be read.
-    """
-    from flexroad.catalog.area import Area
-
-    return Area.read(path, layer) if path else None

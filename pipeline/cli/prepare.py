@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog.storage.outputs import made_folder
+from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.command import Command
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.prepare_options import (
     Density,
@@ -28,26 +31,26 @@ from flexroad.pipeline.cli.prepare_options import (
     with_common,
 )
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
+from flexroad.pipeline.prepare import mesh, odm, photos, points
+from flexroad.pipeline.prepare import mesh as meshes
 from flexroad.pipeline.prepare.options import PrepareOptions
+from flexroad.pipeline.prepare.output import check_replaced, disk_errors
+from flexroad.pipeline.prepare.raster_writer import PreparedDataset
+from flexroad.pipeline.run.lock import run_lock
+from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
+from flexroad.tasks.acquire.points import ground_filter, morphological
+from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options
+from flexroad.tasks.errors import TaskError
 
-if TYPE_CHECKING:
-    from flexroad.pipeline.execute import Executor
-    from flexroad.pipeline.prepare.raster_writer import PreparedDataset
-    from flexroad.tasks.acquire.points.to_rasters import Options
-
-prepare = typer.Typer(
-    no_args_is_help=True,
-    help="Make rasters and a catalog of points, meshes or photographs.",
-)
+app = group("prepare", "Make rasters and a catalog of points, meshes or photographs.")
 
 
 def _points_options(
     slope: float | None, radius: float | None, fill: float | None, void: float | None, **more: Any
 ) -> Options:
     """Return the options for making rasters of points; None keeps a default."""
-    from flexroad.tasks.acquire.points import ground_filter, morphological
-    from flexroad.tasks.acquire.points.to_rasters import Options
-
     given = _given(slope=slope, radius_m=radius)
     if more.get("ground") == "morphological":
         more["morphological"] = morphological.Options(**given)
@@ -62,8 +65,6 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 def _executor(workers: int | None) -> Executor:
-    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-
     return SerialExecutor() if workers == 1 else DaskExecutor(workers)
 
 
@@ -74,11 +75,6 @@ def _log(line: str) -> None:
 @contextlib.contextmanager
 def _held(out: Path) -> Iterator[None]:
     """Make the output folder, check that it can be written, and hold its lock; no empty one is left."""
-    from flexroad.catalog.storage.outputs import made_folder
-    from flexroad.catalog.storage.paths import check_writable
-    from flexroad.pipeline.prepare.output import check_replaced, disk_errors
-    from flexroad.pipeline.run.lock import run_lock
-
     check_replaced(out)
     with contextlib.ExitStack() as stack:
         with disk_errors(out):
@@ -90,11 +86,6 @@ def _held(out: Path) -> Iterator[None]:
 
 def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
     """Run a command and print its result; SIGTERM is handled like Ctrl-C, and leaves no files behind."""
-    import signal
-
-    from flexroad.pipeline.errors import ConfigError
-    from flexroad.tasks.errors import TaskError
-
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _held(out):
@@ -110,7 +101,7 @@ def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
     echo(after_catalog(dataset.catalog))
 
 
-@prepare.command("points", cls=Command)
+@app.command("points", cls=Command)
 @with_common
 def prepare_points(
     common: PrepareOptions,
@@ -169,9 +160,6 @@ def prepare_points(
 
     They are DSM, DTM, bridge decks and orthophoto.
     """
-    from flexroad.pipeline.prepare import points
-    from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES
-
     options = _points_options(
         slope,
         radius,
@@ -189,7 +177,7 @@ def prepare_points(
     )
 
 
-@prepare.command("mesh", cls=Command)
+@app.command("mesh", cls=Command)
 @with_common
 def prepare_mesh(
     common: PrepareOptions,
@@ -213,8 +201,6 @@ def prepare_mesh(
 
     They are made from sampled points, and from its texture seen from above.
     """
-    from flexroad.pipeline.prepare import mesh as meshes
-
     mesh_options = meshes.MeshOptions(up, offset, density, seed, dop=not no_dop, refine=not no_refine)
     options = _points_options(slope, radius, fill, void, ground="filter")
     _run(
@@ -223,7 +209,7 @@ def prepare_mesh(
     )
 
 
-@prepare.command("odm", cls=Command)
+@app.command("odm", cls=Command)
 @with_common
 def prepare_odm(
     common: PrepareOptions,
@@ -241,8 +227,6 @@ def prepare_odm(
 
     Its own rasters are taken, else they are made of its textured mesh, else of its points.
     """
-    from flexroad.pipeline.prepare import mesh, odm
-
     mesh_options = mesh.MeshOptions(density=density, seed=seed)
     options = _points_options(slope, radius, fill, void, ground="filter")
     _run(
@@ -251,7 +235,7 @@ def prepare_odm(
     )
 
 
-@prepare.command("photos", cls=Command)
+@app.command("photos", cls=Command)
 @with_common
 def prepare_photos(
     common: PrepareOptions,
@@ -307,9 +291,6 @@ def prepare_photos(
 
     The steps are cameras, dense stereo, a Poisson mesh, and rasters as with `mesh`.
     """
-    from flexroad.pipeline.prepare import photos
-    from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
-
     photos_options = photos.PhotosOptions(
         control,
         control_crs,

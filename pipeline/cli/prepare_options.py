@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 import typer
 
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.command import MIN_COVER_HELP
 from flexroad.pipeline.prepare.options import PrepareOptions
 
 COMMON: dict[str, Any] = {
@@ -107,7 +106,7 @@ COMMON: dict[str, Any] = {
             max=1,
             metavar="SHARE",
             rich_help_panel=options.RASTERS,
-            help=MIN_COVER_HELP,
+            help=options.MIN_COVER_HELP,
         ),
     ],
     "date": Annotated[

@@ -11,12 +11,19 @@ import typer
 
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.results.points import Ground
+from flexroad.pipeline.results.query import along_lines, at_points, beyond_survey, outside, required_crs
+from flexroad.pipeline.results.query_files import LONLAT, parse_csv, read_lines, read_points
+
+app = group()
 
 STDIN = Path("-")
 
 
+@app.command(cls=Command)
 def query(
     path: options.Run,
     points: Annotated[
@@ -87,10 +94,6 @@ def query(
     The output is CSV: the columns of the points and height_m, nx, ny, nz, tile and class; with --line also
     distance and grade.
     """
-    from flexroad.pipeline.results.points import Ground
-    from flexroad.pipeline.results.query import along_lines, at_points, beyond_survey, outside, required_crs
-    from flexroad.pipeline.results.query_files import LONLAT, parse_csv, read_lines, read_points
-
     if (points is None) == (line is None):
         raise ConfigError("give the points with --points FILE, or a line with --line")
     if lonlat and crs:

@@ -6,10 +6,20 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
 
+from flexroad.catalog.storage.paths import parse_location, read
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, echo_document
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report import write_report
+from flexroad.pipeline.reproduce.figures import write_figures
+from flexroad.pipeline.reproduce.tables import write_comparison
+from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.record import Run
+
+app = group()
 
 Output = Annotated[
     Path,
@@ -19,6 +29,7 @@ Output = Annotated[
 ]
 
 
+@app.command(cls=Command)
 def report(
     path: options.Run,
     form: Annotated[
@@ -50,13 +61,6 @@ def report(
 
     The file is RUN/report.md, .csv or .html.
     """
-    from rich.console import Console
-
-    from flexroad.catalog.storage.paths import parse_location, read
-    from flexroad.pipeline.report import write_report
-    from flexroad.pipeline.run.progress import StepProgress
-    from flexroad.pipeline.run.record import Run
-
     if form != "html" and (compared or viewer):
         given = "--compare" if compared else "--viewer"
         raise ConfigError(f"{given} is for --format html only; add that, or leave out {given}")
@@ -67,6 +71,7 @@ def report(
     echo(f"written to {written}", err=True)
 
 
+@app.command(cls=Command)
 def tables(
     path: options.Run,
     output: Output,
@@ -107,15 +112,13 @@ def tables(
 
     They are Markdown, LaTeX, CSV and HTML.
     """
-    from flexroad.pipeline.reproduce.tables import write_comparison
-    from flexroad.pipeline.run.record import Run
-
     folders = (true, dsc3d, dsc3d_true, literal)
     runs = [Run.open(folder, allow or ()) if folder else None for folder in folders]
     for written in write_comparison(Run.open(path, allow or ()), runs[0], output, *runs[1:]):
         echo(str(written))
 
 
+@app.command(cls=Command)
 def figures(
     path: options.Run,
     output: Output,
@@ -129,9 +132,6 @@ def figures(
 
     They are PDF and PNG, small WebP pictures, and a page of captions.
     """
-    from flexroad.pipeline.reproduce.figures import write_figures
-    from flexroad.pipeline.run.record import Run
-
     for note in write_figures(Run.open(path, allow or ()), output, tile):
         echo(f"note: {note}", err=True)
     echo(f"figures in {output / 'figures.md'}")

@@ -3,31 +3,64 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shlex
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
 
+from flexroad.catalog.area import Area
+from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
-from flexroad.pipeline.cli.lifecycle import Outcome, format_summary, report_outcome, warn
+from flexroad.pipeline.cli.command import Command, group
+from flexroad.pipeline.cli.dry_run import plan
+from flexroad.pipeline.cli.lifecycle import Outcome, RunCommand, format_summary, report_outcome, warn
 from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
-from flexroad.pipeline.errors import ClusterLost
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ClusterLost, ConfigError
+from flexroad.pipeline.execute.dask import check_address
+from flexroad.pipeline.run.collection import write_states
+from flexroad.pipeline.run.conductor import Prepared, Selection, Workers, created, process, reopened
+from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
 from flexroad.pipeline.run.observer import Observer
+from flexroad.pipeline.run.progress import FIRST_S, ProgressDisplay, said_repeatedly
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.status import progress, summary
+from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.worker.tile import TileResult
 
-if TYPE_CHECKING:
-    from flexroad.pipeline.run.conductor import Prepared
-    from flexroad.pipeline.run.progress import ProgressDisplay
-    from flexroad.pipeline.run.record import Run
-    from flexroad.pipeline.run.summary import Summary
-    from flexroad.pipeline.worker.tile import TileResult
+app = group()
 
+
+def _address(value: str | None) -> str | None:
+    """Return the address of a scheduler; a wrong one is refused before the catalog is read."""
+    if value is not None:
+        try:
+            check_address(value)
+        except ConfigError as error:
+            raise typer.BadParameter(str(error)) from error
+    return value
+
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="A running Dask scheduler: tcp://host:8786, tls://host:8786.",
+        rich_help_panel=options.WORK,
+        callback=_address,
+    ),
+]
 StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "assess", "export"]
 
 
+@app.command(cls=RunCommand)
 @ignore_write_errors()
 def run(
     catalog: Annotated[
@@ -74,7 +107,7 @@ def run(
     area_layer: options.AreaLayer = None,
     executor: options.RunExecutor = "auto",
     workers: options.MostWorkers = None,
-    scheduler: options.Scheduler = None,
+    scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     on_failure: options.OnFailure = None,
     prometheus: options.Prometheus = None,
@@ -90,18 +123,11 @@ def run(
 
     After an interruption, the same command resumes the run.
     """
-    from flexroad.catalog.storage.paths import parse_location
-    from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.run.conductor import Selection, Workers, created
-    from flexroad.pipeline.run.record import Run
-
     path, source = parse_location(out), parse_location(catalog)
     root = parse_location(store) if store else None
     if dry_run:
-        from flexroad.pipeline.cli.dry_run import plan
-
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, options.read_area(area, area_layer))
+        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         tiles, selected = selection.of(path, source, allow or (), chosen)
         planned = Run.planned(path, chosen, tiles, root, checksum)
         for line in plan(planned, selected.tiles, verbose, workers):
@@ -109,7 +135,7 @@ def run(
         return
     with report_outcome(path, on_failure, prometheus) as outcome:
         chosen = load_config(config, settings or ())
-        selection = Selection(tile or (), bbox, options.read_area(area, area_layer))
+        selection = Selection(tile or (), bbox, Area.read(area, area_layer) if area else None)
         shown = Shown(outcome)
         with created(
             path,
@@ -126,6 +152,7 @@ def run(
     _exit(outcome)
 
 
+@app.command(cls=RunCommand)
 @ignore_write_errors()
 def rerun(
     path: options.Run,
@@ -149,7 +176,7 @@ def rerun(
     verify: options.Verify = False,
     executor: options.RunExecutor = "auto",
     workers: options.MostWorkers = None,
-    scheduler: options.Scheduler = None,
+    scheduler: Scheduler = None,
     dashboard: options.Dashboard = False,
     on_failure: options.OnFailure = None,
     prometheus: options.Prometheus = None,
@@ -158,9 +185,6 @@ def rerun(
 
     For changes of source files or of RUN/config.yaml, and for failed tiles.
     """
-    from flexroad.catalog.storage.paths import parse_location
-    from flexroad.pipeline.run.conductor import Workers, reopened
-
     location = parse_location(path)
     with report_outcome(location, on_failure, prometheus) as outcome:
         shown = Shown(outcome)
@@ -196,7 +220,6 @@ class Shown(Observer):
     @contextlib.contextmanager
     def working(self, work: str) -> Iterator[None]:
         """Name the work of the block if it takes long, as with catalogs of thousands of tiles."""
-        from flexroad.pipeline.run.progress import FIRST_S, said_repeatedly
 
         def line(spent_s: float) -> str:
             return f"{work}, {spent_s:.0f} s spent"
@@ -214,10 +237,6 @@ class Shown(Observer):
 
     def start(self, tiles: int, selected: int) -> None:
         """Show the progress."""
-        from rich.console import Console
-
-        from flexroad.pipeline.run.progress import ProgressDisplay
-
         self.display = self._stack.enter_context(ProgressDisplay(selected, Console(stderr=True)))
         if self.outcome.textfile is not None:
             self.outcome.textfile.total = tiles
@@ -237,8 +256,6 @@ class Shown(Observer):
 
 def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
     """Process the tiles and fill in the outcome."""
-    from flexroad.pipeline.run.conductor import process
-
     folder, outcome = shlex.quote(str(prepared.run.path)), shown.outcome
     try:
         with shown:
@@ -280,6 +297,7 @@ def _exit(outcome: Outcome) -> None:
     raise typer.Exit(outcome.exit_code)
 
 
+@app.command(cls=Command)
 def status(
     path: options.Run,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
@@ -289,13 +307,8 @@ def status(
     allow: options.Allow = None,
 ) -> None:
     """Show the state of a run and the failures of its tiles."""
-    from flexroad.catalog.storage.paths import parse_location
-    from flexroad.pipeline.run.record import Run
-
     opened = Run.open(parse_location(path), allow or ())
     if geojson is not None:
-        from flexroad.pipeline.run.collection import write_states
-
         write_states(opened, parse_location(geojson))
         echo(str(geojson))
         return
@@ -303,12 +316,6 @@ def status(
 
 
 def _print_status(run: Run, as_json: bool) -> None:
-    import json
-    from dataclasses import asdict
-
-    from flexroad.pipeline.run.lock import describe_owner, exit_reason, owner
-    from flexroad.pipeline.run.status import progress, summary
-
     lock_owner = owner(run.path)
     alive = lock_owner if lock_owner and not exit_reason(lock_owner) else None
     if as_json:

@@ -8,11 +8,25 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from flexroad.catalog import Catalog
+from flexroad.catalog.allowlist import check_allowed
+from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.paths import check_writable
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.cli import options as shared
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config import document
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.report.training import summary, verdict, write_model
+from flexroad.pipeline.training import train as training
+from flexroad.tasks.errors import TaskError
+
+app = group()
 
 
+@app.command(cls=Command)
 def train(
     catalog: shared.CatalogFile,
     labels: Annotated[
@@ -91,20 +105,10 @@ def train(
 
     It is validated on other tiles. The files are MODEL, its report MODEL.html, and MODEL.json.
     """
-    from flexroad.catalog import Catalog
-    from flexroad.catalog.allowlist import check_allowed
-    from flexroad.catalog.storage.outputs import output_file
-    from flexroad.catalog.storage.paths import check_writable
-    from flexroad.pipeline.config.loading import load_config
-    from flexroad.pipeline.errors import ConfigError
-    from flexroad.pipeline.report.training import summary, verdict, write_model
-    from flexroad.pipeline.training.train import TrainOptions, train
-    from flexroad.tasks.errors import TaskError
-
     # The options of a training have no stage before a dot.
     changes = [text for text in settings or () if "." in text.partition("=")[0]]
     own = [text for text in settings or () if text not in changes]
-    options = TrainOptions(labels, validation, gap_m, ignore_m, seed, _settings(own))
+    options = training.TrainOptions(labels, validation, gap_m, ignore_m, seed, _settings(own))
     tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config, changes)
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +117,7 @@ def train(
     for suffix in ("", ".html", ".json"):
         output_file(output.with_name(output.name + suffix))
     try:
-        outcome = train(tiles, loaded_config, options, lambda line: echo(line, err=True))
+        outcome = training.train(tiles, loaded_config, options, lambda line: echo(line, err=True))
         model, page, _ = write_model(outcome, output)
     except TaskError as error:
         raise ConfigError(str(error)) from error
@@ -129,9 +133,6 @@ def train(
 
 def _settings(assignments: list[str]) -> dict[str, Any]:
     """Return the settings by name; values are parsed as YAML."""
-    from flexroad.pipeline.config import document
-    from flexroad.pipeline.errors import ConfigError
-
     parsed: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")

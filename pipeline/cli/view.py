@@ -7,16 +7,26 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
+from flexroad.catalog.storage.paths import is_remote, parse_location
 from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
+from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.errors import ConfigError
+from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
+from flexroad.pipeline.export.viewer import server, write_viewer
+from flexroad.pipeline.run.progress import StepProgress
+from flexroad.pipeline.run.record import Run
+
+app = group()
 
 FOLDER = "viewer"
 MOST_NOTES = 5
 
 
+@app.command(cls=Command)
 def view(
     path: options.Run,
     output: Annotated[
@@ -64,14 +74,6 @@ def view(
     The page opens without a server and without network. The same command goes on after an interruption, and
     writes only tiles that have changed.
     """
-    from rich.console import Console
-
-    from flexroad.catalog.storage.paths import is_remote, parse_location
-    from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
-    from flexroad.pipeline.export.viewer import write_viewer
-    from flexroad.pipeline.run.progress import StepProgress
-    from flexroad.pipeline.run.record import Run
-
     if port and not serve:
         raise ConfigError(f"--port {port} is for --serve; add that, or leave out --port")
     run = Run.open(parse_location(path), [str(place) for place in allow or ()])
@@ -92,8 +94,6 @@ def view(
 
 
 def _serve(folder: Path, port: int) -> None:
-    from flexroad.pipeline.export.viewer import server
-
     try:
         web = server(folder, port)
     except OSError as error:

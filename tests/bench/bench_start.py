@@ -1,6 +1,6 @@
 """Start of commands: CPU time of whole processes, relative to ``python -c "import numpy"``.
 
-Targets: ``flexroad --help`` at most 5, ``flexroad config show`` at most 8, a run with nothing to do over ten
+Targets: ``flexroad --help`` at most 3, ``flexroad config show`` at most 8, a run with nothing to do over ten
 tiles at most 15, a rerun of one tile at most 25, all with the default number of workers. Two workers must not
 take longer than one over 48 small tiles, wall time and CPU time: ``bench_start.py --tiles``.
 """
@@ -45,7 +45,7 @@ def start() -> None:
         tile = Catalog.read(survey / "catalog.parquet").tiles[0].id
         commands = {
             "python -c 'import numpy'": ([sys.executable, "-c", "import numpy"], 1),
-            "flexroad --help": ([*FLEXROAD, "--help"], 5),
+            "flexroad --help": ([*FLEXROAD, "--help"], 3),
             "flexroad config show production": ([*FLEXROAD, "config", "show", "production"], 8),
             "nothing to do, ten tiles": ([*FLEXROAD, "run", "--config", "production", *catalog], 15),
             "rerun of one of ten tiles": (

@@ -1,5 +1,6 @@
 """Help pages: what each option takes, and under which heading it is."""
 
+import importlib
 import re
 from collections.abc import Iterator
 from datetime import datetime
@@ -9,12 +10,14 @@ from typing import Any, get_args, get_origin
 import pytest
 import typer
 
+from flexroad.pipeline.cli.main import COMMANDS as LISTED
 from flexroad.pipeline.cli.main import app
 from flexroad.pipeline.graph.stages import STAGE_NAMES
 
 
 def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for name, command in group.commands.items():
+    for name in group.commands:
+        command = group.get_command(None, name)
         inner = hasattr(command, "commands")
         yield from commands(command, (*words, name)) if inner else [((*words, name), command)]
 
@@ -69,11 +72,26 @@ def test_help_lists_commands_with_whole_sentences(words, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     group = typer.main.get_command(app)
     for word in words:
-        group = group.commands[word]
+        group = group.get_command(None, word)
     lines = group.get_help(group.make_context("x", [], resilient_parsing=True)).splitlines()
     listed = lines[lines.index("Commands:") + 1 :]
     assert len(listed) == len(group.commands)
     assert [line for line in listed if line.endswith("...")] == []
+
+
+def test_help_lists_commands_as_their_own_pages_describe_them():
+    group = typer.main.get_command(app)
+    listed = {name: command.get_short_help_str(200) for name, command in group.commands.items()}
+    assert listed == {name: group.get_command(None, name).get_short_help_str(200) for name in listed}
+
+
+def test_commands_of_all_modules_are_listed():
+    names = {module for module, _ in LISTED.values()}
+    written = set()
+    for name in names:
+        group = typer.main.get_group(importlib.import_module(f"flexroad.pipeline.cli.{name}").app)
+        written |= {group.name} if group.name else set(group.commands)
+    assert written == set(LISTED)
 
 
 def test_help_lists_options_under_headings():

@@ -54,7 +54,7 @@ def parsed(*words) -> dict:
     """The parameters of a command after parsing, unchecked."""
     command = typer.main.get_command(app)
     for name in words[: 2 if words[0] == "catalog" else 1]:
-        command = command.commands[name]
+        command = command.get_command(None, name)
     rest = list(words[words.index(command.name) + 1 :])
     return command.make_context(command.name, rest, resilient_parsing=True).params
 
