@@ -13,7 +13,6 @@ from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.sources import nrw, rasters, templates
 from flexroad.catalog.text import count
 from flexroad.catalog.tiling import Conversion, TilingResult
-from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.check.catalog import check
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
@@ -252,6 +251,8 @@ def catalog_synthetic(
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""
+    from flexroad.pipeline.benchmark.scenes import write_scenes  # noqa: PLC0415 loads scipy
+
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
     echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
