@@ -31,8 +31,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.formats import FORMATS, Format
-from flexroad.pipeline.export.photo import check_photos
-from flexroad.pipeline.export.source import Options, Source
+from flexroad.pipeline.export.source import Options, Source, check_photos
 from flexroad.pipeline.run.lock import run_lock
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked

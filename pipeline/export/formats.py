@@ -25,9 +25,8 @@ from flexroad.pipeline.export import (
     tiles3d,
 )
 from flexroad.pipeline.export.network import network
-from flexroad.pipeline.export.photo import photographed, texture_of
 from flexroad.pipeline.export.pieces import Encode, Piece, figures, part_name, write_joined, write_pieces
-from flexroad.pipeline.export.source import Options, Source, TileItem
+from flexroad.pipeline.export.source import Options, Source, TileItem, photographed, texture_of
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError

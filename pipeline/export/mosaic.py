@@ -52,7 +52,7 @@ SAME_CELL = 1e-6
 
 
 @dataclass(frozen=True)
-class Layer:
+class _Layer:
     """One file of the mosaic."""
 
     bands: tuple[cog.Band, ...]
@@ -66,8 +66,8 @@ class Layer:
 
 
 LAYERS = (
-    Layer((cog.HEIGHT,), "average"),
-    Layer(
+    _Layer((cog.HEIGHT,), "average"),
+    _Layer(
         tuple(
             cog.Band(
                 f"normal_{axis}", f"Component of the upward unit normal to the {way}", "int16", "", NO_NORMAL
@@ -76,8 +76,8 @@ LAYERS = (
         ),
         "average",
     ),
-    Layer((replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
-    Layer((cog.SUPPORT,), "mode"),
+    _Layer((replace(cog.ROAD, nodata=NO_ROAD),), "mode"),
+    _Layer((cog.SUPPORT,), "mode"),
 )
 
 
@@ -162,7 +162,7 @@ def whole_grid(grids: Sequence[Grid], cell: float | None) -> Grid:
     return Grid(grids[0].crs, left * cell, top * cell, cell, width, height)
 
 
-def _draft(folder: Path, layer: Layer, grid: Grid, source: Source) -> Any:
+def _draft(folder: Path, layer: _Layer, grid: Grid, source: Source) -> Any:
     """Open a raster without compression for the values of a layer."""
     heights = layer.bands[0] is cog.HEIGHT and source.vertical
     raster = rasterio.open(
@@ -250,7 +250,7 @@ def _cells(grid: Grid, eastings: Floats, northings: Floats) -> tuple[NDArray[np.
     return rows[:, None], columns[None, :]
 
 
-def _finish(draft: Path, path: Path, layer: Layer) -> None:
+def _finish(draft: Path, path: Path, layer: _Layer) -> None:
     """Copy a draft to a cloud-optimised GeoTIFF with overviews, and read it once.
 
     GDAL does not report blocks that it cannot write when it closes a file: only reading them shows it.

@@ -37,7 +37,7 @@ BLOCK_BYTES = 4 * SIZE * SIZE
 
 
 @dataclass
-class Canvas:
+class _Canvas:
     """Heights of map tiles in a file, float32, m; NaN where there are none."""
 
     file: IO[bytes]
@@ -79,7 +79,7 @@ def write_tiles(
     first = min(terrarium.overview_zoom(bounds), zoom)
     beside = folder if isinstance(folder, Path) else None
     with TemporaryFile(dir=beside) as heights, TemporaryFile(dir=beside) as images:
-        canvas = Canvas(heights)
+        canvas = _Canvas(heights)
         lowest = min((_add(canvas, zoom, tile) for tile in tiles), default=np.inf)
         if not canvas.places:
             raise ConfigError(f"{source.run.path}: no selected tile has a height")
@@ -108,7 +108,7 @@ def load_writer() -> Any:
         raise ConfigError(f"pmtiles needs the library pmtiles; install it with {INSTALL}") from error
 
 
-def _add(canvas: Canvas, zoom: int, tile: FinishedTile) -> float:
+def _add(canvas: _Canvas, zoom: int, tile: FinishedTile) -> float:
     """Sample the pixels of a tile; return its lowest height (m), infinite without any."""
     surface, road, grid = tile.surface, tile.road, tile.tile.grid
     placed, lowest = bounds_in(terrarium.CRS, grid.crs, grid.bounds), np.inf
@@ -135,7 +135,7 @@ def _add(canvas: Canvas, zoom: int, tile: FinishedTile) -> float:
     return lowest
 
 
-def _add_overviews(canvas: Canvas, zoom: int) -> None:
+def _add_overviews(canvas: _Canvas, zoom: int) -> None:
     """Add the map tiles of the level above: means of four pixels."""
     for parent in sorted(
         {(zoom - 1, column // 2, row // 2) for z, column, row in canvas.places if z == zoom}
@@ -148,7 +148,7 @@ def _add_overviews(canvas: Canvas, zoom: int) -> None:
         canvas.write(parent, np.block(quarters))
 
 
-def _write(archive: Any, canvas: Canvas, source: Source, bounds: Bounds, no_height: float) -> None:
+def _write(archive: Any, canvas: _Canvas, source: Source, bounds: Bounds, no_height: float) -> None:
     """Write the images of all map tiles in the order of their ids, and what they are."""
     for number, tile in sorted((pmtiles.tile.zxy_to_tileid(*tile), tile) for tile in canvas.places):
         archive.write_tile(number, terrarium.encode_png(canvas.read(tile), no_height))

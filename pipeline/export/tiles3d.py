@@ -27,9 +27,8 @@ from flexroad.catalog.storage.paths import Location, exists, listing, parse_loca
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.photo import aerial_of, texture_of
 from flexroad.pipeline.export.pieces import Piece, Row, write_pieces
-from flexroad.pipeline.export.source import Options, Source, TileItem, layer_state
+from flexroad.pipeline.export.source import Options, Source, TileItem, aerial_of, layer_state, texture_of
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name

@@ -14,8 +14,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from flexroad.catalog.text import printable
-from flexroad.pipeline.report import quality
-from flexroad.pipeline.report.content import MESHES, Content
+from flexroad.pipeline.report.content import ESTIMATE_MEANING, HOLDOUT, MESHES, Content
 from flexroad.pipeline.store.tables import csv_text
 from flexroad.tasks.quality.places import Place
 
@@ -84,9 +83,9 @@ def sections(content: Content) -> Iterable[tuple[str, pd.DataFrame, str]]:
         ("Further figures, mean over tiles", content.further, ""),
         ("Per stratum, mean over tiles", content.strata, ""),
         ("Worst tiles by road L2", content.worst, ""),
-        (WORST_ESTIMATES, content.worst_estimates, quality.MEANING),
+        (WORST_ESTIMATES, content.worst_estimates, ESTIMATE_MEANING),
         ("Error estimates and support, mean over tiles", content.quality, ""),
-        ("Error estimates at withheld squares", content.held_out, quality.HOLDOUT),
+        ("Error estimates at withheld squares", content.held_out, HOLDOUT),
         ("Meshes", content.meshes, MESHES),
         ("Steps between neighbouring tiles", content.steps.check, content.steps.note),
         ("Largest steps between neighbouring tiles", content.steps.edges.head(10), ""),

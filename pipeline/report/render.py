@@ -1,6 +1,6 @@
 """Pictures for reports, as PNG bytes: maps of one tile with north up and metres on the axes, and line charts.
 
-Pictures of meshes are in `mesh_pictures`.
+Pictures of meshes are in `pictures`.
 """
 
 from __future__ import annotations
@@ -285,15 +285,19 @@ def _round_limit(error: Floats) -> float:
 
 def _shaded(rgb: Floats, height: Floats, cell: float) -> Floats:
     """Shade colours by Lambert's law with the sun in the north-west; level ground keeps its colour."""
-    south, east = np.gradient(height, cell)
     # Next to NaN cells the gradient is NaN: shaded as level.
-    south, east = np.nan_to_num(south), np.nan_to_num(east)
+    south, east = (np.asarray(np.nan_to_num(slope)) for slope in np.gradient(height, cell))
+    light = np.clip(0.5 * sunlight(east, south), 0, 1)[..., None]
+    lit: Floats = 2 * light * rgb + (1 - 2 * light) * rgb**2
+    return np.where(np.isfinite(height)[..., None], lit, to_rgb(UNKNOWN))
+
+
+def sunlight(east: Floats, south: Floats) -> Floats:
+    """Return the light on slopes to the east and south relative to that on level ground, by Lambert's law."""
     azimuth, altitude = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ALTITUDE_DEG)
     sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
     facing = (math.sin(altitude) - sun_east * east + sun_north * south) / np.sqrt(1 + east**2 + south**2)
-    light = np.clip(0.5 * facing / math.sin(altitude), 0, 1)[..., None]
-    lit: Floats = 2 * light * rgb + (1 - 2 * light) * rgb**2
-    return np.where(np.isfinite(height)[..., None], lit, to_rgb(UNKNOWN))
+    return np.asarray(facing / math.sin(altitude))
 
 
 def _laid_over(rgb: Floats, mask: Bools, colour: str, opacity: float) -> Floats:

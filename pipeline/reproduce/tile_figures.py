@@ -19,8 +19,7 @@ from scipy import ndimage
 
 from flexroad.catalog import Grid
 from flexroad.catalog.grid import Bounds
-from flexroad.pipeline.report.mesh_pictures import render_meshes
-from flexroad.pipeline.report.pictures import NO_MESH
+from flexroad.pipeline.report.pictures import NO_MESH, render_meshes
 from flexroad.pipeline.reproduce.layout import (
     ANGLE_COLOURS,
     ANGLE_NORM,

@@ -17,11 +17,8 @@ from markupsafe import Markup
 
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count, printable
-from flexroad.pipeline.report import quality
-from flexroad.pipeline.report.browser.compare import Comparison, compare
-from flexroad.pipeline.report.browser.histograms import histograms
-from flexroad.pipeline.report.browser.outcome import cards, headline, statements
-from flexroad.pipeline.report.browser.reasons import Reason, described, reasons
+from flexroad.pipeline.report.browser.figures import Comparison, compare, histograms
+from flexroad.pipeline.report.browser.outcome import Reason, cards, described, headline, reasons, statements
 from flexroad.pipeline.report.browser.relief import relief
 from flexroad.pipeline.report.browser.tiles import (
     TileTable,
@@ -31,7 +28,7 @@ from flexroad.pipeline.report.browser.tiles import (
     numeric_columns,
     tile_table,
 )
-from flexroad.pipeline.report.content import WORST, Content
+from flexroad.pipeline.report.content import ESTIMATE_MEANING, WORST, Content
 from flexroad.pipeline.report.pages import MAIN, WORST_ESTIMATES, TilePictures, sections, template
 from flexroad.pipeline.report.pictures import tile_pictures
 from flexroad.pipeline.run.record import Run
@@ -49,7 +46,7 @@ ESTIMATE, TRUE_ERROR = "error_estimate_m", "l2_road_m"
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class _Look:
     """A tile to look at."""
 
     tile_id: str
@@ -124,7 +121,7 @@ def html_page(
         comparison=comparison,
         looks=[_look(name, table, numbers, options, pictures, viewer) for name in first],
         ranked_by=ranked_by,
-        meaning=quality.MEANING.replace("`", ""),
+        meaning=ESTIMATE_MEANING.replace("`", ""),
         viewer=viewer,
         view_command=f"flexroad view {shlex.quote(str(run.path))}",
         sections=[one for one in sections(content) if one[0] not in (MAIN, WORST_ESTIMATES)],
@@ -182,13 +179,13 @@ def _look(
     options: Options,
     pictures: Mapping[str, TilePictures],
     viewer: str,
-) -> Look:
+) -> _Look:
     row: dict[str, Any] = dict(table.frame.loc[name])
     found = pictures.get(name)
     estimate, true = row[ESTIMATE], row[TRUE_ERROR]
     parts = [f"Error estimate {estimate:.2g} m"] if np.isfinite(estimate) else []
     parts += [f"road error (L2) {true:.2g} m"] if np.isfinite(true) else []
-    return Look(
+    return _Look(
         name,
         numbers[name],
         f"{'; '.join(parts)}.",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flexroad.catalog import Tile
-from flexroad.pipeline.report.render import SUN_ALTITUDE_DEG, SUN_AZIMUTH_DEG
+from flexroad.pipeline.report.render import sunlight
 from flexroad.pipeline.report.steps import Results
 from flexroad.pipeline.run.finished import RunPlace
 from flexroad.pipeline.run.record import Run
@@ -98,10 +98,7 @@ def _square(surface: Surface, road: RoadMask, side: int) -> NDArray[np.uint8]:
 def _shade(height: Floats, step_x: float, step_y: float) -> Floats:
     """Return the light on a surface by Lambert's law as grey, with the sun in the north-west."""
     south, east = np.gradient(EXAGGERATION * height, step_y, step_x)
-    azimuth, altitude = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ALTITUDE_DEG)
-    sun_east, sun_north = math.sin(azimuth) * math.cos(altitude), math.cos(azimuth) * math.cos(altitude)
-    facing = (math.sin(altitude) - sun_east * east + sun_north * south) / np.sqrt(1 + east**2 + south**2)
-    return np.asarray(np.clip(LEVEL * facing / math.sin(altitude), 0.35 * LEVEL, 255.0))
+    return np.asarray(np.clip(LEVEL * sunlight(np.asarray(east), np.asarray(south)), 0.35 * LEVEL, 255.0))
 
 
 def _resampled(cells: NDArray[np.bool_], road: RoadMask, side: int) -> Floats:

@@ -215,6 +215,11 @@ def as_script(data: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
+def short(value: float) -> str:
+    """Return a number with three digits, or as a whole one."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def _rounded(value: float) -> float | int | None:
     if not math.isfinite(value):
         return None

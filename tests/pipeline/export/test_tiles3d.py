@@ -19,8 +19,7 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import pieces
 from flexroad.pipeline.export import tiles3d as coarse
 from flexroad.pipeline.export.driver import export
-from flexroad.pipeline.export.photo import aerial_of
-from flexroad.pipeline.export.source import Options, select
+from flexroad.pipeline.export.source import Options, aerial_of, select
 from flexroad.pipeline.export.tiles3d import Node, blocks
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles

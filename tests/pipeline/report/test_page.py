@@ -12,11 +12,9 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.report import _viewer_address, write_report
-from flexroad.pipeline.report.browser.compare import compare
-from flexroad.pipeline.report.browser.histograms import histograms
-from flexroad.pipeline.report.browser.outcome import headline, statements
+from flexroad.pipeline.report.browser.figures import compare, histograms
+from flexroad.pipeline.report.browser.outcome import MEANINGS, headline, reasons, statements
 from flexroad.pipeline.report.browser.page import html_page, ranking
-from flexroad.pipeline.report.browser.reasons import MEANINGS, reasons
 from flexroad.pipeline.report.browser.tiles import (
     LABELS,
     NAMES,

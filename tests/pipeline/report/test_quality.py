@@ -9,8 +9,7 @@ import yaml
 from flexroad.catalog import Catalog
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.report.content import gather
-from flexroad.pipeline.report.quality import held_out, highest_error_estimates, over_tiles
+from flexroad.pipeline.report.content import gather, held_out, highest_error_estimates, over_tiles
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.pipeline.store.tables import COLUMNS, metrics_frame, read_metrics
