@@ -1,5 +1,7 @@
 """Project rules that linters do not check: file names, file lengths, imports of the command line."""
 
+import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -34,3 +36,17 @@ def test_command_line_starts_without_heavy_libraries(module):
     code = f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.strip() == "[]"
+
+
+SCRIPTS = sorted([*(ROOT / "experiments").glob("*.py"), *(ROOT / "tests" / "bench").glob("*.py")])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_names_that_scripts_import_exist(script):
+    for node in ast.walk(ast.parse(script.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(("flexroad", "tests")):
+            module = importlib.import_module(node.module)
+            for name in node.names:
+                if not hasattr(module, name.name):
+                    importlib.import_module(f"{node.module}.{name.name}")
