@@ -6,7 +6,7 @@ import posixpath
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
-from flexroad.catalog.headers import vrt
+from flexroad.catalog.headers.open_raster import MAX_DEPTH, vrt_sources
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.index import Catalog
 from flexroad.catalog.storage.paths import Location, resolved
@@ -16,8 +16,6 @@ from flexroad.catalog.trust import ADDRESS, AllowedFolders, full_name
 MAX_FOLDERS = 4
 """Largest number of folders suggested with --allow; if there are more, parent folders are suggested."""
 TOPS = ("/", "s3:/", "s3:")
-MAX_DEPTH = 4
-"""Largest depth of VRTs that name VRTs."""
 
 
 def check_allowed(catalog: Catalog, layers: Collection[str] = LAYERS) -> None:
@@ -84,7 +82,7 @@ def _sources(name: str, depth: int = MAX_DEPTH) -> tuple[str, ...]:
     if not depth or not on_disk or not name.lower().endswith(".vrt"):
         return ()
     try:
-        named = vrt.sources(Path(name))
+        named = vrt_sources(Path(name))
     except (Refused, OSError):
         # The reader reports it.
         return ()

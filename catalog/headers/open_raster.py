@@ -3,22 +3,27 @@
 GDAL chooses the driver by a file's content, whatever its name: a VRT or WMS named ``a.tif`` would make it
 read other files or the web. So the driver is chosen here, by the first bytes, and is the only one allowed.
 Side-car files and metadata can name further files, too; they are checked as well.
+
+Of VRTs only plain mosaics are read. GDAL's own reader of XML takes names of elements and attributes in any
+case, and attributes for elements. So all elements and attributes must be known here, as `gdalbuildvrt` and
+`gdal_translate -of VRT` write them.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import rasterio
 from rasterio.errors import CRSError, RasterioError
 
 from flexroad.catalog.headers.refused import Refused, head, require_beside
-from flexroad.catalog.headers.vrt import sources
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 from flexroad.catalog.trust import AllowedFolders
 
@@ -61,6 +66,23 @@ BLOCK_CACHE_BYTES = 16 * 2**20
 """Blocks of files that stay open which GDAL keeps in memory; its own default grows with the machine."""
 OFFLINE = {"CPL_VSIL_CURL_ALLOWED_FILENAME": "none"}
 """GDAL's option for local files: its file system on the web opens nothing."""
+MAX_VRT_BYTES = 64_000_000
+VRT_ELEMENTS = frozenset(
+    "VRTDataset SRS GeoTransform Metadata MDI VRTRasterBand MaskBand OverviewList BlockXSize BlockYSize "
+    "ColorInterp ColorTable Entry CategoryNames Category Description UnitType Offset Scale NoDataValue "
+    "HideNoDataValue SimpleSource ComplexSource AveragedSource NoDataFromMaskSource SourceFilename "
+    "SourceBand SourceProperties SrcRect DstRect ScaleOffset ScaleRatio NODATA LUT UseMaskBand".split()
+)
+VRT_ATTRIBUTES = frozenset(
+    "rasterXSize rasterYSize dataType band blockXSize blockYSize dataAxisToSRSAxisMapping coordinateEpoch "
+    "domain key relativeToVRT shared resampling RasterXSize RasterYSize DataType BlockXSize BlockYSize "
+    "xOff yOff xSize ySize c1 c2 c3 c4".split()
+)
+DECLARATION = re.compile(rb"^(\xef\xbb\xbf)?\s*<\?xml[^<>?]*\?>")
+PREFIX = re.compile(r"[^/]*:|/+vsi|<")
+ONLY_MOSAICS = (
+    "only mosaics of local files, as gdalbuildvrt makes them, are read; or convert it with gdal_translate"
+)
 
 
 @contextmanager
@@ -126,7 +148,7 @@ def files_of(path: Path, depth: int = MAX_DEPTH) -> Iterator[Path]:
     yield path
     yield from (side for side in _candidates(path) if side.exists())
     if depth and _driver(path) == "VRT":
-        for name in sources(path):
+        for name in vrt_sources(path):
             yield from files_of(Path(name), depth - 1)
 
 
@@ -140,7 +162,7 @@ def has_own_blocks(path: Path, depth: int = MAX_DEPTH) -> bool:
         driver = _driver(path)
         if driver != "VRT":
             return driver == "GTiff"
-        return depth > 0 and all(has_own_blocks(Path(name), depth - 1) for name in sources(path))
+        return depth > 0 and all(has_own_blocks(Path(name), depth - 1) for name in vrt_sources(path))
     except OSError:
         return False
 
@@ -174,7 +196,7 @@ def _checked(path: Path, allowed: AllowedFolders | None, depth: int) -> tuple[st
         return driver, alone
     if depth == 0:
         raise Refused(f"is a VRT of VRTs, more than {MAX_DEPTH} deep; convert it with gdal_translate")
-    for name in sources(path):
+    for name in vrt_sources(path):
         if allowed is not None and not allowed.permits(name):
             raise Refused(str(allowed.refusal("is a VRT that", name)))
         alone &= _source(Path(name), allowed, depth)
@@ -207,6 +229,59 @@ def _require_plain(path: Path, driver: str, size: int, mtime_ns: int) -> None:
         raise Refused(f"cannot be read: {error}; fetch it again") from error
 
 
+def vrt_sources(path: Path) -> tuple[str, ...]:
+    """Return the full names of the files that a VRT names.
+
+    Raises
+    ------
+    Refused
+        If the VRT is anything but a plain mosaic of files.
+    """
+    stats = path.stat()
+    if stats.st_size > MAX_VRT_BYTES:
+        raise Refused(f"is a VRT of {stats.st_size:,} bytes, more than {MAX_VRT_BYTES:,}; divide it")
+    names = _vrt_names(path, stats.st_size, stats.st_mtime_ns)
+    folder = _vrt_folder(path)
+    return tuple(dict.fromkeys(str(folder / name) for name in names))
+
+
+def _vrt_folder(path: Path) -> Path:
+    """Return the folder that relative names start from: GDAL follows links of the file, not of folders."""
+    for _ in range(40):
+        if not path.is_symlink():
+            return path.absolute().parent
+        path = path.parent / path.readlink()
+    raise Refused("is a circle of links; replace it by a file")
+
+
+@lru_cache(maxsize=256)
+def _vrt_names(path: Path, size: int, mtime_ns: int) -> tuple[str, ...]:
+    """Return the names of a VRT's sources, absolute or relative to its folder; cached by size and time."""
+    data = path.read_bytes()
+    if re.search(rb"<[!?]", DECLARATION.sub(b"", data)) or b"\0" in data:
+        raise Refused(f"is a VRT with comments or declarations; {ONLY_MOSAICS}")
+    try:
+        root = ElementTree.fromstring(data.decode())
+    except (ElementTree.ParseError, ValueError) as error:
+        raise Refused(f"is a damaged VRT ({error}); fetch it again") from error
+    for element in root.iter():
+        unknown = (
+            [element.tag] if element.tag not in VRT_ELEMENTS else sorted({*element.attrib} - VRT_ATTRIBUTES)
+        )
+        if unknown:
+            raise Refused(f"is a VRT with {unknown[0][:60]}; {ONLY_MOSAICS}")
+    return tuple(dict.fromkeys(_vrt_name(element) for element in root.iter("SourceFilename")))
+
+
+def _vrt_name(element: ElementTree.Element) -> str:
+    name, relative = element.text or "", element.get("relativeToVRT", "0")
+    if not name or name != name.strip() or len(element) or PREFIX.match(name):
+        raise Refused(f"is a VRT that names {name.strip()!r}; {ONLY_MOSAICS}")
+    if relative not in ("0", "1") or (relative == "0") != os.path.isabs(name):  # noqa: PTH117
+        raise Refused(f"is a VRT that names {name!r}, relative to no known folder; {ONLY_MOSAICS}")
+    return name
+
+
 def _driver(path: Path) -> str:
     """Return the name of GDAL's driver for a file, by its first bytes."""
     data = head(path)
@@ -226,13 +301,7 @@ def _driver(path: Path) -> str:
 
 
 def _side_cars(path: Path) -> list[Path]:
-    """Return the side-car files of a raster that GDAL may open, checked.
-
-    Raises
-    ------
-    Refused
-        If one of them is not a regular file of the raster's folder, or leads to other files.
-    """
+    """Return the side-car files of a raster that GDAL may open; refuse those that lead to other files."""
     found = [side for side in _candidates(path) if side.exists() or side.is_symlink()]
     for side in found:
         try:

@@ -164,15 +164,13 @@ def index(
 
 
 def _downloads(root: Path) -> tuple[list[Download], list[str]]:
-    """Return the downloads below a folder, newest first, and lines on folders that cannot be listed.
-
-    The newest are first because the first file with a value is used.
-    """
+    """Return the downloads below a folder, newest first, and lines on folders that cannot be listed."""
     if not root.is_dir():
         raise CatalogError(f"folder {root} does not exist")
     found, unlisted = glob(root, "**/*")
     downloads = [download for download in map(parse, found) if download]
     lines = unlisted_lines(root, "downloads", unlisted)
+    # The first file with a value is used.
     return sorted(downloads, key=lambda download: -download.year), lines
 
 

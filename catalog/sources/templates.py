@@ -192,13 +192,7 @@ def read(root: Path, layout: Layout, *, dataset: str, date: datetime | None = No
 
 
 def _without_metres(dsm: dict[str, _MatchedFile]) -> list[str]:
-    """Remove the files that are not in metres; return a line on each.
-
-    Raises
-    ------
-    CatalogError
-        If no file is left.
-    """
+    """Remove the files that are not in metres, and return a line on each; one must be left."""
     errors = dict[str, CatalogError]()
     for tile_id, match in dsm.items():
         try:

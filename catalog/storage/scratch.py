@@ -94,13 +94,7 @@ def _held(folder: Path) -> int | None:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder whose process has ended.
-
-    Raises
-    ------
-    OSError
-        If a process holds it.
-    """
+    """Hold the lock of a folder whose process has ended; raise OSError if a process holds it."""
     opened = os.open(folder / LOCK, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from flexroad.catalog.headers.open_raster import vrt_sources
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.headers.vrt import sources
 
 BAND = '<VRTRasterBand dataType="Byte" band="1">{}</VRTRasterBand>'
 SOURCE = "<SimpleSource>{}</SimpleSource>"
@@ -19,7 +19,7 @@ def dataset(inner, attributes=""):
 def check_refused(path, text, match="only mosaics"):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(Refused, match=match):
-        sources(path)
+        vrt_sources(path)
 
 
 def test_sources_are_full_names(tmp_path):
@@ -27,7 +27,7 @@ def test_sources_are_full_names(tmp_path):
     names = ('"1">b/../a.tif', '"0">/data/b &amp; c.tif')
     files = "".join(SOURCE.format(f"<SourceFilename relativeToVRT={name}</SourceFilename>") for name in names)
     path.write_text(dataset(BAND.format(files + files)))
-    assert sources(path) == (f"{tmp_path}/b/../a.tif", "/data/b & c.tif")
+    assert vrt_sources(path) == (f"{tmp_path}/b/../a.tif", "/data/b & c.tif")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_anything_but_a_plain_mosaic_is_refused(tmp_path, text):
 def test_damaged_and_huge_vrt_are_refused(tmp_path, monkeypatch):
     check_refused(tmp_path / "a.vrt", "<VRTDataset>", "damaged")
     check_refused(tmp_path / "b.vrt", b"<VRTDataset>\xff</VRTDataset>", "damaged")
-    monkeypatch.setattr("flexroad.catalog.headers.vrt.MAX_BYTES", 10)
+    monkeypatch.setattr("flexroad.catalog.headers.open_raster.MAX_VRT_BYTES", 10)
     check_refused(tmp_path / "c.vrt", dataset(""), "divide it")
 
 
@@ -95,4 +95,4 @@ def test_vrt_written_by_gdal_is_plain(tmp_path):
     with rasterio.open(raster, "r+") as src:
         src.nodata, src.descriptions = -1.0, ["heights"]
     copy(raster, tmp_path / "a.vrt", driver="VRT")
-    assert [Path(name).name for name in sources(tmp_path / "a.vrt")] == ["a.tif"]
+    assert [Path(name).name for name in vrt_sources(tmp_path / "a.vrt")] == ["a.tif"]
