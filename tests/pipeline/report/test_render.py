@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from flexroad.catalog import Grid
-from flexroad.pipeline.report import pictures, render
+from flexroad.pipeline.report import render
+from flexroad.pipeline.report.pictures import render_meshes
 from flexroad.tasks.types import Mesh
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)
@@ -174,7 +175,7 @@ def opengl():
 def test_render_meshes_road_is_on_the_left_and_broken_mesh_is_none():
     whole = sheet()
     broken = Mesh(whole.crs, whole.origin, whole.vertices[:, :2], whole.faces, whole.road)
-    drawn = pictures.render_meshes({"b": whole, "broken": broken, "a": whole})
+    pictures = render_meshes({"b": whole, "broken": broken, "a": whole})
     assert list(pictures) == ["b", "broken", "a"]
     assert pictures["broken"] is None
     assert pictures["a"] == pictures["b"]
@@ -197,7 +198,7 @@ def test_render_meshes_draws_part_in_given_colours():
     west, south = whole.origin[:2]
     shares = []
     for within in (None, (west + 150, south + 50, west + 240, south + 200)):
-        picture = pictures.render_meshes({"a": whole}, {"a": red_in_the_west}, within, (300, 240))["a"]
+        picture = render_meshes({"a": whole}, {"a": red_in_the_west}, within, (300, 240))["a"]
         image = pixels(picture)
         assert image.shape == (240, 300, 3)
         red, blue = ((image[..., a] - image[..., b]) > 60 for a, b in ((0, 2), (2, 0)))
@@ -209,7 +210,7 @@ def test_render_meshes_draws_part_in_given_colours():
 
 def test_render_meshes_without_meshes_starts_no_child(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nonexistent")
-    assert pictures.render_meshes({}) == {}
+    assert render_meshes({}) == {}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for VTK is a shell script")
@@ -223,7 +224,7 @@ def test_render_meshes_failing_child_gives_none_and_warns(tmp_path, monkeypatch,
     stand_in.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     with caplog.at_level(logging.WARNING):
-        assert pictures.render_meshes({"a": sheet(), "b": sheet()}) == {"a": None, "b": None}
+        assert render_meshes({"a": sheet(), "b": sheet()}) == {"a": None, "b": None}
     (record,) = caplog.records
     assert re.search(f"a, b: .*{reason}", record.getMessage())
 
