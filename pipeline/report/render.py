@@ -1,6 +1,7 @@
-"""Pictures for reports, as PNG bytes: maps of one tile with north up and metres on the axes, and line charts.
+"""Pictures for reports, as PNG bytes 480 pixels wide: maps of one tile, and line charts.
 
-Pictures of meshes are in `pictures`.
+Maps have north up and metres on the axes. Their ``grid`` says where the cells lie; their ``title`` stands
+above the map. Pictures of meshes are in `pictures`.
 """
 
 from __future__ import annotations
@@ -64,17 +65,8 @@ def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = 
     ----------
     height : Floats
         Heights (m), ``(H, W)``; NaN stays empty.
-    grid : Grid
-        Where the cells lie.
-    title : str
-        What is drawn, above the map.
     road : Bools, optional
         Road cells, drawn over the relief.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide.
     """
     low, high = _limits(height)
     norm = Normalize(low, high)
@@ -87,7 +79,7 @@ def hillshade(height: Floats, grid: Grid, title: str = "", road: Bools | None = 
 
 
 def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: str = "") -> bytes:
-    """Draw the kept and the dropped part of a road mask over the relief.
+    """Draw the kept and the dropped part of a road mask over the relief; the legend gives both areas.
 
     Parameters
     ----------
@@ -95,15 +87,6 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: s
         The DSM (m), ``(H, W)``.
     raw, kept : Bools
         Road before and after the filter (the paper's M^r and M^{r+}), ``(H, W)``.
-    grid : Grid
-        Where the cells lie.
-    title : str
-        What is drawn, above the map.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide; the legend gives both areas.
     """
     return _parts_picture(height, (("kept", kept, KEPT), ("dropped", raw & ~kept, DROPPED)), grid, title)
 
@@ -111,7 +94,7 @@ def filter_picture(height: Floats, raw: Bools, kept: Bools, grid: Grid, title: s
 def support_picture(
     height: Floats, support: NDArray[np.uint8], road: Bools, grid: Grid, title: str = ""
 ) -> bytes:
-    """Draw the support of the surface on road cells over the relief.
+    """Draw the support of the surface on road cells over the relief; the legend gives the areas.
 
     Parameters
     ----------
@@ -121,15 +104,6 @@ def support_picture(
         Class of each cell, a `flexroad.tasks.quality.support.Support`, ``(H, W)``.
     road : Bools
         Road cells before the filter, ``(H, W)``.
-    grid : Grid
-        Where the cells lie.
-    title : str
-        What is drawn, above the map.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide; the legend gives the areas.
     """
     kinds = (Support.MEASURED, KEPT), (Support.DTM, BY_DTM), (Support.INFERRED, DROPPED)
     names = {Support.MEASURED: "measured", Support.DTM: "DTM", Support.INFERRED: "inferred"}
@@ -165,26 +139,17 @@ def _parts_picture(height: Floats, parts: Sequence[tuple[str, Bools, str]], grid
 def error_map(
     error: Floats, grid: Grid, title: str = "", road: Bools | None = None, limit_m: float | None = None
 ) -> bytes:
-    """Draw signed vertical errors: red is too high, blue too low.
+    """Draw signed vertical errors: red is too high, blue too low, arrows say that some exceed the limit.
 
     Parameters
     ----------
     error : Floats
         Mesh or surface minus reference (m), ``(H, W)``; NaN stays empty.
-    grid : Grid
-        Where the cells lie.
-    title : str
-        What is drawn, above the map.
     road : Bools, optional
         Cells whose outline is drawn.
     limit_m : float, optional
         End of the colour bar on both sides (m). By default the 98th percentile of the absolute error,
         rounded up to 1, 2 or 5 times a power of ten; set it to compare pictures.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide; the colour bar has arrows if errors exceed the limit.
     """
     limit = limit_m if limit_m is not None else _round_limit(error)
     figure, axes = _map(error, grid, title, "RdBu_r", Normalize(-limit, limit))
@@ -207,15 +172,6 @@ def segmentation_map(
         An orthophoto of the grid (red, green, blue), ``(3, h, w)``.
     truth, segmented : Bools
         Road by the labels and by the segmenter, ``(H, W)``.
-    grid : Grid
-        Where the cells lie.
-    title : str
-        What is drawn, above the map.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide.
     """
     figure, axes = _map(np.moveaxis(photo, 0, -1) / 255, grid, title)
     # The first line is wider, so that it is visible below the second where both agree.
@@ -247,11 +203,6 @@ def curves(
         Limits of the x and the y axis.
     mark : tuple, optional
         x, y and name of a point to mark.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide.
     """
     figure = Figure(figsize=(WIDTH_PX / DPI, 3.4), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
@@ -391,11 +342,6 @@ def estimate_picture(
         Place by flag; each has a circle, with the names of its flags.
     title : str
         What is drawn, above the map.
-
-    Returns
-    -------
-    bytes
-        A PNG, 480 pixels wide.
     """
     norm = Normalize(0, LIMIT_M, clip=True)
     grey = np.broadcast_to(np.array(to_rgb("#e4e2dd")), (*height.shape, 3))
