@@ -10,6 +10,10 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
+from flexroad.catalog.lazy import lazy
+
+numba = lazy("numba")
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -30,14 +34,12 @@ class Compiled(Generic[P, R]):
     @cached_property
     def dispatcher(self) -> Any:
         """The function as numba's dispatcher."""
-        from numba import njit
-
         # numba needs dispatchers, not Compiled objects, under the names of the functions that this one calls.
         names = self.function.__globals__
         for name in self.function.__code__.co_names:
             if isinstance(names.get(name), Compiled):
                 names[name] = names[name].dispatcher
-        return njit(cache=True, error_model=self.error_model, fastmath=self.fastmath)(self.function)
+        return numba.njit(cache=True, error_model=self.error_model, fastmath=self.fastmath)(self.function)
 
 
 def compiled(

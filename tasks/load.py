@@ -8,22 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.below_ground import below_ground_note
 from flexroad.tasks.io.height_units import check_units
+from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
+from flexroad.tasks.io.same_survey import survey_difference
 from flexroad.tasks.types import Bools, Floats, Source, TileData
-
-if TYPE_CHECKING:
-    from flexroad.tasks.io.mosaic import Mosaic
 
 VERSION = 3
 
@@ -86,9 +86,6 @@ def load(tile: Tile, options: Options) -> TileData:
         if tile.layer(name) is None:
             option = name.replace("_", "-")
             raise TaskError(f"the tile has no {name}; give its files to `flexroad catalog` with --{option}")
-    from flexroad.catalog.headers.rasters import quiet
-    from flexroad.tasks.io.mosaic import read_mosaic
-
     grid = tile.grid.buffered(options.halo_m)
     if grid.width * grid.height > MAX_CELLS:
         raise TaskError(
@@ -147,9 +144,6 @@ def load_border(ground: Tile, core: Grid, options: Options | None = None) -> Til
     TaskError
         If the layers differ in their unit of height.
     """
-    from flexroad.catalog.headers.rasters import quiet
-    from flexroad.tasks.io.mosaic import read_mosaic
-
     grid, chosen = ground.grid, options or Options()
     with quiet():
         mosaics = {
@@ -185,8 +179,6 @@ def _offset(tile: Tile, options: Options) -> tuple[bool, list[str]]:
     """Return whether roads are fitted to the DSM minus an offset, and a note if they would be but cannot."""
     if options.road_height != "offset":
         return False, []
-    from flexroad.tasks.io.same_survey import survey_difference
-
     differs, undeclared = survey_difference(tile)
     unchanged = "road_height: the DSM is used without an offset, because"
     if differs:

@@ -10,6 +10,7 @@ from rasterio.enums import Resampling
 
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.below_ground import below_ground_note
@@ -19,8 +20,12 @@ from flexroad.tasks.io.raster_grid import RasterGrid
 from flexroad.tasks.load import Options
 from flexroad.tasks.types import Floats, TileData
 
+rioxarray = lazy("rioxarray")
+
 if TYPE_CHECKING:
     import xarray as xr
+else:
+    xr = lazy("xarray")
 
 TILE_ID = "arrays"
 """The tile id of data that come from no catalog."""
@@ -98,16 +103,13 @@ def _patch(name: str, array: xr.DataArray) -> RasterWindow:
 
 def _plane(name: str, array: xr.DataArray) -> xr.DataArray:
     """Return the array as ``(y, x)``; a band or time of length 1 is dropped."""
-    import rioxarray  # noqa: F401 (gives arrays their .rio)
-    import xarray as xr
-    from rioxarray.exceptions import MissingSpatialDimensionError
-
+    without_axes = rioxarray.exceptions.MissingSpatialDimensionError  # the import gives arrays their .rio
     if not isinstance(array, xr.DataArray):
         raise TaskError(f"{name} is a {type(array).__name__}; give an xarray.DataArray with y, x and a CRS")
     array = array.squeeze(drop=True) if array.ndim > 2 else array
     try:
         x, y = array.rio.x_dim, array.rio.y_dim
-    except MissingSpatialDimensionError:
+    except without_axes:
         x = y = ""
     if {x, y} != set(array.dims):
         sizes = ", ".join(f"{dim}: {size}" for dim, size in array.sizes.items())

@@ -6,7 +6,10 @@ import contextlib
 from functools import cache
 from pathlib import Path
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
+
+psutil = lazy("psutil")
 
 SHARE = 0.8
 """Share of the machine's memory that one command may plan to use."""
@@ -49,8 +52,6 @@ def _limits(group: Path) -> list[int]:
 @cache
 def limit() -> int:
     """Return the memory that a command may plan to use (bytes)."""
-    import psutil
-
     return int(SHARE * min([psutil.virtual_memory().total, *group_limits()]))
 
 

@@ -15,9 +15,10 @@ roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -51,9 +52,6 @@ from flexroad.tasks.spline.mesh_border import (
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats, Mesh, RoadClusters, RoadMask, Surface
-
-if TYPE_CHECKING:
-    import shapely
 
 VERSION = 5
 

@@ -9,11 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import one_line
 from flexroad.tasks.errors import TaskError
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
+    import PIL.Image
+else:
+    PIL = lazy("PIL")
 
 MOST_PIXELS = 400_000_000
 """Largest photograph or texture (pixels), 1.1 GiB as RGB: sensors of drones have up to 150 million pixels,
@@ -25,16 +28,14 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
 @contextlib.contextmanager
 def bounded() -> Iterator[None]:
     """Context manager in which Pillow opens images up to `MOST_PIXELS`, without a warning."""
-    from PIL import Image
-
     # Pillow refuses twice its limit, and warns from once.
-    before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MOST_PIXELS // 2
+    before, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, MOST_PIXELS // 2
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", PIL.Image.DecompressionBombWarning)
             yield
     finally:
-        Image.MAX_IMAGE_PIXELS = before
+        PIL.Image.MAX_IMAGE_PIXELS = before
 
 
 @contextlib.contextmanager
@@ -66,7 +67,7 @@ def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
         raise TaskError(f"{failure}: {one_line(error)}; {remedy}", file=str(file)) from error
 
 
-def check_pixels(image: Image, name: str, remedy: str, file: Path) -> None:
+def check_pixels(image: PIL.Image.Image, name: str, remedy: str, file: Path) -> None:
     """Check the size of an open image before its pixels are read.
 
     Raises

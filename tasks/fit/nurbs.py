@@ -8,19 +8,27 @@ Adam optimises the heights and weights of a fixed grid of control points under t
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+from flexroad.tasks.roads.road_height import with_road_heights
+from flexroad.tasks.spline import adam, torch_engine
+from flexroad.tasks.spline.moving import WEIGHTS, MovingNurbs, moving
+from flexroad.tasks.spline.objective import Objective, objective
+from flexroad.tasks.spline.space import (
+    Space,
+    check_cells,
+    clamped_space,
+    points_at_spacing,
+    start_heights,
+    surface_on,
+)
+from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT, NurbsSurface
 from flexroad.tasks.types import Bools, Floats, RoadClusters, TileData
-
-if TYPE_CHECKING:
-    from flexroad.tasks.spline.moving import MovingNurbs
-    from flexroad.tasks.spline.objective import Objective
-    from flexroad.tasks.spline.space import Space
-    from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 1
 
@@ -95,11 +103,6 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> NurbsSurfac
         If there are fewer cells with a height than control points, if neither the DTM nor the road has a
         height to start from, or if the device is not available.
     """
-    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-    from flexroad.tasks.roads.road_height import with_road_heights
-    from flexroad.tasks.spline.moving import moving
-    from flexroad.tasks.spline.space import start_heights, surface_on
-
     data = without_invalid_dtm(with_road_heights(data, clusters), clusters)
     space = space_of(data, options)
     start, datum = start_heights(data.dsm, data.dtm, clusters.mask, space, options.terrain)
@@ -120,8 +123,6 @@ def space_of(data: TileData, options: Options) -> Space:
     TaskError
         If the grid has fewer cells than control points.
     """
-    from flexroad.tasks.spline.space import clamped_space, points_at_spacing
-
     points = options.control_points
     if options.spacing_m is not None:
         points = points_at_spacing(data.grid, options.degree, options.spacing_m)
@@ -136,9 +137,6 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
     TaskError
         If there are fewer cells with a height than control points.
     """
-    from flexroad.tasks.spline.objective import objective
-    from flexroad.tasks.spline.space import check_cells
-
     heights = np.where(road, data.dsm, data.dtm) - datum
     check_cells(heights, space.points)
     factor = np.where(road, 1.0, options.lambda_terrain if options.terrain else 0.0)
@@ -147,10 +145,6 @@ def objective_of(data: TileData, road: Bools, space: Space, datum: float, option
 
 def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Floats]:
     """Return the optimised control heights above the datum (m) and the weights."""
-    from flexroad.tasks.spline import adam, torch_engine
-    from flexroad.tasks.spline.moving import WEIGHTS
-    from flexroad.tasks.spline.surface import MAX_LOG_WEIGHT
-
     schedule = adam.Schedule(
         options.learning_rate, options.iterations, options.stop_tolerance, options.stop_window,
         options.result == "last",

@@ -11,6 +11,7 @@ from flexroad.catalog.grid import Bounds
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
 from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.roads.road_height import with_road_heights
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1
@@ -62,8 +63,6 @@ def fit(data: TileData, clusters: RoadClusters, options: Options) -> PlaneSurfac
     TaskError
         If neither the road nor the DTM has a height.
     """
-    from flexroad.tasks.roads.road_height import with_road_heights
-
     data = with_road_heights(data, clusters)
     heights = np.where(clusters.mask, data.dsm, np.nan)
     from_dtm = not np.isfinite(heights).any()

@@ -13,20 +13,27 @@ neighbours have one surface, although no tile waits for another (docs/mosaic.md)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from flexroad.catalog.borders import Border
+from flexroad.tasks.meshing.road_outline import crossings
 from flexroad.tasks.options import Options as BaseOptions
+from flexroad.tasks.roads.distances import distances
+from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
+from flexroad.tasks.roads.road_height import with_road_heights
+from flexroad.tasks.spline.border_steps import border_steps, spline_around
+from flexroad.tasks.spline.frame import Corner, Edge, Frame, rounded
+from flexroad.tasks.spline.irls import HuberObjective, minimise
+from flexroad.tasks.spline.lattice import Lattice, Range
+from flexroad.tasks.spline.objective import objective
+from flexroad.tasks.spline.space import Space, check_cells, start_heights, surface_on
+from flexroad.tasks.spline.stepped import ground_beside, with_steps
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.spline.thin_plate import bending_energy
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
-
-if TYPE_CHECKING:
-    from flexroad.catalog.borders import Border
-    from flexroad.tasks.spline.frame import Corner, Edge, Frame
-    from flexroad.tasks.spline.lattice import Lattice, Range
-    from flexroad.tasks.spline.space import Space
-    from flexroad.tasks.spline.surface import NurbsSurface
 
 VERSION = 8
 
@@ -100,10 +107,6 @@ def fit(data: TileData, clusters: RoadClusters, options: Options, frame: Frame |
         If there are fewer cells with a height than control points, or if neither the DTM nor the road has a
         height to start from.
     """
-    from flexroad.tasks.roads.road_height import with_road_heights
-    from flexroad.tasks.spline.space import check_cells, surface_on
-    from flexroad.tasks.spline.stepped import ground_beside, with_steps
-
     fitted, core = with_road_heights(data, clusters), data.core
     rows, cols = data.grid.window(core)
     lattice = _lattice((core.width, core.height), core.cell, options)
@@ -138,9 +141,6 @@ def corner(
     data, road, clusters : TileData, RoadMask, RoadClusters
         The cells of ``border.grid``, their road mask and the filtered road.
     """
-    from flexroad.tasks.roads.road_height import with_road_heights
-    from flexroad.tasks.spline.frame import Corner, rounded
-
     data = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     k, j = _lines(data, clusters, border, lattice)
@@ -168,11 +168,6 @@ def edge(
     ends : tuple of Corner
         The corners at the western and eastern, or the southern and northern end; their points are held.
     """
-    from flexroad.tasks.meshing.road_outline import crossings
-    from flexroad.tasks.roads.road_height import with_road_heights
-    from flexroad.tasks.spline.border_steps import border_steps, spline_around
-    from flexroad.tasks.spline.frame import Edge, rounded
-
     fitted = with_road_heights(data, clusters)
     lattice, p = _lattice(border.tile, border.grid.cell, options), options.degree
     eastward = border.kind == "east"
@@ -200,8 +195,6 @@ def edge(
 
 
 def _lattice(cells: tuple[int, int], cell: float, options: Options) -> Lattice:
-    from flexroad.tasks.spline.lattice import Lattice
-
     return Lattice.of(cells, cell, options.degree, options.spacing_m)
 
 
@@ -213,15 +206,11 @@ def _precise(options: Options) -> Options:
 
 def _ground(data: TileData, clusters: RoadClusters) -> Floats:
     """Return the heights to fit, ``(H, W)``, m: the DSM's on the road, the valid DTM's elsewhere."""
-    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-
     return np.where(clusters.mask, data.dsm, without_invalid_dtm(data, clusters).dtm)
 
 
 def _lines(data: TileData, clusters: RoadClusters, border: Border, lattice: Lattice) -> tuple[int, int]:
     """Return the number of intervals up to which a corner or edge is fitted, along easting and northing."""
-    from flexroad.tasks.roads.distances import distances
-
     missing, cell = np.isnan(_ground(data, clusters)), data.grid.cell
     if not missing.all():
         needed, along = BEYOND_DATA_M, np.zeros_like(missing)
@@ -254,9 +243,6 @@ def _problem(
     held: Floats, options: Options,
 ) -> _Problem:  # fmt: skip
     """Return the loss over the cells in a part of the lattice."""
-    from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
-    from flexroad.tasks.spline.space import start_heights
-
     space, window = lattice.part(data.grid.shape, start, u, v)
     dsm, road = data.dsm[window], clusters.mask[window]
     dtm = without_invalid_dtm(data, clusters).dtm[window]
@@ -288,10 +274,6 @@ def _minimum(
     options: Options,
 ) -> Floats:  # fmt: skip
     """Return the control heights above the datum, ``(m, n)``, that minimise the loss over a raster."""
-    from flexroad.tasks.spline.irls import HuberObjective, minimise
-    from flexroad.tasks.spline.objective import objective
-    from flexroad.tasks.spline.thin_plate import bending_energy
-
     # Divided by the number of cells with a height, like the differences, so that voids do not change the
     # balance.
     bending = bending_energy(stiffness / np.count_nonzero(np.isfinite(heights)), space)

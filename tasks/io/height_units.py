@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +13,9 @@ from flexroad.catalog.limits import HIGHEST_M, LOWEST_M
 from flexroad.catalog.text import count
 from flexroad.catalog.tile import Layer
 from flexroad.tasks.errors import TaskError, Unusable
+from flexroad.tasks.io.raster import RasterWindow
 from flexroad.tasks.types import Floats
 
-if TYPE_CHECKING:
-    from flexroad.tasks.io.raster import RasterWindow
 
 SMALLER = {"cm": 100, "mm": 1000}
 """Units that heights outside the range may be in, with their number in a metre."""

@@ -6,6 +6,8 @@ from typing import Any
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
+from flexroad.catalog.headers.rasters import date_of, quiet
+from flexroad.tasks.io.raster import Unreadable, read_raster
 
 
 def survey_difference(tile: Tile) -> tuple[str, str]:
@@ -31,9 +33,6 @@ def survey_difference(tile: Tile) -> tuple[str, str]:
 
 def _declared(tile: Tile, name: str) -> list[tuple[str, str]]:
     """Return date and vertical CRS of each file of a layer, "" where it declares none."""
-    from flexroad.catalog.headers.rasters import date_of, quiet
-    from flexroad.tasks.io.raster import Unreadable, read_raster
-
     layer = tile.layer(name)
     found: list[tuple[str, str]] = []
     with quiet():

@@ -27,12 +27,16 @@ from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.vectors import listed
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.tasks import memory
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools
+
+pandas = lazy("pandas")
+pyogrio = lazy("pyogrio")
 
 if TYPE_CHECKING:
     from upath import UPath
@@ -89,8 +93,6 @@ def read_near(request: Query, bounds: Bounds) -> Any:
     TaskError
         If the file is missing or cannot be read, has no such layer or column, or has no CRS.
     """
-    import pandas
-
     try:
         version = stat(request.path)
         is_other = version is None and exists(request.path)
@@ -128,8 +130,6 @@ def _touching(part: Any, bounds: Bounds) -> Any:
 @lru_cache(maxsize=64)
 def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
     """Return the layers to read; ``version`` is in the cache key, so that a changed file is read again."""
-    import pyogrio
-
     try:
         file = _file(request, version)
         kinds = dict(pyogrio.list_layers(file))
@@ -151,8 +151,6 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
 
 def _listed(file: str, kinds: Mapping[str, str | None]) -> str:
     """Return the layers of an opened file for a message, with type and number of features."""
-    import pyogrio
-
     numbers = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
     return listed(
         {name: f"{kinds[name] or 'no geometry'}, {count(n, 'feature')}" for name, n in numbers.items()}
@@ -232,8 +230,6 @@ def has_place(features: NDArray[np.object_]) -> Bools:
 
 def _read_square(request: Query, version: FileStat, layer: _Layer, square: Bounds | None) -> Any:
     """Return a layer's features, or those that touch a square, in the layer's CRS."""
-    import pyogrio
-
     file = _file(request, version)
     bbox = square and transformer(request.crs, layer.crs).transform_bounds(*square, densify_pts=21)
     try:
@@ -249,8 +245,6 @@ def _read_square(request: Query, version: FileStat, layer: _Layer, square: Bound
 
 
 def _read(request: Query, file: str, layer: _Layer, bbox: Bounds | None) -> Any:
-    import pyogrio
-
     def read(**more: str) -> Any:
         return pyogrio.read_dataframe(
             file,

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import vertical
+from flexroad.catalog.headers.kept_rasters import kept_raster
+from flexroad.catalog.headers.rasters import quiet
+from flexroad.tasks.io.raster import Unreadable, read_raster
+from flexroad.tasks.io.raster_header import header
 
 LAYERS = ("dsm", "dtm")
 """Layers that the surface's heights come from."""
@@ -20,11 +24,6 @@ def vertical_crs(tile: Tile) -> str | None:
     TaskError
         If a file cannot be read at the moment.
     """
-    from flexroad.catalog.headers.kept_rasters import kept_raster
-    from flexroad.catalog.headers.rasters import quiet
-    from flexroad.tasks.io.raster import Unreadable, read_raster
-    from flexroad.tasks.io.raster_header import header
-
     found: set[str | None] = set()
     tile = tile.within(tile.grid.bounds)
     with quiet():

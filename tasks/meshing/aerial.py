@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
@@ -29,9 +30,9 @@ class Aerial:
 
     def complete(self) -> NDArray[np.uint8]:
         """Return the colours, ``(h, w, 3)``; an unknown pixel has that of the nearest known one."""
-        from scipy.ndimage import distance_transform_edt
-
-        row, column = distance_transform_edt(self.share == 0, return_distances=False, return_indices=True)
+        row, column = scipy.ndimage.distance_transform_edt(
+            self.share == 0, return_distances=False, return_indices=True
+        )
         return np.asarray(np.rint(self.colour[row, column]), np.uint8)
 
 

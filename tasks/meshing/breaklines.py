@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.types import Bools, Floats
-
-if TYPE_CHECKING:
-    import shapely
 
 LEAST_M = 0.08
 """Smaller steps have no line (m): they are within the noise of a surface model."""
@@ -52,8 +49,6 @@ def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
     local : tuple of float
         West, south, east and north of the tile, from the origin of its cells (m).
     """
-    import shapely
-
     cells = surface.cells
     # The median leaves straight edges where they are. Noise of single cells would break lines into pieces.
     large = np.abs(scipy.ndimage.median_filter(surface.steps, 3)) >= LEAST_M

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Bools, Floats
-
-if TYPE_CHECKING:
-    import shapely
 
 GRID_M = 2.0**-8
 """Where lines cross, their points are moved to multiples of this (m): no two of them are too close."""
@@ -22,8 +19,6 @@ AT_BORDER_M = 0.005
 
 def parts_of(lines: shapely.MultiLineString) -> NDArray[np.object_]:
     """Return lines as an array."""
-    import shapely
-
     return np.asarray(shapely.get_parts(lines))
 
 
@@ -40,8 +35,6 @@ def divided(
     is_fine : callable
         Tells for points, ``(n, 2)``, whether lines are fine there, ``(n,)``.
     """
-    import shapely
-
     pieces = shapely.linestrings(_segments(shapely.segmentize(lines, coarse_m)))
     dense = shapely.segmentize(pieces, fine_m)
     places, piece = shapely.get_coordinates(dense, return_index=True)
@@ -58,8 +51,6 @@ def ends_at_border(lines: Sequence[NDArray[np.object_]], local: Bounds) -> Float
 
 def apart_from(points: Floats, lines: Sequence[NDArray[np.object_]], distance_m: float) -> Bools:
     """Return which points, ``(n, 2 or more)``, are not within a distance (m) of the lines, ``(n,)``."""
-    import shapely
-
     if not lines:
         return np.ones(len(points), np.bool_)
     every = shapely.multilinestrings(np.concatenate(lines))
@@ -105,16 +96,12 @@ def points_and_segments(
 
 def _noded(lines: Sequence[NDArray[np.object_]]) -> shapely.Geometry:
     """Return lines that have no points in common but ends."""
-    import shapely
-
     every = shapely.multilinestrings(np.concatenate(lines))
     return every if len(lines) == 1 else shapely.union_all(every, grid_size=GRID_M)
 
 
 def _segments(lines: shapely.Geometry) -> Floats:
     """Return the segments of lines, ``(n, 2, 2)``."""
-    import shapely
-
     points, line = shapely.get_coordinates(shapely.get_parts(lines), return_index=True)
     joined = line[1:] == line[:-1]
     return np.stack([points[:-1][joined], points[1:][joined]], axis=1)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
@@ -153,15 +154,13 @@ def _fitted(bounds: Bounds, heights: Floats, meshes: Sequence[tuple[Floats, Face
 
 def _filled(heights: Floats, cells: Bools, places: Floats) -> Floats:
     """Return heights at all nodes; a corner of a drawn cell without one has that of the nearest place."""
-    from scipy.spatial import cKDTree
-
     needed = np.zeros(heights.shape, bool)
     for corner in _corners(needed):
         corner[cells] = True
     row, column = np.nonzero(needed & np.isnan(heights))
     filled = np.where(np.isnan(heights), places[:, 2].mean(), heights)
     if len(row):
-        _, nearest = cKDTree(places[:, :2]).query(np.column_stack([column, row]))
+        _, nearest = scipy.spatial.cKDTree(places[:, :2]).query(np.column_stack([column, row]))
         filled[row, column] = places[nearest, 2]
     return filled
 

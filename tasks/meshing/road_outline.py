@@ -7,20 +7,17 @@ Coordinates are metres from the whole-metre origin of a grid (`Grid.origin`). Po
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from flexroad.catalog.borders import Border
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.meshing.lines import GRID_M
 from flexroad.tasks.types import Bools, Floats
-
-if TYPE_CHECKING:
-    import shapely
-
-    from flexroad.catalog.borders import Border
 
 TOLERANCE_M = 0.01
 """Largest distance by which an outline is simplified (m)."""
@@ -42,15 +39,11 @@ class RoadOutline:
 
     def contains(self, points: Floats) -> Bools:
         """Return which points, ``(n, 2 or more)``, are on the road, ``(n,)``."""
-        import shapely
-
         shapely.prepare(self.areas)
         return np.asarray(shapely.contains_xy(self.areas, points[:, 0], points[:, 1]))
 
     def touches(self, points: Floats) -> Bools:
         """Return which points, ``(n, 2)``, are on the road or within `NEAR_M` of it, ``(n,)``."""
-        import shapely
-
         shapely.prepare(self.areas)
         return np.asarray(shapely.dwithin(self.areas, shapely.points(points), NEAR_M))
 
@@ -63,8 +56,6 @@ def encoded(areas: NDArray[np.object_], core: Grid) -> NDArray[np.uint8] | None:
     areas : ndarray of polygons
         In the CRS of the grid.
     """
-    import shapely
-
     west, south, east, north = core.bounds
     within = shapely.box(west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M)
     near = areas[~shapely.is_empty(areas) & has_place(areas)]
@@ -88,8 +79,6 @@ def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> R
     local : tuple of float
         West, south, east and north of the tile (m).
     """
-    import shapely
-
     united = shapely.from_wkb(areas.tobytes())
     inside = shapely.intersection(shapely.boundary(united), shapely.box(*local))
     parts = shapely.get_parts(shapely.line_merge(_lines_of(inside)))
@@ -105,8 +94,6 @@ def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
     areas : ndarray or None
         The result of `encoded` for ``border.grid``.
     """
-    import shapely
-
     if areas is None:
         return np.empty(0)
     west, south, east, north = border.within(0.0)
@@ -118,8 +105,6 @@ def crossings(areas: NDArray[np.uint8] | None, border: Border) -> Floats:
 
 def _closed(areas: shapely.Geometry) -> shapely.Geometry:
     """Return areas with their gaps closed, but possibly without their tips."""
-    import shapely
-
     # GEOS buffers areas of a fixed precision on their grid, and so fills large holes.
     areas = shapely.set_precision(areas, 0)
     wider = shapely.buffer(areas, GAP_M / 2, join_style="mitre")
@@ -128,15 +113,11 @@ def _closed(areas: shapely.Geometry) -> shapely.Geometry:
 
 def _polygons(geometries: Any) -> NDArray[np.object_]:
     """Return the polygons in geometries of any kind."""
-    import shapely
-
     parts = shapely.get_parts(shapely.get_parts(geometries))
     return np.asarray(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)])
 
 
 def _lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:
     """Return the lines of a geometry that may have points as well."""
-    import shapely
-
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return shapely.multilinestrings(parts[shapely.get_type_id(parts) == 1])

@@ -8,15 +8,15 @@ every other one outside, and the lines follow the limit to within a cell.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats
 
-if TYPE_CHECKING:
-    import shapely
+rasterio = lazy("rasterio")
 
 TOLERANCE = 0.3
 """Largest distance by which the lines are simplified (cells): centres are at least 0.35 cells away."""
@@ -33,8 +33,6 @@ class SurveyLimit:
 
     def covers(self, points: Floats) -> Bools:
         """Return which points, ``(n, 2 or more)``, the survey covers, ``(n,)``."""
-        import shapely
-
         shapely.prepare(self.covered)
         return np.asarray(shapely.intersects_xy(self.covered, points[:, 0], points[:, 1]))
 
@@ -53,8 +51,6 @@ def survey_limit(outside: Bools, corner: tuple[float, float], cell: float, withi
     within : tuple of float
         West, south, east and north of the area to be meshed (m): the cells or the hull of their centres.
     """
-    import shapely
-
     if outside.all():
         return SurveyLimit(shapely.MultiLineString(), shapely.MultiPolygon())
     west, south, east, north = within
@@ -106,15 +102,11 @@ def _steps(outside: Bools) -> Floats:
 
 def _covered(lines: shapely.MultiLineString, area: shapely.Polygon, outside: Bools) -> shapely.MultiPolygon:
     """Return the parts of an area between the lines whose cells have data, in columns and rows."""
-    import shapely
-    from rasterio.features import rasterize
-    from rasterio.transform import Affine
-
     network = shapely.union_all([lines, shapely.boundary(area)])
     parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(network)))
-    number = rasterize(
+    number = rasterio.features.rasterize(
         list(zip(parts, range(1, len(parts) + 1), strict=True)),
-        out_shape=outside.shape, transform=Affine.identity(), dtype=np.int32,
+        out_shape=outside.shape, transform=rasterio.transform.Affine.identity(), dtype=np.int32,
     )  # fmt: skip
     cells = np.bincount(number.ravel(), minlength=len(parts) + 1)
     beyond = np.bincount(number.ravel(), outside.ravel(), len(parts) + 1)

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
@@ -185,8 +186,6 @@ def _repeated(places: Floats) -> Bools:
 
 def _crossing(rim: Floats) -> Bools:
     """Return which edges, ``(n, 2, 2)``, have points in common with others that are not ends of both."""
-    import shapely
-
     lines = shapely.linestrings(rim)
     result = np.zeros(len(rim), np.bool_)
     if not shapely.is_simple(shapely.multilinestrings(lines)):

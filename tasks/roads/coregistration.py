@@ -24,7 +24,10 @@ import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats, Orthophoto, TileData
+
+rasterio = lazy("rasterio")
 
 Singles = NDArray[np.float32]
 Sun = tuple[float, float]
@@ -224,11 +227,8 @@ def _working(grid: Grid) -> Grid:
 
 def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
     """Return the mean of the values under each cell of the grid, ``(H, W)``; NaN where there are none."""
-    from rasterio.enums import Resampling
-    from rasterio.warp import reproject
-
     means = np.full(grid.shape, np.nan)
-    reproject(
+    rasterio.warp.reproject(
         values.astype(np.float64),
         means,
         src_transform=source.transform,
@@ -237,7 +237,7 @@ def _onto(values: Floats, source: Grid, grid: Grid) -> Floats:
         dst_crs=grid.crs,
         src_nodata=np.nan,
         dst_nodata=np.nan,
-        resampling=Resampling.average,
+        resampling=rasterio.enums.Resampling.average,
     )
     return means
 

@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.distances import within
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.types import Bools, TileData
+
+cv2 = lazy("cv2")
 
 SLACK = 1e-9
 """Tolerance of sizes as a fraction of a cell, so that 0.6 m is three cells of 0.2 m."""
@@ -82,8 +85,6 @@ def close(mask: Bools, cell: float, width_m: float) -> Bools:
 
     A morphological closing with a disc one cell wider than the gap. Outside the grid there is no road.
     """
-    import cv2
-
     n = math.floor(width_m / cell + SLACK) + 1
     if n == 1:
         return mask
@@ -112,8 +113,6 @@ def drop(mask: Bools, cell: float, area_m2: float) -> Bools:
 
 def _pieces(mask: Bools, cell: float, connectivity: int) -> tuple[NDArray[np.int32], Any, Bools]:
     """Return each cell's piece (0: not in the mask), the pieces' areas (m2), and which touch no grid edge."""
-    import cv2
-
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=connectivity)
     inner = np.ones(count, bool)
     for edge in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):

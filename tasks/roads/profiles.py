@@ -8,17 +8,14 @@ slope become cubic splines along the road. What a road has beside that (crown, r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.roads.height_grid import HeightGrid
 from flexroad.tasks.types import Bools, Floats
-
-if TYPE_CHECKING:
-    from scipy.interpolate import PPoly
 
 
 class Options(base.Options):
@@ -31,9 +28,9 @@ class Options(base.Options):
 class Profiles:
     """Cubic splines over the length along the curve, `ReferenceLine.s`."""
 
-    elevation: PPoly
+    elevation: scipy.interpolate.PPoly
     """Height on the line (m)."""
-    superelevation: PPoly
+    superelevation: scipy.interpolate.PPoly
     """Slope across the road (radians), positive where the left side is higher."""
 
 
@@ -86,13 +83,11 @@ def _straight(heights: Floats, v: Floats, inside: Bools) -> tuple[Floats, Floats
     return np.interp(rows, at, mean_z - slope * mean_v), np.interp(rows, at, slope)
 
 
-def _spline(s: Floats, values: Floats, knot_m: float) -> PPoly:
+def _spline(s: Floats, values: Floats, knot_m: float) -> scipy.interpolate.PPoly:
     """Return the cubic spline with pieces of about ``knot_m`` that fits values by least squares."""
-    from scipy.interpolate import PPoly, make_lsq_spline
-
     # With at least two values a piece the fit is unique.
     pieces = max(1, min(round(s[-1] / knot_m), (len(s) - 1) // 2 - 3))
     knots = np.concatenate([[s[0]] * 3, np.linspace(s[0], s[-1], pieces + 1), [s[-1]] * 3])
-    whole = PPoly.from_spline(make_lsq_spline(s, values, knots, 3))
+    whole = scipy.interpolate.PPoly.from_spline(scipy.interpolate.make_lsq_spline(s, values, knots, 3))
     # The repeated knots at the ends have given pieces without length.
-    return PPoly(whole.c[:, 3:-3], whole.x[3:-3])
+    return scipy.interpolate.PPoly(whole.c[:, 3:-3], whole.x[3:-3])

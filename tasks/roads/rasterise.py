@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.vectors import Query, has_place, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
+
+rasterio = lazy("rasterio")
 
 CLASS_TAGS = ("highway", "area:highway")
 """OSM's tags of a road's class: in tables with such a column, features without a value are not roads."""
@@ -86,12 +89,12 @@ def rasterise_roads(data: TileData, options: Options = DEFAULTS) -> Bools:
 
 def cells(areas: NDArray[np.object_], grid: Grid) -> Bools:
     """Return the cells whose centre lies in one of the polygons, ``(H, W)``."""
-    from rasterio.features import rasterize
-
     areas = areas[~shapely.is_empty(areas) & has_place(areas)]
     if not len(areas):
         return np.zeros(grid.shape, bool)
-    burnt: Any = rasterize(areas, out_shape=grid.shape, transform=grid.transform, dtype=np.uint8)
+    burnt: Any = rasterio.features.rasterize(
+        areas, out_shape=grid.shape, transform=grid.transform, dtype=np.uint8
+    )
     return np.asarray(burnt != 0)
 
 

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
+import shapely
 from pydantic import Field, field_validator
 
 from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Bools, Floats
-
-if TYPE_CHECKING:
-    from scipy.interpolate import PPoly
 
 SAMPLE_M = 0.25
 """Distance of the points that are smoothed (m)."""
@@ -79,7 +77,7 @@ class ReferenceLine:
     """Width of the carriageway at each point, ``(n,)``, m; the line is in its middle."""
     parameter: Floats
     """Parameter of the curve at each point, ``(n,)``."""
-    curve: PPoly
+    curve: scipy.interpolate.PPoly
     """The plan: cubic pieces in x and y, twice continuously differentiable."""
     offset_m: float
     """Largest distance of a point from the centre lines (m)."""
@@ -207,19 +205,15 @@ def _along(points: Floats) -> Floats:
 
 def _away(points: Floats, x: Floats, y: Floats) -> Floats:
     """Return the distances of points from a polyline."""
-    import shapely
-
     return np.asarray(shapely.distance(shapely.LineString(points), shapely.points(x, y)))
 
 
-def _curve(smooth: Floats, piece_m: float) -> PPoly:
+def _curve(smooth: Floats, piece_m: float) -> scipy.interpolate.PPoly:
     """Return a curve through some points of a smooth polyline; its parameter is nearly its length."""
-    from scipy.interpolate import CubicSpline
-
     along = _along(smooth)
     pieces = max(2, round(along[-1] / piece_m))
     chosen = np.round(np.linspace(0, len(smooth) - 1, pieces + 1)).astype(int)
-    return CubicSpline(along[chosen], smooth[chosen], bc_type="natural")
+    return scipy.interpolate.CubicSpline(along[chosen], smooth[chosen], bc_type="natural")
 
 
 def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
@@ -229,8 +223,6 @@ def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
     ``smooth_m`` pass and shorter ones do not. Where the result leaves the allowed distance, weights of the
     points grow until it does not.
     """
-    from scipy.linalg import solveh_banded
-
     along = _along(points)
     at = np.linspace(0.0, along[-1], round(along[-1] / SAMPLE_M) + 1)
     place = np.stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)], axis=1)
@@ -238,7 +230,7 @@ def _smoothed(points: Floats, options: Options, within_m: float) -> Floats:
     weights = np.ones(len(at))
     weights[[0, -1]] = PINNED
     for _ in range(ROUNDS):
-        smooth = solveh_banded(penalty + weights * DIAGONAL, weights[:, None] * place)
+        smooth = scipy.linalg.solveh_banded(penalty + weights * DIAGONAL, weights[:, None] * place)
         over = np.linalg.norm(smooth - place, axis=1) > within_m
         if not over.any():
             break
@@ -254,7 +246,7 @@ def _second_differences(count: int) -> Floats:
     return bands
 
 
-def _equally_spaced(curve: PPoly, increment: float) -> Floats:
+def _equally_spaced(curve: scipy.interpolate.PPoly, increment: float) -> Floats:
     """Return parameters of points whose distances are all equal, from the start of a curve."""
     end = float(curve.x[-1])
     t = np.arange(0.0, end + increment / 2, increment)
@@ -269,7 +261,7 @@ def _equally_spaced(curve: PPoly, increment: float) -> Floats:
     return np.asarray(t[t <= end])
 
 
-def _lengths(curve: PPoly, parameter: Floats) -> Floats:
+def _lengths(curve: scipy.interpolate.PPoly, parameter: Floats) -> Floats:
     """Return the length of a curve from the first to each parameter."""
     ends = np.union1d(parameter, curve.x[(curve.x > parameter[0]) & (curve.x < parameter[-1])])
     node, weight = np.polynomial.legendre.leggauss(6)
@@ -281,9 +273,8 @@ def _lengths(curve: PPoly, parameter: Floats) -> Floats:
 
 def _widths(route: Route, x: Floats, y: Floats, increment: float) -> Floats:
     """Return the width at points of a route; steps between its parts are spread over some metres."""
-    import shapely
-    from scipy.ndimage import uniform_filter1d
-
     tree = shapely.STRtree([shapely.LineString(part.points) for part in route.parts])
     width = np.array([part.width_m for part in route.parts])[tree.nearest(shapely.points(x, y))]
-    return np.asarray(uniform_filter1d(width, max(1, round(WIDENING_M / increment)), mode="nearest"))
+    return np.asarray(
+        scipy.ndimage.uniform_filter1d(width, max(1, round(WIDENING_M / increment)), mode="nearest")
+    )

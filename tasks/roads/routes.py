@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 from pydantic import Field
 
 from flexroad.tasks import options as base
@@ -102,8 +103,6 @@ def routes(lines: Sequence[CentreLine], options: Options) -> list[Route]:
 
 def _pieces(line: CentreLine, max_turn_deg: float) -> Iterator[CentreLine]:
     """Cut a line at its sharp turns and where it crosses itself."""
-    import shapely
-
     keep = np.linalg.norm(np.diff(line.points, axis=0), axis=1) > 0
     points = line.points[np.concatenate([[True], keep])]
     if len(points) < 2:
@@ -120,16 +119,15 @@ def _pieces(line: CentreLine, max_turn_deg: float) -> Iterator[CentreLine]:
 
 def _divided(line: CentreLine, max_length_m: float) -> Iterator[CentreLine]:
     """Divide a line into the least number of equal lengths that are short enough."""
-    from shapely import LineString, get_coordinates
-    from shapely.ops import substring
-
     parts = math.ceil(line.length_m / max_length_m * (1 - 1e-9))
     if parts < 2:
         yield line
         return
-    whole, ends = LineString(line.points), np.linspace(0, 1, parts + 1)
+    whole, ends = shapely.LineString(line.points), np.linspace(0, 1, parts + 1)
     for begin, end in itertools.pairwise(ends):
-        yield replace(line, points=get_coordinates(substring(whole, begin, end, normalized=True)))
+        yield replace(
+            line, points=shapely.get_coordinates(shapely.ops.substring(whole, begin, end, normalized=True))
+        )
 
 
 def _turn(a: Floats, b: Floats) -> Floats:
@@ -191,8 +189,6 @@ def _chain(first: int, follows: dict[End, End]) -> Iterator[tuple[int, bool]]:
 
 def _simple(chain: Sequence[CentreLine], max_length_m: float) -> Iterator[Route]:
     """Cut a chain before each line that would cross or touch the route so far, or make it too long."""
-    import shapely
-
     parts: list[CentreLine] = []
     length_m = 0.0
     for part in chain:

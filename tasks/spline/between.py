@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from flexroad.tasks.types import Bools, Floats
 
@@ -23,9 +24,6 @@ def between(values: Floats, cells: Bools) -> Floats:
     unknown = cells & np.isnan(values)
     if not unknown.any():
         return values
-    from scipy import sparse
-    from scipy.sparse.linalg import spsolve
-
     # With a rim of other cells, every cell has four neighbours.
     given, cells, unknown = np.pad(values, 1), np.pad(cells, 1), np.pad(unknown, 1)
     row, col = np.nonzero(unknown)
@@ -41,6 +39,6 @@ def between(values: Floats, cells: Bools) -> Floats:
         right[known] += given[place][known]
         joints.append((joined, number[place][joined], np.full(joined.size, -1.0)))
     rows, cols, weights = (np.concatenate(part) for part in zip((own, own, degree), *joints, strict=True))
-    matrix = sparse.csc_matrix((weights, (rows, cols)), 2 * (row.size,))
-    given[row, col] = spsolve(matrix, right)
+    matrix = scipy.sparse.csc_matrix((weights, (rows, cols)), 2 * (row.size,))
+    given[row, col] = scipy.sparse.linalg.spsolve(matrix, right)
     return given[1:-1, 1:-1]

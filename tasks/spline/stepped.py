@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.roads.distances import within
+from flexroad.tasks.roads.road_height import ground_heights
 from flexroad.tasks.spline.between import between
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.spline.surface import NurbsSurface
@@ -122,8 +123,6 @@ def ground_beside(data: TileData, clusters: RoadClusters, frame: Frame | None = 
 
     Without a frame there are no steps on the border.
     """
-    from flexroad.tasks.roads.road_height import ground_heights
-
     if clusters.beside is None:
         return None
     window = data.grid.window(data.core)

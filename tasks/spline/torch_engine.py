@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.adam import BETA_1, BETA_2, EPSILON, Schedule
 from flexroad.tasks.spline.objective import NEIGHBOURS, Objective
@@ -14,6 +15,8 @@ from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import torch
+else:
+    torch = lazy("torch")
 
 
 class TorchObjective:
@@ -26,8 +29,6 @@ class TorchObjective:
     """
 
     def __init__(self, objective: Objective, shape: tuple[int, int], device: str) -> None:
-        import torch
-
         if device == "cpu":
             # At these sizes two threads are slower than one.
             torch.set_num_threads(1)
@@ -42,8 +43,6 @@ class TorchObjective:
 
     def tensor(self, array: Floats) -> torch.Tensor:
         """Return the array on the device."""
-        import torch
-
         return torch.tensor(array, dtype=torch.float64, device=self.device)
 
     def __call__(self, variables: torch.Tensor) -> torch.Tensor:
@@ -58,8 +57,6 @@ class TorchObjective:
         return self.basis_v @ coefficients @ self.basis_u.T
 
     def _regulariser(self, z: torch.Tensor) -> torch.Tensor:
-        import torch
-
         rows, cols = z.shape
 
         def neighbours(outside: float) -> torch.Tensor:
@@ -75,8 +72,6 @@ def minimise(
     objective: Objective, start: Floats, limit: Floats, schedule: Schedule, device: str
 ) -> tuple[Floats, list[float]]:
     """Minimise like `tasks.spline.adam.minimise`, with torch's Adam and autograd, on ``device``."""
-    import torch
-
     loss_at = TorchObjective(objective, (start.shape[1], start.shape[2]), device)
     variables = loss_at.tensor(start).requires_grad_()
     bound = loss_at.tensor(np.broadcast_to(limit, start.shape))

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.acquire.mesh.sample import TexturedMesh
+
+PIL = lazy("PIL")
+trimesh = lazy("trimesh")
 
 
 def encode(mesh: TexturedMesh) -> bytes:
@@ -18,9 +22,6 @@ def encode(mesh: TexturedMesh) -> bytes:
     mesh : TexturedMesh
         Faces that share a vertex must also share its texture coordinates.
     """
-    import trimesh
-    from PIL import Image
-
     assert mesh.uv is not None
     origin = np.floor(mesh.vertices.min(axis=0))
     east, north, up = (mesh.vertices - origin).T
@@ -28,7 +29,7 @@ def encode(mesh: TexturedMesh) -> bytes:
     uv[mesh.faces] = mesh.uv
     material = trimesh.visual.material.PBRMaterial(
         name="orthophoto",
-        baseColorTexture=Image.fromarray(mesh.textures[0]),
+        baseColorTexture=PIL.Image.fromarray(mesh.textures[0]),
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )

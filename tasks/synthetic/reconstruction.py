@@ -16,11 +16,14 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options as base
 from flexroad.tasks.synthetic.noise import generator, waves
 from flexroad.tasks.synthetic.scene import Scene
 from flexroad.tasks.synthetic.spoilers import Kind
 from flexroad.tasks.types import Bools, Floats
+
+rasterio = lazy("rasterio")
 
 BUMP_M = (1.5, 15.0)
 """Shortest and longest wave of the bumps (m)."""
@@ -148,10 +151,10 @@ def _open_holes(holes: Bools, grid: Grid, seed: int, faults: Faults) -> Bools:
 
 def _bridge(height: Floats, holes: Bools) -> Floats:
     """Return the heights with a smooth surface in the holes, interpolated from their rims."""
-    from rasterio.fill import fillnodata
-
     span = float(np.hypot(*height.shape))
     # float32 resolves millimetres only near 0.
     base_m = float(height.mean())
-    filled = fillnodata((height - base_m).astype(np.float32), ~holes, span, smoothing_iterations=2)
+    filled = rasterio.fill.fillnodata(
+        (height - base_m).astype(np.float32), ~holes, span, smoothing_iterations=2
+    )
     return np.where(holes, filled + base_m, height)

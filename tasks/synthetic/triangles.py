@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.types import Bools, Floats
+
+pv = lazy("pyvista")
 
 Faces = NDArray[np.int32]
 FRAGMENT_M = (0.4, 1.5)
@@ -38,8 +41,6 @@ def simplified(vertices: Floats, faces: Faces, triangles: int) -> tuple[Floats, 
     Edges are collapsed in the order of their error (quadrics), as in photogrammetry software. Coordinates
     should be small, because they are converted to float32.
     """
-    import pyvista as pv
-
     mesh = pv.PolyData.from_regular_faces(vertices, faces).clean()
     if mesh.n_cells > triangles:
         mesh = mesh.decimate(1 - triangles / mesh.n_cells)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import FARTHEST
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import bounded
@@ -27,6 +28,8 @@ from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 from flexroad.tasks.acquire.mesh.textures import Textures
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
+
+trimesh = lazy("trimesh")
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf")
 UPRIGHT = 2.0
@@ -129,8 +132,6 @@ def _errors(path: Path, resolver: Beside) -> Iterator[None]:
 
 
 def _scene(path: Path, resolver: Beside) -> Any:
-    import trimesh
-
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise TaskError(

@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import check_pixels, image_errors
 from flexroad.tasks.acquire.mesh.beside import beside
 from flexroad.tasks.errors import TaskError
+
+PIL = lazy("PIL")
 
 REMEDY = "export it again, or make no orthophoto: --no-dop"
 HELD, DECODING = 3, 9
@@ -97,8 +100,6 @@ def _of_mtl(path: Path) -> dict[str, Path]:
 
 def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
     """Return a texture, ``(h, w, 3)``, from a file or an open image; others take ``held`` bytes."""
-    from PIL import Image
-
     name = f"the texture {source} of {path}" if isinstance(source, Path) else f"the texture in {path}"
     if isinstance(source, Path) and not source.is_file():
         raise TaskError(
@@ -107,7 +108,7 @@ def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
             file=str(path),
         )
     with image_errors(f"{name} cannot be read", REMEDY, path):
-        image = Image.open(source) if isinstance(source, Path) else source
+        image = PIL.Image.open(source) if isinstance(source, Path) else source
         check_pixels(image, name, REMEDY, path)
         memory.check(held + DECODING * image.width * image.height, name, "use smaller textures", str(path))
         return np.asarray(image.convert("RGB"))

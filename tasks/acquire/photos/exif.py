@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from PIL import ExifTags, Image
 from pyproj import Transformer
 
@@ -289,9 +290,9 @@ def _date(text: Any) -> datetime | None:
 
 
 def _check_one_place(shots: Sequence[Shot], positions: Floats) -> None:
-    from scipy.cluster.hierarchy import fcluster, linkage
-
-    groups = fcluster(linkage(positions[:, :2], "single"), FAR_M, "distance")
+    groups = scipy.cluster.hierarchy.fcluster(
+        scipy.cluster.hierarchy.linkage(positions[:, :2], "single"), FAR_M, "distance"
+    )
     if groups.max() == 1:
         return
     first = [shots[int(np.argmax(groups == k))].path.name for k in range(1, groups.max() + 1)]

@@ -16,10 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options as base
 from flexroad.tasks.acquire import images as images  # sets OpenCV's limit
 from flexroad.tasks.acquire.photos.sfm import Reconstruction, View, colmap
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
+
+cv2 = lazy("cv2")
 
 FEWEST_SHARED = 20
 """Smallest number of sparse points shared by the photographs of a pair."""
@@ -192,10 +196,6 @@ def _pinhole(view: View, size: int) -> Pinhole:
 
 def _read(view: View, size: int) -> NDArray[np.uint8]:
     """Return the reduced photograph in sensor orientation, ``(h, w, 3)``: blue, green, red."""
-    import cv2
-
-    from flexroad.tasks.errors import TaskError
-
     try:
         # The poses are those of the sensor, so the orientation tag is ignored.
         image = cv2.imread(str(view.path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -249,8 +249,6 @@ def _resampled(
     view: View, image: NDArray[np.uint8], rotation: Floats, pixels: Pinhole
 ) -> tuple[NDArray[np.uint8], Bools]:
     """Return a photograph resampled to other pixels, ``(h, w, 3)``, and which it covers, ``(h, w)``."""
-    import cv2
-
     camera = view.camera
     directions = pixels.rays().reshape(-1, 3) @ (view.rotation @ rotation.T).T
     ahead = directions[:, 2] > 0.1
@@ -275,8 +273,6 @@ def _match(
     options: Options,
 ) -> NDArray[np.float32]:
     """Return depths of the first photograph along the common camera's z, ``(h, w)``, m; NaN if unmatched."""
-    import cv2
-
     first, inside = _resampled(view, image, pair.rotation, pair.first)
     second, covered = _resampled(other, partner, pair.rotation, pair.second)
     window = options.window_px
@@ -311,8 +307,6 @@ def _to_view(
 
     Both cameras have the same centre, so the pixel that a ray hits does not depend on the depth.
     """
-    import cv2
-
     directions = rays @ (pair.rotation @ view.rotation.T).T.astype(np.float32)
     position = (
         directions[..., :2] / directions[..., 2:] * pair.first.focal - (pair.first.left, pair.first.top) - 0.5
@@ -351,8 +345,6 @@ def _consistent(
 
 def _without_small_patches(depth: NDArray[np.float32], parallax_m: float) -> NDArray[np.float32]:
     """Return the depths without small patches; a patch ends where the parallax jumps by two pixels."""
-    import cv2
-
     # In 1/16 of a pixel, the unit of the matcher.
     parallax = np.nan_to_num(16 * parallax_m / depth, nan=0).clip(0, 32767).astype(np.int16)
     cv2.filterSpeckles(parallax, 0, int(SMALLEST_PATCH * parallax.size), 32)

@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.acquire.mesh.sample import TexturedMesh
 from flexroad.tasks.acquire.photos.mvs_cpu import Cloud
 from flexroad.tasks.acquire.photos.sfm import colmap
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
+
+trimesh = lazy("trimesh")
 
 CELLS = 2.0
 """Width of the octree's finest cells, in distances between points; smaller cells would fit the noise."""
@@ -58,8 +61,6 @@ def poisson(
     TaskError
         If pycolmap is missing, or there are too few points for a surface.
     """
-    import trimesh
-
     pycolmap = colmap()
     write_ply(work / "cloud.ply", cloud)
     span = float(np.ptp(cloud.points, axis=0).max()) if len(cloud) else 0.0

@@ -17,17 +17,19 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options as base
 from flexroad.tasks.acquire.photos.exif import Control, PlacedPhotos, Shot
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Floats
+
+pycolmap = lazy("pycolmap")
 
 EXHAUSTIVE = 12
 """Up to this number of photographs, all pairs are matched."""
@@ -117,8 +119,8 @@ class Reconstruction:
         return float(np.median(plan)), float(np.median(np.abs(self.residuals[:, 2])))
 
 
-def colmap() -> ModuleType:
-    """Import pycolmap, an optional dependency, and silence its log.
+def colmap() -> Any:
+    """Return pycolmap, an optional dependency, and silence its log.
 
     Raises
     ------
@@ -126,12 +128,11 @@ def colmap() -> ModuleType:
         If it is not installed; the message has the command to install it.
     """
     try:
-        import pycolmap
+        # It logs hundreds of lines of progress; its errors are raised here as TaskError.
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     except ImportError as error:
         raise TaskError(f"photographs need pycolmap ({error}): {INSTALL}") from error
-    # It logs hundreds of lines of progress; its errors are raised here as TaskError.
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    return pycolmap  # type: ignore[no-any-return]
+    return pycolmap
 
 
 def reconstruct(
@@ -156,28 +157,26 @@ def reconstruct(
     TaskError
         If pycolmap is missing, no photographs match, or fewer than 3 or less than half of them can be placed.
     """
-    pycolmap = colmap()
+    colmap()
     pycolmap.set_random_seed(options.seed)
     origin = np.floor(placed.positions.min(axis=0))
     root = Path(os.path.commonpath([shot.path.resolve().parent for shot in placed.shots]))
     shots = {shot.path.resolve().relative_to(root).as_posix(): shot for shot in placed.shots}
     database = work / "database.db"
-    _features(pycolmap, database, root, shots, options)
-    _priors(pycolmap, database, dict(zip(shots, placed.positions - origin, strict=True)), placed)
-    _match(pycolmap, database, len(shots), options)
+    _features(database, root, shots, options)
+    _priors(database, dict(zip(shots, placed.positions - origin, strict=True)), placed)
+    _match(database, len(shots), options)
     has_focal = all(shot.focal_px for shot in placed.shots)
-    model, held = _map(pycolmap, database, root, work, options, has_focal)
+    model, held = _map(database, root, work, options, has_focal)
     _check_placed(model, shots, options)
-    controlled = None if control is None else _control(pycolmap, model, shots, control, origin)
+    controlled = None if control is None else _control(model, shots, control, origin)
     folder = work / "model"
     folder.mkdir()
     model.write(folder)
     return _result(model, (folder, root), placed, shots, origin, controlled, held and controlled is None)
 
 
-def _features(
-    pycolmap: ModuleType, database: Path, root: Path, shots: Mapping[str, Shot], options: Options
-) -> None:
+def _features(database: Path, root: Path, shots: Mapping[str, Shot], options: Options) -> None:
     cameras: dict[tuple[Any, ...], list[str]] = defaultdict(list)
     for name, shot in shots.items():
         cameras[shot.camera, shot.width, shot.height, shot.focal_px].append(name)
@@ -199,7 +198,7 @@ def _features(
         )
 
 
-def _priors(pycolmap: ModuleType, database: Path, local: Mapping[str, Floats], placed: PlacedPhotos) -> None:
+def _priors(database: Path, local: Mapping[str, Floats], placed: PlacedPhotos) -> None:
     accuracy = dict(zip(local, placed.accuracy, strict=True))
     with pycolmap.Database.open(database) as db:
         # Remove the priors in degrees that the feature extraction wrote from EXIF.
@@ -215,7 +214,7 @@ def _priors(pycolmap: ModuleType, database: Path, local: Mapping[str, Floats], p
             )
 
 
-def _match(pycolmap: ModuleType, database: Path, count: int, options: Options) -> None:
+def _match(database: Path, count: int, options: Options) -> None:
     matching = pycolmap.FeatureMatchingOptions(num_threads=options.threads or -1, use_gpu=pycolmap.has_cuda)
     verifying = pycolmap.TwoViewGeometryOptions()
     verifying.ransac.random_seed = options.seed
@@ -236,16 +235,14 @@ def _match(pycolmap: ModuleType, database: Path, count: int, options: Options) -
             )
 
 
-def _map(
-    pycolmap: ModuleType, database: Path, root: Path, work: Path, options: Options, has_focal: bool
-) -> tuple[Any, bool]:
+def _map(database: Path, root: Path, work: Path, options: Options, has_focal: bool) -> tuple[Any, bool]:
     """Return the model with most photographs, and whether the focal length was held fixed."""
     held = has_focal and options.calibrate != "free"
     models = {}
     for hold in [True] * held + [False] * (not held or options.calibrate == "auto"):
         folder = work / f"mapped-{'held' if hold else 'free'}"
         folder.mkdir()
-        candidates = pycolmap.incremental_mapping(database, root, folder, _mapping(pycolmap, options, hold))
+        candidates = pycolmap.incremental_mapping(database, root, folder, _mapping(options, hold))
         if candidates:
             models[hold] = max(candidates.values(), key=lambda model: model.num_reg_images())
     if not models:
@@ -257,7 +254,7 @@ def _map(
     return (models[False], False) if free > fixed else (models[True], True)
 
 
-def _mapping(pycolmap: ModuleType, options: Options, hold: bool) -> Any:
+def _mapping(options: Options, hold: bool) -> Any:
     mapping = pycolmap.IncrementalPipelineOptions(
         use_prior_position=True,
         ba_refine_focal_length=not hold,
@@ -290,9 +287,7 @@ def _check_placed(model: Any, shots: Mapping[str, Shot], options: Options) -> No
     )
 
 
-def _control(
-    pycolmap: ModuleType, model: Any, shots: Mapping[str, Shot], control: Control, origin: Floats
-) -> Floats | None:
+def _control(model: Any, shots: Mapping[str, Shot], control: Control, origin: Floats) -> Floats | None:
     """Transform the model to the control points, adjust it with these fixed; return residuals, ``(n, 3)``, m.
 
     Returns None, and leaves the model unchanged, if fewer than 3 points are marked in 2 placed photographs.
@@ -313,7 +308,7 @@ def _control(
     for image in image_of.values():
         config.add_image(image.image_id)
     for point, rays in zip(given, observations, strict=True):
-        config.add_constant_point(_add_point(pycolmap, model, point, rays))
+        config.add_constant_point(_add_point(model, point, rays))
     pycolmap.create_default_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(print_summary=False), config, model
     ).solve()
@@ -321,7 +316,7 @@ def _control(
     return residuals
 
 
-def _add_point(pycolmap: ModuleType, model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
+def _add_point(model: Any, point: Floats, rays: Sequence[tuple[Any, Floats]]) -> int:
     track = pycolmap.Track()
     for image, pixel in rays:
         image.points2D.append(pycolmap.Point2D(pixel))

@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.acquire.points import low_outliers
 from flexroad.tasks.types import Bools, Floats
+
+cv2 = lazy("cv2")
 
 
 class Options(low_outliers.Options):
@@ -91,8 +94,6 @@ def _highest_ground(surface: Floats, radius: int, fall: float) -> Floats:
     fall : float
         Fall of the ground over one cell (m).
     """
-    import cv2
-
     result = surface.copy()
     for size in range(1, radius + 1):
         disk = _disk(size)

@@ -16,11 +16,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Orthophoto
 
+dinov2 = lazy("transformers.models.dinov2.modeling_dinov2")
+dinov2_with_registers = lazy("transformers.models.dinov2_with_registers.modeling_dinov2_with_registers")
+huggingface_hub = lazy("huggingface_hub")
+transformers = lazy("transformers")
+
 if TYPE_CHECKING:
     import torch
+else:
+    torch = lazy("torch")
 
 Device = Literal["auto", "cpu", "cuda"]
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -90,8 +98,6 @@ class Backbone:
         windows : (n, 3, size, size) array
             Normalised by `MEAN` and `STD`; ``size`` is a multiple of `PATCH`.
         """
-        import torch
-
         side = windows.shape[-1] // PATCH
         dtype = torch.float16 if self.device == "cuda" else torch.bfloat16
         with torch.inference_mode(), torch.autocast(self.device, dtype, enabled=self.half):
@@ -121,11 +127,10 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         If the extra, the weights or the device are missing, or the files are not a DINOv2 model.
     """
     try:
-        import torch
-        from transformers.utils import logging
+        has_gpu = torch.cuda.is_available()
+        transformers.utils.logging.disable_progress_bar()
     except ImportError as error:
         raise missing_extra(error) from error
-    has_gpu = torch.cuda.is_available()
     if device == "cuda" and not has_gpu:
         raise TaskError("no device 'cuda' on this machine; set segment.device to cpu or auto")
     target = "cuda" if has_gpu and device != "cpu" else "cpu"
@@ -134,7 +139,6 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
         torch.set_num_threads(1)
     folder = _folder(name)
     model_class = _model_class(folder, name)
-    logging.disable_progress_bar()
     try:
         model, info = model_class.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True
@@ -156,19 +160,16 @@ def load_backbone(name: str, device: Device = "auto", half: bool = False) -> Bac
 
 
 def _folder(name: str) -> Path:
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
-
     path = Path(name).expanduser()
     if path.is_dir():
         return path
     try:
-        return Path(snapshot_download(name, local_files_only=True))
-    except HFValidationError as error:
+        return Path(huggingface_hub.snapshot_download(name, local_files_only=True))
+    except huggingface_hub.errors.HFValidationError as error:
         raise TaskError(
             f"no folder {name} with a DINOv2 model, and {name} is not a hub name like {EXAMPLE}"
         ) from error
-    except LocalEntryNotFoundError as error:
+    except huggingface_hub.errors.LocalEntryNotFoundError as error:
         raise TaskError(f"the weights of {name} are not on this machine; {_remedy(name)}") from error
 
 
@@ -185,15 +186,7 @@ def _model_class(folder: Path, name: str) -> Any:
     if model_type not in MODEL_TYPES:
         raise TaskError(f"{folder} holds a model of type {model_type!r}, not one of {', '.join(MODEL_TYPES)}")
     # Import only the model's module: importing all of transformers takes seconds.
-    if model_type == "dinov2":
-        from transformers.models.dinov2.modeling_dinov2 import Dinov2Model
-
-        return Dinov2Model
-    from transformers.models.dinov2_with_registers.modeling_dinov2_with_registers import (
-        Dinov2WithRegistersModel,
-    )
-
-    return Dinov2WithRegistersModel
+    return dinov2.Dinov2Model if model_type == "dinov2" else dinov2_with_registers.Dinov2WithRegistersModel
 
 
 def _identity(model: Any) -> str:

@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.options import Options
 from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, missing_extra
 from flexroad.tasks.segment.dinov2.windows import Predict
+
+safetensors = lazy("safetensors")
+torch = lazy("torch")
 
 KEY = "flexroad"
 """Key of `About` in the file's metadata."""
@@ -69,10 +73,8 @@ class Head:
 
     def encode(self) -> bytes:
         """Return the file's content."""
-        from safetensors.numpy import save
-
         arrays = {"weight": np.ascontiguousarray(self.weight), "bias": np.ascontiguousarray(self.bias)}
-        content: bytes = save(arrays, {KEY: self.about.model_dump_json()})
+        content: bytes = safetensors.numpy.save(arrays, {KEY: self.about.model_dump_json()})
         return content
 
 
@@ -85,7 +87,7 @@ def read_head(path: Path) -> Head:
         If the file does not exist, is damaged or is not a head, or safetensors is not installed.
     """
     try:
-        from safetensors import SafetensorError, safe_open
+        safe_open, damaged = safetensors.safe_open, safetensors.SafetensorError
     except ImportError as error:
         raise missing_extra(error) from error
     if not path.is_file():
@@ -99,7 +101,7 @@ def read_head(path: Path) -> Head:
                 raise ValueError("road is not one of its classes")
             shape = len(about.classes), about.layers * about.hidden_size
             return Head(_array(file, "weight", shape), _array(file, "bias", shape[:1]), about)
-    except (SafetensorError, ValueError, OSError) as error:
+    except (damaged, ValueError, OSError) as error:
         if why := access_reason(error):
             raise TaskError(f"{path} {why}", str(path)) from error
         raise TaskError(
@@ -170,8 +172,6 @@ def predictor(head: Head, backbone: Backbone, class_name: str = "road") -> Predi
 
     The logits of the patches are interpolated to the pixels (bilinear), as in DINOv2's segmentation heads.
     """
-    import torch
-
     row = head.about.classes.index(class_name)
     weight = torch.from_numpy(head.weight[row]).to(backbone.device)
     bias = float(head.bias[row])

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks.options import Options
 from flexroad.tasks.segment.training_types import Epoch, Progress
 from flexroad.tasks.types import Floats
 
 if TYPE_CHECKING:
     import torch
+else:
+    torch = lazy("torch")
 
 THRESHOLDS = np.linspace(0.01, 0.99, 99)
 """Candidates for the threshold."""
@@ -84,8 +87,6 @@ class Regression:
     """A linear map trained by AdamW on the weighted cross entropy."""
 
     def __init__(self, windows: Windows, settings: Settings) -> None:
-        import torch
-
         self.centre, self.spread = (torch.tensor(m, dtype=torch.float32) for m in _moments(windows.tokens))
         self.road_weight = ((windows.cells - windows.road) / windows.road) ** settings.balance
         self.weight = torch.zeros(len(self.centre), requires_grad=True)
@@ -106,8 +107,6 @@ class Regression:
 
     def loss(self, windows: Windows, which: NDArray[np.intp]) -> tuple[torch.Tensor, float]:
         """Return the summed cross entropy of the labelled cells in windows ``which``, and their weight."""
-        import torch
-
         logits, road = at_cells(windows, which, *self.folded())
         weights = 1 + (self.road_weight - 1) * road
         entropy = torch.nn.functional.binary_cross_entropy_with_logits
@@ -126,8 +125,6 @@ class Regression:
 
     def mean_loss(self, windows: Windows, batch: int) -> float:
         """Return the mean loss over windows, without training."""
-        import torch
-
         sums = np.zeros(2)
         with torch.no_grad():
             for which in _batches(np.arange(len(windows.labels)), batch):
@@ -163,8 +160,6 @@ def at_cells(
 
     The logits of the patches are interpolated as in `head.predictor`: bilinear, corners not aligned.
     """
-    import torch
-
     logits = []
     for i in which:
         coarse = torch.from_numpy(windows.tokens[i].astype(np.float32)) @ weight + bias
@@ -179,8 +174,6 @@ def at_cells(
 
 def best_threshold(windows: Windows, line: Line) -> tuple[float, float]:
     """Return the probability threshold with the best IoU, and that IoU."""
-    import torch
-
     weight, bias = torch.from_numpy(line.weight), torch.tensor(line.bias)
     counts = np.zeros((2, len(THRESHOLDS) + 1))
     for i in range(len(windows.labels)):

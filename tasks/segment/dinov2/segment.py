@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flexroad.catalog.grid import Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import options
 from flexroad.tasks.errors import LayerMissing
+from flexroad.tasks.io.orthophoto import read_photo
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.mask_cleanup import Cleanup, clean
@@ -24,6 +26,8 @@ from flexroad.tasks.segment.dinov2.backbone import PATCH, Backbone, Device, load
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
 from flexroad.tasks.segment.dinov2.windows import blend, cover
 from flexroad.tasks.types import Bools, Orthophoto, RoadMask, TileData
+
+rasterio = lazy("rasterio")
 
 VERSION = 1
 READS = ("dop", "roads")
@@ -114,8 +118,6 @@ def _predict(
 ) -> tuple[Orthophoto, NDArray[np.float32]]:
     """Return the photo around the tile and the road probability of its pixels, 0 where it has no data."""
     gsd_m, size = options.gsd_m or head.about.gsd_m, options.window_px or head.about.window_px
-    from flexroad.tasks.io.orthophoto import read_photo
-
     overlap = round(size * options.overlap)
     assert data.dop is not None
     photo = read_photo(data.dop, cover(data.grid, gsd_m, size, overlap), gsd_m)
@@ -132,18 +134,17 @@ def _centres(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _mean(probability: NDArray[np.float32], pixels: Grid, grid: Grid) -> NDArray[np.float32]:
     """Return the mean over each cell, ``(H, W)``; bilinear interpolation if pixels are coarser than cells."""
-    from rasterio.enums import Resampling
-    from rasterio.warp import reproject
-
     cells = np.zeros(grid.shape, np.float32)
-    reproject(
+    rasterio.warp.reproject(
         probability,
         cells,
         src_transform=pixels.transform,
         src_crs=pixels.crs,
         dst_transform=grid.transform,
         dst_crs=grid.crs,
-        resampling=Resampling.average if pixels.cell < grid.cell else Resampling.bilinear,
+        resampling=rasterio.enums.Resampling.average
+        if pixels.cell < grid.cell
+        else rasterio.enums.Resampling.bilinear,
     )
     return np.clip(cells, 0, 1)
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import TaskError
-from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu
+from flexroad.tasks.acquire.photos import mvs_cpu, mvs_gpu, sfm
 from flexroad.tasks.acquire.photos.exif import Control, place_photos, read_shot
 from flexroad.tasks.acquire.photos.poisson import poisson, write_ply
 from flexroad.tasks.acquire.photos.sfm import Options, reconstruct
@@ -172,6 +173,7 @@ def test_reconstruct_names_photographs_not_placed(placed, photos, tmp_path):
 
 
 def test_reconstruct_without_pycolmap_gives_install_command(placed, tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm, "pycolmap", lazy("pycolmap"))
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(TaskError, match=r"pip install 'flexroad\[photogrammetry\]'"):
         reconstruct(placed, tmp_path, QUICK)

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Catalog, Grid
+from flexroad.catalog.lazy import lazy
 from flexroad.tasks import TaskError, load
 from flexroad.tasks.roads import coregistration
 from flexroad.tasks.roads.mask_cleanup import NOTHING
+from flexroad.tasks.segment.dinov2 import backbone, head
 from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
@@ -394,6 +396,7 @@ def test_segment_without_extra_names_package(heads, sample, monkeypatch, module)
     load_backbone.cache_clear()
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr({"transformers": backbone, "safetensors": head}[module], module, lazy(module))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(TaskError, match=rf'needs {module}: pip install "flexroad\[dinov2\]"'):
         segmented(sample.data, heads[0])
