@@ -34,7 +34,8 @@ from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.benchmark.truth import CATALOG
 from flexroad.pipeline.cli.main import main as flexroad
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_function
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES
+from flexroad.tasks.options import stage_function
 from flexroad.tasks.synthetic import gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import Kind
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData

@@ -1,12 +1,8 @@
-"""Corners and edges of tiles: small tiles of their own, which all tiles around them share.
+"""Corners and edges of tiles as nodes of the graph; `tasks.border` computes them.
 
-A fit whose module has the functions `corner` and `edge` holds the control points that they return. Each part
-of a border is one node of the graph::
-
-    Border -> load_border -> segment -> ecsrc -> corner | edge -> the tile's fit
-
-Its fingerprint follows from its position, the options of these stages and the files that reach the ground
-around it, and not from a tile: neighbouring tiles have the same node, and the first one stores its result.
+The fingerprint of such a node follows from its position, the options of its stages and the files that reach
+the ground around it, and not from a tile: neighbouring tiles have the same node, and the first one stores its
+result.
 """
 
 from __future__ import annotations
@@ -22,31 +18,20 @@ import numpy as np
 import shapely
 
 from flexroad.catalog import Catalog, Grid, Layer, Tile
-from flexroad.catalog.borders import Border, Kind, border_at, border_of, places_of
+from flexroad.catalog.borders import Border, Kind, border_at, places_of
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.tile import REACH_M, files_around
 from flexroad.pipeline.config.models import Chain, Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.sources import border_json, to_json
-from flexroad.pipeline.graph.stages import model_files, stage_function, stage_head, stage_module
-from flexroad.tasks.errors import LayerMissing, TaskError
-from flexroad.tasks.load import READS, load_border
-from flexroad.tasks.load import Options as LoadOptions
-from flexroad.tasks.options import Options
-from flexroad.tasks.roads.extent import beyond_extent
-from flexroad.tasks.spline.frame import Corner, Edge, Frame
+from flexroad.pipeline.graph.stages import model_files, stage_head
+from flexroad.tasks.border import BorderStages, BorderTask
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import Options, stage_module
 from flexroad.tasks.spline.lattice import check_spacing
-from flexroad.tasks.types import RoadMask, TileData
 
 STAGE = "border"
 """Name of the nodes in the store, the log and the table of failures."""
-AROUND_M = 100.0
-"""Distance from a corner or edge up to which the filter sees the ground (m): it judges a road by the size of
-its cluster, and a short piece of a viaduct would look like an object. A larger halo counts instead, or
-the distance up to which the control points act: without ground there, the mesh must not depend on them."""
-ENDS = ((0, 1), (2, 3), (0, 2), (1, 3))
-"""Numbers of the corners at the ends of the southern, northern, western and eastern edge."""
-
 KEPT = 4096
 """Corners and edges that are kept because the tiles of the next row have them, too: of a thousand tiles."""
 
@@ -54,112 +39,6 @@ KEPT = 4096
 def has_borders(fit: Options) -> bool:
     """Return whether a method of the fit shares the border of a tile with its neighbours."""
     return hasattr(stage_module(fit), "edge")
-
-
-@dataclass(frozen=True)
-class BorderStages:
-    """The stages that a corner or edge goes through, with their options."""
-
-    segment: Options
-    ecsrc: Options
-    fit: Options
-    load: LoadOptions
-    """The heights that roads are fitted to, and the halo of the tiles: if it sees the far side of a void, so
-    must the corner or edge."""
-
-    @classmethod
-    def of(cls, chain: Chain) -> BorderStages:
-        """Return those of a variant."""
-        load = chain["load"]
-        assert isinstance(load, LoadOptions)
-        return cls(chain["segment"], chain["ecsrc"], chain["fit"], load)
-
-    @property
-    def heights(self) -> list[Any]:
-        """The options of `load` that its ground depends on, as they enter fingerprints."""
-        return [self.load.road_height, self.load.offset_undeclared]
-
-    @property
-    def by_name(self) -> dict[str, Options]:
-        """The options by stage."""
-        return {"segment": self.segment, "ecsrc": self.ecsrc, "fit": self.fit}
-
-    @property
-    def reads(self) -> frozenset[str]:
-        """Names of the layers that they read."""
-        return frozenset((*READS, *getattr(stage_module(self.segment), "READS", ())))
-
-    @property
-    def reach_m(self) -> float:
-        """Distance from a corner or edge up to which ground is read (m), at most `REACH_M`."""
-        fit: Any = stage_module(self.fit)
-        acting_m: float = fit.acting_m(self.fit)
-        return min(max(AROUND_M, self.load.halo_m, acting_m), REACH_M)
-
-    def part(self, border: Border, data: TileData, ends: Sequence[Corner]) -> Corner | Edge:
-        """Return the control points of a corner, or of an edge between its two ends.
-
-        Parameters
-        ----------
-        data : TileData
-            The rasters around it, from `load_border`.
-        """
-        road = self._segmented(data)
-        clusters = stage_function("ecsrc", self.ecsrc)(data, road, self.ecsrc)
-        module: Any = stage_module(self.fit)
-        if border.kind == "corner":
-            corner: Corner = module.corner(data, road, clusters, border, self.fit)
-            return corner
-        edge: Edge = module.edge(data, road, clusters, border, ends, self.fit)
-        return edge
-
-    def frame(self, data: TileData, tile: Grid) -> Frame:
-        """Return the frame of a tile from rasters that reach `reach_m` beyond it."""
-        parts: list[Any] = []
-        for number, border in enumerate(border_of(tile, self.reach_m)):
-            ends = [parts[end] for end in ENDS[number - 4]] if number >= 4 else []
-            parts.append(self.part(border, _cut(data, border.grid), ends))
-        return Frame(*parts)
-
-    def _segmented(self, data: TileData) -> RoadMask:
-        try:
-            road: RoadMask = stage_function("segment", self.segment)(data, self.segment)
-        except LayerMissing:
-            nowhere = np.zeros(data.grid.shape, np.bool_)
-            road = RoadMask(data.grid, data.core, nowhere, beyond_extent(data))
-        return road
-
-
-def _cut(data: TileData, grid: Grid) -> TileData:
-    """Return the data of a corner or edge, a part of larger rasters."""
-    part = data.grid.window(grid)
-    return TileData(
-        tile_id=data.tile_id,
-        grid=grid,
-        core=grid,
-        dsm=data.dsm[part],
-        dtm=data.dtm[part],
-        road_height=None if data.road_height is None else data.road_height[part],
-        offset_dsm=data.offset_dsm,
-        road_mask=None if data.road_mask is None else data.road_mask[part],
-    )
-
-
-@dataclass(frozen=True)
-class BorderTask:
-    """The computation of one corner or edge."""
-
-    border: Border
-    stages: BorderStages
-
-    def ground(self, tile: Tile) -> Tile:
-        """Return the ground around it, with the files of a tile that reach it and that the stages read."""
-        return tile.around(self.border.grid, self.border.within(REACH_M), self.stages.reads)
-
-    def __call__(self, tile: Tile, ends: Sequence[Corner]) -> Corner | Edge:
-        """Return the control points of the corner, or of the edge between its two ends."""
-        data = load_border(self.ground(tile), tile.grid, self.stages.load)
-        return self.stages.part(self.border, data, ends)
 
 
 @dataclass(frozen=True)

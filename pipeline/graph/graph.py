@@ -26,7 +26,7 @@ from typing import Any
 from flexroad.catalog import Layer, Tile
 from flexroad.catalog.storage.paths import FileStat, Location, stat
 from flexroad.pipeline.config.models import Chain, Config, Export
-from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderPattern, BorderTask, has_borders
+from flexroad.pipeline.graph.borders import STAGE, BorderPattern, has_borders
 from flexroad.pipeline.graph.sources import (
     Recorded,
     SourceFiles,
@@ -36,16 +36,10 @@ from flexroad.pipeline.graph.sources import (
     names_json,
     to_json,
 )
-from flexroad.pipeline.graph.stages import (
-    STAGE_NAMES,
-    STAGES,
-    model_files,
-    stage_function,
-    stage_head,
-    stage_module,
-)
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, model_files, stage_head
+from flexroad.tasks.border import ENDS, BorderTask
 from flexroad.tasks.export import cog, glb, npz, ply
-from flexroad.tasks.options import Options
+from flexroad.tasks.options import Options, stage_function, stage_module
 
 ITEM_VERSION = 2
 """Raised when the STAC item of a tile changes for the same result."""

@@ -8,7 +8,8 @@ from flexroad.catalog import Catalog, Tile
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import product_layers
-from flexroad.pipeline.graph.stages import stage_module, stage_version
+from flexroad.pipeline.graph.stages import stage_version
+from flexroad.tasks.options import stage_module
 
 PRODUCTION = {"road_mask": "production", "roads": "production_vector"}
 """Layer of roads -> the shipped configuration that takes the roads from it, the preferred one first."""

@@ -15,13 +15,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from flexroad.tasks.options import Options
+from flexroad.tasks.options import Options, stage_module
 
 STAGES: dict[str, tuple[str, ...]] = {
     "load": (),
@@ -36,11 +34,6 @@ STAGES: dict[str, tuple[str, ...]] = {
 STAGE_NAMES = tuple(STAGES)
 
 
-def stage_module(options: Options) -> ModuleType:
-    """Return the module that computes the stage: the one that defines the options' class and `VERSION`."""
-    return sys.modules[type(options).__module__]
-
-
 def stage_version(stage: str, options: Options) -> tuple[str, int]:
     """Return the name of a stage with its method, such as ``fit.nurbs``, and its `VERSION`."""
     method = options.model_dump().get("method")
@@ -50,12 +43,6 @@ def stage_version(stage: str, options: Options) -> tuple[str, int]:
 def stage_head(stage: str, options: Options) -> list[Any]:
     """Return stage, `VERSION` and options as they enter fingerprints."""
     return [stage, stage_module(options).VERSION, options.model_dump(mode="json")]
-
-
-def stage_function(stage: str, options: Options) -> Callable[..., Any]:
-    """Return the function that computes a stage: the function named ``stage`` in the options' module."""
-    function: Callable[..., Any] = getattr(stage_module(options), stage)
-    return function
 
 
 def model_files(options: Options) -> tuple[Path, ...]:

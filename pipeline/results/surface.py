@@ -19,12 +19,13 @@ from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.borders import BorderStages, has_borders
-from flexroad.pipeline.graph.stages import stage_function
+from flexroad.pipeline.graph.borders import has_borders
 from flexroad.tasks import sample, types
+from flexroad.tasks.border import BorderStages
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import npz
 from flexroad.tasks.load_arrays import load_arrays
+from flexroad.tasks.options import stage_function
 from flexroad.tasks.quality.assess import NO_ROAD
 from flexroad.tasks.segment import mask
 from flexroad.tasks.spline.frame import Frame

@@ -21,11 +21,10 @@ from flexroad.catalog import Tile
 from flexroad.catalog.storage.paths import Location, stat
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
-from flexroad.pipeline.graph.stages import stage_function
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.records import Failure, utc_now
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.options import Options
+from flexroad.tasks.options import Options, stage_function
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.types import RoadClusters, Surface, TileData
 

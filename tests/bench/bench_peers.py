@@ -20,10 +20,10 @@ import numpy as np
 from flexroad.catalog import Catalog, Grid
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
-from flexroad.pipeline.graph.stages import stage_function
 from flexroad.tasks import load, sample
 from flexroad.tasks.fit.raster import RasterSurface
 from flexroad.tasks.metrics import evaluate
+from flexroad.tasks.options import stage_function
 from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
 from flexroad.tasks.types import Floats, RoadClusters, RoadMask, Surface, TileData
 from tests.bench.gis_peers import installed

@@ -21,10 +21,10 @@ from flexroad.catalog import Catalog
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.execute import SerialExecutor
-from flexroad.pipeline.graph.stages import stage_function
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks import load
+from flexroad.tasks.options import stage_function
 from tests.bench import bench_simulated, bench_tile, measure_stages
 from tests.bench.timing import Peak, cpu_s, one_cpu_s, one_thread, peak
 

@@ -21,12 +21,14 @@ from flexroad.catalog.tile import REACH_M
 from flexroad.pipeline.benchmark.scenes import MADE, write_scenes
 from flexroad.pipeline.config.loading import compose, load_config
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.graph.borders import ENDS, STAGE, BorderStages, check_tiles
+from flexroad.pipeline.graph.borders import STAGE, check_tiles
 from flexroad.pipeline.graph.graph import Pattern, files_read, tile_graph
-from flexroad.pipeline.graph.stages import model_files, stage_module
+from flexroad.pipeline.graph.stages import model_files
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.tasks import load
+from flexroad.tasks.border import ENDS, BorderStages
 from flexroad.tasks.errors import TaskError
+from flexroad.tasks.options import stage_module
 from flexroad.tasks.spline.lattice import Lattice
 
 PRODUCTION = load_config("production")

@@ -20,8 +20,9 @@ from flexroad.pipeline.graph.graph import (
     own_files_missing,
     tile_graph,
 )
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_module, stage_version
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_version
 from flexroad.tasks.filter import ecsrc
+from flexroad.tasks.options import stage_module
 from flexroad.tasks.segment import mask
 from tests.make_rasters import write
 

@@ -8,7 +8,7 @@ import pytest
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.graph.borders import ENDS
+from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.roads.extent import beyond_extent

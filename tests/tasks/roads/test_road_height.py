@@ -7,9 +7,9 @@ import pytest
 
 from flexroad.catalog import Grid
 from flexroad.catalog.borders import border_of
-from flexroad.pipeline.graph.borders import ENDS
 from flexroad.tasks.acquire.points.to_rasters import Options as Rastering
 from flexroad.tasks.acquire.points.to_rasters import rasterise
+from flexroad.tasks.border import ENDS
 from flexroad.tasks.filter import planar
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality import assess

@@ -8,9 +8,9 @@ from scipy.ndimage import distance_transform_edt
 
 from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
-from flexroad.pipeline.graph.borders import ENDS
 from flexroad.pipeline.store import codec
 from flexroad.tasks import sample
+from flexroad.tasks.border import ENDS
 from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.metrics.mesh_check import check
 from flexroad.tasks.spline.frame import Frame
