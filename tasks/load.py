@@ -19,10 +19,9 @@ from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.below_ground import below_ground_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference
 from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
-from flexroad.tasks.io.same_survey import survey_difference
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 VERSION = 3

@@ -13,7 +13,7 @@ from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.below_ground import below_ground_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note
 from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid

@@ -16,7 +16,7 @@ from flexroad.pipeline.benchmark.dsc3d import write_stand_in
 from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs
-from flexroad.tasks.io.vector_date import vector_date
+from flexroad.tasks.io.vectors import vector_date
 from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tasks.synthetic.orthophoto import orthophoto

@@ -19,8 +19,6 @@ HOMES = {
 """Stage -> its module, or the package of its methods if it has several; in the paper's order."""
 DEFAULTS = {"segment": "mask", "ecsrc": "paper", "fit": "nurbs"}
 """Default method of each stage that has several."""
-NO_METHODS = ("kit", "training_types")
-"""Modules in the packages of methods that are not methods."""
 
 
 @cache
@@ -35,8 +33,7 @@ def methods(stage: str) -> dict[str, Any]:
         return {"": home}
     modules: dict[str, Any] = {}
     for file in sorted(pkgutil.iter_modules(home.__path__), key=lambda file: file.name):
-        if file.name not in NO_METHODS:
-            name = f"{file.name}.{stage}" if file.ispkg else file.name
-            module = importlib.import_module(f"{HOMES[stage]}.{name}")
-            modules |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
+        name = f"{file.name}.{stage}" if file.ispkg else file.name
+        module = importlib.import_module(f"{HOMES[stage]}.{name}")
+        modules |= dict.fromkeys(get_args(module.Options.model_fields["method"].annotation), module)
     return modules

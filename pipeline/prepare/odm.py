@@ -32,7 +32,7 @@ from flexroad.pipeline.prepare.points import prepare_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks import memory
-from flexroad.tasks.acquire.points import fill_voids, ground_filter, to_rasters
+from flexroad.tasks.acquire.points import ground_filter, tin, to_rasters
 from flexroad.tasks.types import Floats, Orthophoto
 
 DSM, DTM, PHOTO = "odm_dem/dsm.tif", "odm_dem/dtm.tif", "odm_orthophoto/odm_orthophoto.tif"
@@ -171,7 +171,7 @@ def _resample_photo(writer: RasterWriter, path: Path, frame: MetricTransform) ->
 def _filter_ground(writer: RasterWriter, options: to_rasters.Options) -> None:
     """Write a DTM made from the DSM: the heights of its ground cells, with voids interpolated."""
     slope = options.filter
-    reach = slope.reach_m + fill_voids.reach_m(options.void_m, writer.grid.cell)
+    reach = slope.reach_m + tin.voids_reach_m(options.void_m, writer.grid.cell)
     side = BLOCK + 2 * reach / writer.grid.cell
     cells = min(side**2, writer.grid.width * writer.grid.height)
     memory.check(
@@ -181,7 +181,7 @@ def _filter_ground(writer: RasterWriter, options: to_rasters.Options) -> None:
         rim = _clipped(part.buffered(reach), writer.grid)
         dsm: Floats = writer.read("dsm", rim)
         is_ground = ground_filter.ground_cells(dsm, rim.cell, slope)
-        dtm = fill_voids.fill(np.where(is_ground, dsm, np.nan), rim, options.void_m)
+        dtm = tin.fill_voids(np.where(is_ground, dsm, np.nan), rim, options.void_m)
         writer.write("dtm", part, dtm[rim.window(part)])
 
 

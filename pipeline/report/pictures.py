@@ -35,7 +35,7 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.quality.compared import compare
+from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.places import places
 from flexroad.tasks.types import Mesh
 

@@ -32,7 +32,7 @@ from flexroad.tasks.roads.mask_cleanup import NOTHING
 from flexroad.tasks.roads.mask_metrics import Quality, judge, together
 from flexroad.tasks.segment.dinov2 import segment as segmenter
 from flexroad.tasks.segment.dinov2 import train as head
-from flexroad.tasks.segment.training_types import Epoch, Sample, Trained
+from flexroad.tasks.segment.dinov2.train import Epoch, Sample, Trained
 from flexroad.tasks.types import Bools, RoadMask, TileData
 
 Labels = Literal["mask", "vector"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.io.vector_date import vector_date
+from flexroad.tasks.io.vectors import vector_date
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Floats
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.filter.kit.union_find import (
+from flexroad.tasks.roads.union_find import (
     Roots,
     clean,
     compress,

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.dtm_validity import without_invalid_dtm
 from flexroad.tasks.roads.road_height import with_road_heights
-from flexroad.tasks.spline import adam, torch_engine
+from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.moving import WEIGHTS, MovingNurbs, moving
 from flexroad.tasks.spline.objective import Objective, objective
 from flexroad.tasks.spline.space import (
@@ -156,7 +156,7 @@ def _adam(loss: Objective, start: Floats, options: Options) -> tuple[Floats, Flo
     variables = np.stack([start, np.zeros_like(start)])
     limit = np.array([math.inf, MAX_LOG_WEIGHT])[:, None, None]
     if options.engine == "torch":
-        (z, rho), _ = torch_engine.minimise(loss, variables, limit, schedule, options.device)
+        (z, rho), _ = adam.minimise_with_torch(loss, variables, limit, schedule, options.device)
     else:
         (z, rho), _ = adam.minimise(loss, variables, limit, schedule)
     return z, np.exp(rho)

@@ -7,10 +7,12 @@ bucket is copied once per process, because reading a GeoPackage in place takes h
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -277,3 +279,13 @@ def _unpacked(table: Any, columns: tuple[str, ...]) -> Any:
 
 def _unescaped(value: str | None) -> str | None:
     return value and re.sub(r"\\(.)", r"\1", value)
+
+
+@contextlib.contextmanager
+def vector_date(date: datetime) -> Iterator[None]:
+    """Make GDAL write a date (UTC) in place of the current one, as GeoPackages have; a context manager."""
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{date:%Y-%m-%dT%H:%M:%SZ}"})
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexroad.tasks import options as base
 from flexroad.tasks.metrics.statistics import mean, nmad
-from flexroad.tasks.quality.compared import compare
+from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.holdout import Refit, holdout
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.roads.dtm_validity import AGREE_M

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.metrics.statistics import mean
-from flexroad.tasks.quality.compared import compare, heights_fitted
-from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M
+from flexroad.tasks.quality.estimate import INTERVAL, SQUARE_M, compare, heights_fitted
 from flexroad.tasks.types import Bools, RoadClusters, RoadMask, Surface, TileData
 
 INSET_M = 15.0

@@ -7,7 +7,7 @@ import scipy
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.assess import Options
-from flexroad.tasks.quality.compared import Compared
+from flexroad.tasks.quality.estimate import Compared
 from flexroad.tasks.quality.support import Support
 from flexroad.tasks.types import Bools, Floats
 

@@ -105,3 +105,25 @@ def _nearest(cells: NDArray[np.intp], aside: NDArray[np.int32]) -> tuple[Floats,
                 if square < squares[k] or (square == squares[k] and col < nearest):
                     squares[k], found[k], nearest = square, row * cols + col, col
     return squares, found
+
+
+@compiled()
+def columns_of(mask: Bools) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Return the columns of the cells of a mask, row by row, and where those of each cell begin.
+
+    The columns of row ``r`` from ``c`` up to ``d`` are ``columns[before[r * W + c] : before[r * W + d]]``.
+
+    Parameters
+    ----------
+    mask : (H, W) array of bool
+
+    Returns
+    -------
+    columns : (n,) array of int
+        Ascending within a row.
+    before : (H * W + 1,) array of int
+        Number of cells of the mask before each cell.
+    """
+    before = np.zeros(mask.size + 1, np.int32)
+    before[1:] = np.cumsum(mask)
+    return np.flatnonzero(mask) % mask.shape[1], before

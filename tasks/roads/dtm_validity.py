@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.roads.columns import columns_of
+from flexroad.tasks.roads.distances import columns_of
 from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, TileData
 
 AGREE_M = 0.3

@@ -14,12 +14,22 @@ import numpy as np
 import scipy
 
 from flexroad.tasks.compiled import compiled
-from flexroad.tasks.spline.equations import RIDGE, undetermined
+from flexroad.tasks.errors import TaskError
 from flexroad.tasks.spline.stencil import from_lines, to_lines
 from flexroad.tasks.types import Bools, Floats
 
 WIDEST = 64
 """Largest number of diagonals on one side of the main one: above, `Multigrid` is faster."""
+RIDGE = 1e-9
+"""Share of the diagonal's mean that is added to it: undetermined control points then keep their height."""
+
+
+def undetermined(point: int) -> TaskError:
+    """Return the error that says which control point, counted from 1, the equations do not determine."""
+    return TaskError(
+        f"control point {point} of the surface is undetermined; use fewer control points (a larger "
+        "fit.spacing_m), or raise fit.bending_m3"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import scipy
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.metrics.plane_lstsq import least_squares_plane
+from flexroad.tasks.metrics.statistics import least_squares_plane
 from flexroad.tasks.roads.distances import filled
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, greville
 from flexroad.tasks.types import Bools, Floats

@@ -2,24 +2,27 @@
 
 The spline is the road's surface, continued beside it. A cell beside the road has a step: the height of the
 ground there above the spline, by DSM or DTM. So both sides of a kerb have their own height, and the road
-stays smooth.
+stays smooth. On an edge between two tiles, both take the steps from the same `Edge`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from flexroad.catalog.borders import Border
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.roads.distances import within
+from flexroad.tasks.roads.distances import distances, within
 from flexroad.tasks.roads.road_height import ground_heights
-from flexroad.tasks.spline.between import between
-from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.spline.frame import Frame, rounded
+from flexroad.tasks.spline.lattice import Lattice, Range
+from flexroad.tasks.spline.space import surface_on
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Bools, Floats, RoadClusters, Surface, TileData
+from flexroad.tasks.types import Bools, Floats, RoadClusters, RoadMask, Surface, TileData
 
 SAME_M = 0.25
 """A DSM within this of the spline (m) shows the ground: it is the road, or as low as a kerb."""
@@ -37,6 +40,8 @@ KERB_M = 2.0
 wall. Farther away the DTM is nearer to the ground than a DSM with grass and shrubs."""
 ROUNDING_M = 1e-6
 """Points this near to the border of a tile are on it (m)."""
+HELD = 1e-9
+"""Weight of 0 in each cell without a value: parts that no known value touches become 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,3 +231,94 @@ def _walls(around: Floats, smoothed: Floats) -> Floats:
     rows = np.arange(len(around))
     medians = (ordered[rows, np.maximum(count - 1, 0) // 2] + ordered[rows, np.minimum(count // 2, 8)]) / 2
     return np.where(smoothed * np.sign(medians) >= np.abs(medians) / 2, medians, 0.0)
+
+
+def between(values: Floats, cells: Bools) -> Floats:
+    """Return values with those that are NaN filled: each is the mean of its neighbours among the cells.
+
+    Parameters
+    ----------
+    values : ndarray, (H, W)
+        NaN only in the given cells.
+    cells : ndarray of bool, (H, W)
+        The other cells count as insulated: their values have no effect.
+    """
+    unknown = cells & np.isnan(values)
+    if not unknown.any():
+        return values
+    # With a rim of other cells, every cell has four neighbours.
+    given, cells, unknown = np.pad(values, 1), np.pad(cells, 1), np.pad(unknown, 1)
+    row, col = np.nonzero(unknown)
+    number = np.full(given.shape, -1)
+    number[row, col] = own = np.arange(row.size)
+    degree, right, joints = np.full(row.size, HELD), np.zeros(row.size), []
+    for down, east in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        place = row + down, col + east
+        known = cells[place] & ~unknown[place]
+        joined = np.flatnonzero(unknown[place])
+        degree[known] += 1
+        degree[joined] += 1
+        right[known] += given[place][known]
+        joints.append((joined, number[place][joined], np.full(joined.size, -1.0)))
+    rows, cols, weights = (np.concatenate(part) for part in zip((own, own, degree), *joints, strict=True))
+    matrix = scipy.sparse.csc_matrix((weights, (rows, cols)), 2 * (row.size,))
+    given[row, col] = scipy.sparse.linalg.spsolve(matrix, right)
+    return given[1:-1, 1:-1]
+
+
+def spline_around(lattice: Lattice, border: Border, u: Range, v: Range, control: Floats) -> NurbsSurface:
+    """Return the spline with some control heights (m) over a part of the lattice around a corner or edge."""
+    (east, north), (along_u, along_v) = border.start, lattice.unit_m
+    space, _ = lattice.part(border.grid.shape, border.cell, u, v)
+    bounds = east + u[0] * along_u, north + v[0] * along_v, east + u[1] * along_u, north + v[1] * along_v
+    return surface_on(space, border.grid, bounds, control, np.ones_like(control), datum=0.0)
+
+
+def border_steps(
+    data: TileData, road: RoadMask, clusters: RoadClusters, border: Border, spline: NurbsSurface
+) -> dict[str, Floats]:
+    """Return ``steps`` and ``road_m`` of an `Edge`; empty if the filter gives no cells beside streets.
+
+    A step is the mean of those of the two cells beside the edge, so that the ground goes on across it. It is
+    0 where one of the two has none: the edge of a road is not moved.
+
+    Parameters
+    ----------
+    data, road, clusters : TileData, RoadMask, RoadClusters
+        The cells around the edge, their road mask and the filtered road.
+    spline : NurbsSurface
+        The spline around the edge; NaN if there is no ground.
+    """
+    if clusters.beside is None or np.isnan(spline.A).any():
+        return {}
+    # As much ground as decides on the steps of the cells beside the edge.
+    reach = math.ceil(KERB_M / data.grid.cell) + 1
+    (rows, cols), (last_rows, last_cols) = border.sides
+    strip = (
+        _widened(rows, last_rows, reach, data.grid.height),
+        _widened(cols, last_cols, reach, data.grid.width),
+    )
+    grid, heights = data.grid.part(*strip), ground_heights(data, clusters)
+    part = TileData(data.tile_id, grid, grid, heights.dsm[strip], heights.dtm[strip])
+    beside = ground_beside(part, RoadClusters(grid, clusters.labels[strip], None, clusters.beside[strip]))
+    if beside is None:
+        return {}
+    steps, has_step = np.zeros((2, *data.grid.shape))
+    steps[strip], has_step[strip] = with_steps(beside, spline, grid).steps, beside.cells
+    both = border.along(has_step).all(axis=0)
+    mean = np.where(both, border.along(steps).sum(axis=0) / 2, 0.0)
+    return {"steps": rounded(mean), "road_m": border.along(_to_road(road, border)).min(axis=0)}
+
+
+def _widened(first: slice, last: slice, reach: int, count: int) -> slice:
+    return slice(max(first.start - reach, 0), min(last.stop + reach, count))
+
+
+def _to_road(road: RoadMask, border: Border) -> Floats:
+    """Return the distance of the cells beside an edge to the nearest road cell, ``(H, W)``, m; else inf."""
+    beside = np.zeros_like(road.mask)
+    for side in border.sides:
+        beside[side] = True
+    away = np.full(beside.shape, np.inf)
+    away[beside] = distances(beside, road.mask) * road.grid.cell
+    return away

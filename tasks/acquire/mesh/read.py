@@ -8,6 +8,7 @@ gives a note, and edges with more or fewer than two faces are not checked.
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +22,9 @@ from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import access_reason
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import bounded
-from flexroad.tasks.acquire.mesh import gltf
-from flexroad.tasks.acquire.mesh.beside import FACTOR, Beside
 from flexroad.tasks.acquire.mesh.georeference import Georeference, Offset, read_sidecar
 from flexroad.tasks.acquire.mesh.sample import TexturedMesh
-from flexroad.tasks.acquire.mesh.textures import Textures
+from flexroad.tasks.acquire.mesh.textures import FACTOR, Beside, Textures
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.types import Bools, Floats
 
@@ -40,6 +39,11 @@ MOST_REPEATS = 1e6
 FACE_BYTES = 200
 """Memory that a face takes with its corners, colours and copies (bytes)."""
 SMALLER = "divide the mesh, or use a coarser one"
+MAGIC = b"glTF"
+MOST_NODES = 100_000
+"""Largest number of nodes and of primitives: trimesh makes an object of each."""
+DEEPEST = 100
+"""Largest number of levels of nodes: the place of each is the product of those above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +146,7 @@ def _scene(path: Path, resolver: Beside) -> Any:
     size = path.stat().st_size
     memory.check(FACTOR * size, f"{path}, {size:,} bytes,", SMALLER, str(path))
     if suffix in (".glb", ".gltf"):
-        elements = gltf.elements(path)
+        elements = gltf_elements(path)
         memory.check(FACE_BYTES * elements, f"{path} with {elements:,} elements", SMALLER, str(path))
     with path.open("rb") as file:
         return trimesh.load_scene(file, file_type=suffix[1:], resolver=resolver, process=False)
@@ -285,3 +289,65 @@ def _check(path: Path, vertices: Floats, faces: NDArray[np.int64]) -> tuple[str,
     if normals[:, 2].sum() < -0.5 * projected[2]:
         return (f"{path.name} is inside out: most faces point down; it is used unchanged",)
     return ()
+
+
+def gltf_elements(path: Path) -> int:
+    """Return the number of vertices and indices that reading a file makes, each instance counted.
+
+    Raises
+    ------
+    Exception
+        Of many types, if the file is damaged.
+    """
+    header = _header(path)
+    counts: list[int] = [_count(accessor) for accessor in header.get("accessors", [])]
+    # Accessors without a view have no bytes in the file; they are filled with zeros.
+    bare = sum(_count(accessor) for accessor in header.get("accessors", []) if "bufferView" not in accessor)
+    meshes = [mesh["primitives"] for mesh in header.get("meshes", [])]
+    nodes = header.get("nodes", [])
+    if max(len(nodes), sum(map(len, meshes))) > MOST_NODES:
+        raise ValueError(f"it has more than {MOST_NODES:,} nodes or primitives")
+    _check_graph(nodes)
+    sizes: list[int] = [sum(_primitive(part, counts) for part in parts) for parts in meshes]
+    placed = sum(sizes[int(node["mesh"])] for node in nodes if "mesh" in node)
+    return bare + sum(sizes) + placed
+
+
+def _header(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        head = file.read(20)
+        if head[:4] != MAGIC:
+            file.seek(0)
+            content = file.read()
+        else:
+            content = file.read(int.from_bytes(head[12:16], "little"))
+    header = json.loads(content)
+    if not isinstance(header, dict):
+        raise TypeError("its JSON is not an object")
+    return header
+
+
+def _count(accessor: dict[str, Any]) -> int:
+    count = accessor["count"]
+    if not isinstance(count, int) or count < 0:
+        raise ValueError(f"an accessor has {str(count)[:50]} elements")
+    return count
+
+
+def _primitive(part: dict[str, Any], counts: list[int]) -> int:
+    used = [*part.get("attributes", {}).values(), *([part["indices"]] if "indices" in part else [])]
+    return sum(counts[index] for index in used)
+
+
+def _check_graph(nodes: list[dict[str, Any]]) -> None:
+    """Check that the nodes are trees: each has at most one parent, and is at most `DEEPEST` below a root."""
+    children = [list(node.get("children", [])) for node in nodes]
+    named = [child for each in children for child in each]
+    if len(set(named)) < len(named) or not set(named) <= set(range(len(nodes))):
+        raise ValueError("it has nodes that have two parents, or do not exist")
+    level, reached = sorted(set(range(len(nodes))) - set(named)), 0
+    for _ in range(DEEPEST):
+        reached += len(level)
+        level = [child for node in level for child in children[node]]
+    if reached < len(nodes):
+        raise ValueError(f"it has nodes below themselves, or more than {DEEPEST} levels of nodes")

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points import fill_voids
+from flexroad.tasks.acquire.points import tin
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
 
@@ -57,7 +57,7 @@ def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float, options: ecsrc
     voids, _ = label(~kept, np.ones((3, 3)))
     # Voids without a removed ground cell keep their interpolated heights.
     replaced = np.isin(voids, voids[ground & ~kept]) & ~kept
-    interpolated = fill_voids.fill(np.where(kept, dtm, np.nan), grid, fill_m)
+    interpolated = tin.fill_voids(np.where(kept, dtm, np.nan), grid, fill_m)
     return np.where(replaced & np.isfinite(dtm), interpolated, dtm)
 
 

@@ -1,6 +1,8 @@
 """Textures of a mesh file, and the plain colours of materials without a texture.
 
 Mesh libraries ignore a texture that is missing or cannot be decoded; here it is an error that names the file.
+
+Of the files that a mesh names, only those in its own folder or below are read.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ from numpy.typing import NDArray
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.images import check_pixels, image_errors
-from flexroad.tasks.acquire.mesh.beside import beside
 from flexroad.tasks.errors import TaskError
 
 PIL = lazy("PIL")
@@ -22,6 +23,8 @@ PIL = lazy("PIL")
 REMEDY = "export it again, or make no orthophoto: --no-dop"
 HELD, DECODING = 3, 9
 """Bytes per texel that a texture takes, and takes more while it is decoded."""
+FACTOR = 8
+"""Memory that reading a mesh takes, as a multiple of its files: text, numbers and copies of both."""
 
 
 class Textures:
@@ -112,3 +115,54 @@ def _decode(path: Path, source: Any, held: int) -> NDArray[np.uint8]:
         check_pixels(image, name, REMEDY, path)
         memory.check(held + DECODING * image.width * image.height, name, "use smaller textures", str(path))
         return np.asarray(image.convert("RGB"))
+
+
+def beside(mesh: Path, name: str) -> Path:
+    """Return a file that a mesh names.
+
+    Raises
+    ------
+    TaskError
+        If it lies outside the folder of the mesh, after links are resolved.
+    """
+    folder = mesh.parent.resolve()
+    try:
+        path = (folder / name).resolve()
+        if path.is_relative_to(folder):
+            return path
+    except (OSError, RuntimeError, ValueError):
+        # A name with a null byte, one that is too long, or a loop of links.
+        pass
+    raise TaskError(
+        f"{mesh} needs the file {name[:200]!r}, which is not in its folder; copy it there and name it "
+        "without folders, or make no orthophoto: --no-dop",
+        file=str(mesh),
+    )
+
+
+class Beside:
+    """Resolver for trimesh: gives it the material file or the buffers that a mesh names.
+
+    trimesh goes on without files that it does not get, so that the reason is kept for the caller.
+    """
+
+    def __init__(self, mesh: Path) -> None:
+        self.mesh = mesh
+        self.file_name = mesh.name
+        self.refused: TaskError | None = None
+
+    def __getitem__(self, name: str) -> bytes:
+        """Return the content of a file."""
+        try:
+            path = beside(self.mesh, name.strip())
+        except TaskError as error:
+            self.refused = error
+            raise FileNotFoundError(name) from error
+        if not path.is_file():
+            raise FileNotFoundError(name)
+        memory.check(FACTOR * path.stat().st_size, f"{path} of {self.mesh}", "use a smaller mesh", str(path))
+        return path.read_bytes()
+
+    def get(self, name: str) -> bytes:
+        """Raise an error: images of OBJ and PLY are read by `Textures`."""
+        raise FileNotFoundError(name)

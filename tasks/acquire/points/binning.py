@@ -1,4 +1,9 @@
-"""The cell of each point, and means per cell."""
+"""The cell of each point, and what the points of a cell give: means, the highest point and the top layer.
+
+The highest of n points with noise is above the surface, the more so the more points a cell has. The mean of
+the points close below it, the top layer, is not, and still belongs to the uppermost surface: a deck, not the
+ground under it. A single point far above all around it is a spike.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.types import TopLayer
 from flexroad.tasks.compiled import compiled
 from flexroad.tasks.types import Floats
 
@@ -16,6 +23,8 @@ Cells = NDArray[np.int64]
 
 NUDGE = 1e-6
 """Part of a cell that is more than the rounding error of its edge's coordinates."""
+AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
+"""The 8 neighbours of a cell."""
 
 
 def bins(easting: Floats, northing: Floats, grid: Grid) -> Cells:
@@ -65,3 +74,80 @@ def means(cells: Cells, shape: tuple[int, int], *values: Floats) -> tuple[Floats
         return tuple(
             (np.bincount(cells, value[inside], minlength=size) / count).reshape(shape) for value in values
         )
+
+
+def highest(cells: Cells, height: Floats, shape: tuple[int, int]) -> Floats:
+    """Return the height of the highest point per cell, ``(H, W)``; NaN in cells without points."""
+    top, _, _ = _two_highest(cells, height, shape[0] * shape[1])
+    return np.where(np.isneginf(top), np.nan, top).reshape(shape)
+
+
+def spikes(cells: Cells, height: Floats, shape: tuple[int, int], despike_m: float) -> NDArray[np.int64]:
+    """Return the indices of single points far above all points around them, ``(k,)``.
+
+    The highest point of a cell is a spike if it is more than ``despike_m`` above the second highest point of
+    its cell and above the highest points of all 8 neighbours. A pole or a crown with two points is not a
+    spike, nor is a point without any points around it. A cell has at most one spike.
+    """
+    top, second, index = _two_highest(cells, height, shape[0] * shape[1])
+    around = ndimage.maximum_filter(top.reshape(shape), footprint=AROUND, mode="constant", cval=-np.inf)
+    rest = np.maximum(second, around.ravel())
+    single: NDArray[np.int64] = index[np.isfinite(rest) & (top > rest + despike_m)]
+    return single
+
+
+@compiled()
+def _two_highest(cells: Cells, height: Floats, size: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Return the two greatest heights per cell (-inf if there is none) and the index of the greatest."""
+    top, second = np.full(size, -np.inf), np.full(size, -np.inf)
+    index = np.full(size, -1, np.int64)
+    for i in range(cells.size):
+        c = cells[i]
+        if c < 0:
+            continue
+        if height[i] > top[c]:
+            second[c], top[c], index[c] = top[c], height[i], i
+        elif height[i] > second[c]:
+            second[c] = height[i]
+    return top, second, index
+
+
+def top_layer(
+    cells: Cells, height: Floats, highest: Floats, depth_m: float, shape: tuple[int, int]
+) -> TopLayer:
+    """Return mean, number and spread of the points of each cell's top layer.
+
+    Parameters
+    ----------
+    cells : Cells
+        The cells of the points, ``(n,)``.
+    height : Floats
+        The points, ``(n,)``, m.
+    highest : Floats
+        Highest point per cell, ``(H, W)``, m; NaN where there is none.
+    depth_m : float
+        Points up to this much below the highest one belong to the top layer (m).
+    shape : tuple of int
+        Rows and columns.
+    """
+    count, below, squared = _sums(cells, height, highest.ravel(), depth_m)
+    with np.errstate(invalid="ignore"):
+        mean, square = below / count, squared / count
+    spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+    return TopLayer(highest + mean.reshape(shape), count.reshape(shape), spread.reshape(shape))
+
+
+@compiled()
+def _sums(cells: Cells, height: Floats, highest: Floats, depth_m: float) -> tuple[Floats, Floats, Floats]:
+    """Return number, sum and sum of squares of the heights relative to the highest, per cell."""
+    count, below, squared = np.zeros_like(highest), np.zeros_like(highest), np.zeros_like(highest)
+    for i in range(cells.size):
+        c = cells[i]
+        if c < 0:
+            continue
+        z = height[i] - highest[c]
+        if z >= -depth_m:
+            count[c] += 1.0
+            below[c] += z
+            squared[c] += z * z
+    return count, below, squared

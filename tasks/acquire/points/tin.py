@@ -1,17 +1,22 @@
-"""Linear interpolation over Delaunay triangles of limited size.
+"""Linear interpolation over Delaunay triangles of limited size: the DTM from ground points, and voids.
 
 A triangle is used if the diameter of its circumcircle, which has no other node inside, is at most a given
 width. The height of a cell therefore depends only on nodes within that distance, and does not change if the
-area is divided into blocks. At the border of the survey, the same rule leaves bays open.
+area is divided into blocks. At the border of the survey, the same rule leaves bays open, and lakes keep their
+shore: a void stays where a disc of that diameter fits into it.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import startinpy
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.points.binning import Cells, means
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.types import Floats, Mesh
 
@@ -23,6 +28,46 @@ LIMIT_FACTOR = 1 + 1e-9
 """Factor of the limit, so that a circle exactly as wide as the limit is used in spite of rounding."""
 COUNT_OFFSET = 0.6180339887
 """Offset (cells) added before rounding down to whole cells, so that rounding errors do not matter."""
+EMPTY_CIRCLE_CELLS = 2 * math.sqrt(2)
+"""Largest diameter (cells) of an empty circle between nodes at any position in cells that all have one."""
+DIAGONAL = math.sqrt(2)
+"""Largest distance of the centres of touching cells (cells), added to the width of a void."""
+
+
+def triangulated(
+    cells: Cells, easting: Floats, northing: Floats, height: Floats, grid: Grid, void_m: float
+) -> Floats:
+    """Return the ground height at the cell centres, linear between the centroids of cells, ``(H, W)``, m.
+
+    A centroid is the mean of the points of a cell in plan and height: it is exact on planes and not biased,
+    as the lowest point would be. A cell with ground points whose centre is outside all triangles, as at the
+    border of the survey, has the mean height of its points.
+
+    Parameters
+    ----------
+    cells : Cells
+        The cells of the ground points, ``(n,)``.
+    easting, northing, height : Floats
+        The ground points, ``(n,)``, m.
+    grid : Grid
+        The cells.
+    void_m : float
+        The DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
+    """
+    east, north, mean = means(cells, grid.shape, easting - grid.west, northing - grid.north, height)
+    ground = tin(east, north, mean, grid, void_m + EMPTY_CIRCLE_CELLS * grid.cell)
+    return np.where(np.isnan(ground), mean, ground)
+
+
+def averaged(cells: Cells, height: Floats, grid: Grid, void_m: float) -> Floats:
+    """Return the mean height of the ground points per cell, voids up to ``void_m`` filled, ``(H, W)``, m."""
+    (mean,) = means(cells, grid.shape, height)
+    return fill_voids(mean, grid, void_m)
+
+
+def tin_reach_m(void_m: float, cell: float) -> float:
+    """Return the largest distance from a cell at which points can change its triangulated height (m)."""
+    return math.ceil(void_m / cell + EMPTY_CIRCLE_CELLS) * cell
 
 
 def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float) -> Floats:
@@ -100,3 +145,22 @@ def _ordered(faces: NDArray[np.int32], nodes: int) -> NDArray[np.int32]:
     rotated = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     # No two faces have the same first two nodes.
     return rotated[np.argsort(rotated[:, 0] * np.int64(nodes) + rotated[:, 1])]
+
+
+def fill_voids(heights: Floats, grid: Grid, size_m: float) -> Floats:
+    """Return the heights with voids of up to ``size_m`` filled, ``(H, W)``, m.
+
+    The centres of the cells around the voids are triangulated (see `tin`). A square or a strip of n cells
+    across is filled if ``size_m`` is at least n cells.
+    """
+    void = np.isnan(heights)
+    border = ~void & ndimage.binary_dilation(void, np.ones((3, 3), bool))
+    row, col = np.indices(grid.shape, np.float64)
+    east, north = (col + 0.5) * grid.cell, -(row + 0.5) * grid.cell
+    interpolated = tin(east, north, np.where(border, heights, np.nan), grid, size_m + DIAGONAL * grid.cell)
+    return np.where(void, interpolated, heights)
+
+
+def voids_reach_m(size_m: float, cell: float) -> float:
+    """Return the largest distance from a cell at which other cells can change the result of `fill` (m)."""
+    return (math.ceil(size_m / cell + DIAGONAL) + 1) * cell

@@ -13,13 +13,11 @@ from pydantic import Field
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks import options as base
-from flexroad.tasks.acquire.points import dtm, fill_voids
 from flexroad.tasks.acquire.points import ground_filter as slope_filter
 from flexroad.tasks.acquire.points import morphological as morphological_filter
-from flexroad.tasks.acquire.points.binning import Cells, bins, means
-from flexroad.tasks.acquire.points.max_height import highest, spikes
+from flexroad.tasks.acquire.points import tin
+from flexroad.tasks.acquire.points.binning import Cells, bins, highest, means, spikes, top_layer
 from flexroad.tasks.acquire.points.orthophoto import photo
-from flexroad.tasks.acquire.points.top_layer import top_layer
 from flexroad.tasks.acquire.types import Points, Rasters, TopLayer
 from flexroad.tasks.types import Bools, Floats, Orthophoto
 
@@ -100,10 +98,10 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     ground = _is_ground(points, options) & ~decks
     return Rasters(
         grid,
-        dsm=fill_voids.fill(highest_points, rim, options.fill_m)[inner],
+        dsm=tin.fill_voids(highest_points, rim, options.fill_m)[inner],
         dtm=_dtm(points[ground], rim, options)[inner],
         top=TopLayer(
-            fill_voids.fill(top.height, rim, options.fill_m)[inner], top.count[inner], top.spread[inner]
+            tin.fill_voids(top.height, rim, options.fill_m)[inner], top.count[inner], top.spread[inner]
         ),
         ground=_occupied(cells[ground], rim.shape)[inner],
         bridges=bridges[inner] if np.isfinite(bridges[inner]).any() else None,
@@ -114,14 +112,14 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
 def reach_m(options: Options, cell: float) -> float:
     """Return the largest distance from a grid of such cells at which points can change a value in it (m)."""
     if options.dtm == "tin":
-        ground = dtm.reach_m(options.void_m, cell)
+        ground = tin.tin_reach_m(options.void_m, cell)
     else:
-        ground = fill_voids.reach_m(options.void_m, cell)
+        ground = tin.voids_reach_m(options.void_m, cell)
     if options.ground == "filter":
         ground += options.filter.reach_m
     if options.ground == "morphological":
         ground += options.morphological.reach_m
-    farthest = max(ground, fill_voids.reach_m(options.fill_m, cell), options.dop_fill_m)
+    farthest = max(ground, tin.voids_reach_m(options.fill_m, cell), options.dop_fill_m)
     # Whether a point is a spike depends on its own and the neighbouring cells.
     return farthest if options.despike_m is None else farthest + 2 * cell
 
@@ -187,8 +185,8 @@ def _occupied(cells: Cells, shape: tuple[int, int]) -> Bools:
 def _dtm(ground: Points, grid: Grid, options: Options) -> Floats:
     cells = bins(ground.easting, ground.northing, grid)
     if options.dtm == "mean":
-        return dtm.averaged(cells, ground.height, grid, options.void_m)
-    return dtm.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
+        return tin.averaged(cells, ground.height, grid, options.void_m)
+    return tin.triangulated(cells, ground.easting, ground.northing, ground.height, grid, options.void_m)
 
 
 def _photo(points: Points, grid: Grid, options: Options, dop_cell: float | None) -> Orthophoto | None:

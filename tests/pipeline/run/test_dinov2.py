@@ -17,7 +17,7 @@ from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import load
 from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.head import Head, read_head
-from flexroad.tasks.segment.training_types import Sample
+from flexroad.tasks.segment.dinov2.train import Sample
 from tests.conftest import QUICK
 from tests.make_backbone import save_backbone
 

@@ -9,9 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.filter.kit.ground_consistency import CONSISTENT, INCONSISTENT, ground_consistency
-from flexroad.tasks.filter.kit.planar_patches import flat_patches
-from flexroad.tasks.filter.planar import BEYOND_M, VERSION, Options, ecsrc
+from flexroad.tasks.filter.planar import (
+    BEYOND_M,
+    CONSISTENT,
+    INCONSISTENT,
+    VERSION,
+    Options,
+    ecsrc,
+    flat_patches,
+    ground_consistency,
+)
 from flexroad.tasks.synthetic import gerod, make_scene
 from flexroad.tasks.synthetic.spoilers import BARE, Kind
 from flexroad.tasks.types import RoadMask, TileData

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import nurbs, plane
-from flexroad.tasks.spline import adam, torch_engine
+from flexroad.tasks.spline import adam
 from flexroad.tasks.spline.objective import objective
 from flexroad.tasks.spline.space import clamped_space
 from flexroad.tasks.types import RoadClusters, TileData
@@ -89,7 +89,7 @@ def test_loss_equals_paper_equations():
 def test_gradient_equals_autograd(degree, free):
     loss_function, at = random_objective(degree, free)
     loss, gradient = loss_function(at)
-    torch_objective = torch_engine.TorchObjective(loss_function, at.shape[1:], "cpu")
+    torch_objective = adam.TorchObjective(loss_function, at.shape[1:], "cpu")
     variables = torch_objective.tensor(at).requires_grad_()
     peer = torch_objective(variables)
     peer.backward()
@@ -147,7 +147,7 @@ def test_minimise_returns_variables_of_lowest_loss(engine):
     loss_function, at = random_objective()
     limit, schedule = np.full((2, 1, 1), 2.0), adam.Schedule(5.0, 20, 0, 20)
     if engine == "torch":
-        best, losses = torch_engine.minimise(loss_function, at, limit, schedule, "cpu")
+        best, losses = adam.minimise_with_torch(loss_function, at, limit, schedule, "cpu")
     else:
         best, losses = adam.minimise(loss_function, at, limit, schedule)
     assert len(losses) == 21

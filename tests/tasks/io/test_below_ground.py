@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid
-from flexroad.tasks.io.below_ground import below_ground_note
+from flexroad.tasks.io.dsm_and_dtm import below_ground_note
 from flexroad.tasks.synthetic import make_scene
 
 

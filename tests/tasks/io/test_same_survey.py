@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexroad.catalog import Grid, Layer, Tile
-from flexroad.tasks.io.same_survey import survey_difference
+from flexroad.tasks.io.dsm_and_dtm import survey_difference
 from tests.make_rasters import UTM, write
 
 GRID = Grid(UTM, 295500.0, 5629500.0, 1.0, 20, 20)

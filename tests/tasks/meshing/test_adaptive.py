@@ -7,7 +7,7 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.meshing import insertion
+from flexroad.tasks.meshing import adaptive
 from flexroad.tasks.meshing.adaptive import LINE_SHARE, thinned
 from flexroad.tasks.metrics.mesh_check import faults
 from flexroad.tasks.metrics.vertical_distance import drape
@@ -103,6 +103,6 @@ def test_thinned_line_is_within_share_of_tolerance():
 
 
 def test_adaptive_mesh_of_too_many_vertices_is_an_error(monkeypatch):
-    monkeypatch.setattr(insertion, "BITS", 6)
+    monkeypatch.setattr(adaptive, "BITS", 6)
     with pytest.raises(TaskError, match="64 vertices or more; raise sample.tolerance_m"):
         made(tolerance_m=0.001)

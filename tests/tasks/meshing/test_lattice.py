@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.tasks.meshing.lattice import squares
-from flexroad.tasks.meshing.triangulate import constrained, delaunay
+from flexroad.tasks.meshing.triangulate import constrained, delaunay, squares
 
 
 def nodes(rows: int, columns: int, step: float) -> np.ndarray:

@@ -10,8 +10,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.fit import smoothing_spline
-from flexroad.tasks.quality.compared import heights_fitted
-from flexroad.tasks.quality.estimate import INTERVAL
+from flexroad.tasks.quality.estimate import INTERVAL, heights_fitted
 from flexroad.tasks.quality.holdout import INSET_M, Holdout, holdout, withheld_squares
 from flexroad.tasks.synthetic import SceneOptions, make_scene
 from flexroad.tasks.synthetic.points import scan

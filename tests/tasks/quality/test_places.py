@@ -5,7 +5,7 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.quality.assess import Options, assess
-from flexroad.tasks.quality.compared import compare
+from flexroad.tasks.quality.estimate import compare
 from flexroad.tasks.quality.places import places
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexroad.tasks.spline.between import between
+from flexroad.tasks.spline.stepped import between
 
 ROW, COL = np.indices((12, 15)).astype(float)
 INSIDE = COL > 0

@@ -12,8 +12,7 @@ import trimesh
 from PIL import Image
 
 from flexroad.tasks import TaskError, memory
-from flexroad.tasks.acquire.mesh import gltf
-from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tasks.acquire.mesh.read import gltf_elements, read_mesh
 from tests import fuzz
 
 PLACED = {"crs": "EPSG:32617", "offset": (552_208.0, 4_114_742.0, 0.0)}
@@ -219,7 +218,7 @@ def test_gltf_nodes_that_are_no_trees_raise(tmp_path, nodes, reason):
     path = tmp_path / "m.gltf"
     path.write_text(json.dumps({"nodes": nodes}))
     with pytest.raises(ValueError, match=reason):
-        gltf.elements(path)
+        gltf_elements(path)
     fails(path, reason)
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.acquire.points.binning import bins
-from flexroad.tasks.acquire.points.dtm import averaged, reach_m, triangulated
+from flexroad.tasks.acquire.points.tin import averaged, reach_m, triangulated
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 

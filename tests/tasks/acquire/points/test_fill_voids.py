@@ -3,7 +3,7 @@ import pytest
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.fill_voids import fill, reach_m
+from flexroad.tasks.acquire.points.tin import fill, reach_m
 
 CELL = 0.2
 

@@ -3,8 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.binning import bins, means
-from flexroad.tasks.acquire.points.max_height import highest, spikes
+from flexroad.tasks.acquire.points.binning import bins, highest, means, spikes
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
 # Positions in quarters of a cell, many of them on borders of cells; some are outside the grid.

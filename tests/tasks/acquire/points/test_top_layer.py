@@ -3,9 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.binning import bins
-from flexroad.tasks.acquire.points.max_height import highest
-from flexroad.tasks.acquire.points.top_layer import top_layer
+from flexroad.tasks.acquire.points.binning import bins, highest, top_layer
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 0.5, 7, 5)
 DEPTH_M = 0.5

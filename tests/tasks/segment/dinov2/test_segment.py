@@ -18,16 +18,16 @@ from flexroad.tasks.segment.dinov2 import backbone, head
 from flexroad.tasks.segment.dinov2 import train as training
 from flexroad.tasks.segment.dinov2.backbone import MEAN, STD, load_backbone, normalised
 from flexroad.tasks.segment.dinov2.head import Head, check, predictor, read_head
-from flexroad.tasks.segment.dinov2.regression import (
+from flexroad.tasks.segment.dinov2.segment import Options, files, segment
+from flexroad.tasks.segment.dinov2.train import (
     THRESHOLDS,
     Labels,
     Line,
+    Sample,
     Windows,
     at_cells,
     best_threshold,
 )
-from flexroad.tasks.segment.dinov2.segment import Options, files, segment
-from flexroad.tasks.segment.training_types import Sample
 from flexroad.tasks.types import TileData
 from tests.make_backbone import save_backbone
 

@@ -1,1 +1,0 @@
-"""Algorithms that the filters share."""
