@@ -17,9 +17,9 @@ from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor
-from flexroad.tasks.synthetic import dsc3d, glb
+from flexroad.tasks.synthetic import dsc3d
 from flexroad.tasks.synthetic.dsc3d import Place
-from flexroad.tasks.synthetic.photogrammetry import photogrammetry
+from flexroad.tasks.synthetic.photogrammetry import encode, photogrammetry
 
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
 """Date of the data; fixed, so that the same command writes the same files."""
@@ -90,7 +90,7 @@ def _write_scene(job: _Job) -> str:
     }
     name = NAME.format(job.seed)
     prepared.write_tile(folder / KNOWN, scene.name, truth.grid, layers, truth.stratum, MADE, name)
-    write(folder / "mesh.glb", glb.encode(scene.mesh))
+    write(folder / "mesh.glb", encode(scene.mesh))
     roads = folder / KNOWN / "road_mask" / f"{scene.name}.tif"
     options = PrepareOptions(roads=roads, date=MADE, dataset=name)
     prepare_mesh(

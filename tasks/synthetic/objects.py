@@ -1,7 +1,10 @@
-"""Houses, trees and cars along a street, and round errors of the road mask.
+"""Houses, towers, trees and cars along a street, roofs in an orthophoto, and round errors of the road mask.
 
 Each street has its own random generator, so an object across a tile border is the same object in both
 tiles. Lengths are in metres, headings in rad, positions in the plan's frame.
+
+An orthophoto is corrected with the terrain model, so whatever stands on the terrain leans outwards in it: on
+the side that leans away, the picture has the facade where the surface model has the roof.
 """
 
 from __future__ import annotations
@@ -27,6 +30,12 @@ SLOT_M = 6.2
 """Length of a parking slot along the kerb (m)."""
 GARDEN_M = 30.0
 """Greatest distance of garden trees and false patches from the carriageway (m)."""
+HALF_SIDE_M, HEIGHT_M = (1.5, 7.0), (22.0, 48.0)
+"""Ranges of half the side and of the height over the ground (m)."""
+SETBACK_M = (10.0, 24.0)
+"""Distance from the carriageway's edge to the middle of a tower (m)."""
+IMAGE_M = 700.0
+"""Side of the part of the orthophoto that is taken from one image (m)."""
 
 
 @dataclass(frozen=True)
@@ -258,3 +267,82 @@ def spots(street: Street, seed: int, density: float) -> list[Spot]:
         Spot(float(a), float(b), float(r), k >= holes)
         for k, (a, b, r) in enumerate(zip(x, y, radius, strict=True))
     ]
+
+
+def towers(streets: Sequence[Street], seed: int, ground_at: GroundAt, mean: float) -> tuple[House, ...]:
+    """Return towers, ``mean`` per street on average, none of them on a road or in a stream."""
+    planned = [house for street in streets for house in _planned(street, seed, mean)] if mean > 0 else []
+    if not planned:
+        return ()
+    x, y = (np.array([getattr(house, axis) for house in planned]) for axis in ("x", "y"))
+    under = ground_at(x, y)
+    reach: Floats = np.array([np.hypot(house.half_length, house.half_depth) for house in planned])
+    free = (under.edge > reach + 1) & (under.trough == 0)
+    return tuple(
+        House(h.x, h.y, h.heading, h.half_length, h.half_depth, float(base) + h.eaves, h.rise)
+        for h, base, ok in zip(planned, under.bare, free, strict=True)
+        if ok
+    )
+
+
+def _planned(street: Street, seed: int, mean: float) -> list[House]:
+    rng = generator(seed, "towers", *street.key)
+    planned = []
+    for _ in range(rng.poisson(mean)):
+        along = rng.uniform(street.start, street.end)
+        lateral = rng.choice((-1, 1)) * (street.half_width_m + rng.uniform(*SETBACK_M))
+        x, y = (float(c) for c in street.point(along, lateral))
+        half, height = rng.uniform(*HALF_SIDE_M), rng.uniform(*HEIGHT_M)
+        rise = 0.0 if rng.random() < 0.6 else half * 2
+        planned.append(House(x, y, float(street.heading(along)), half, half, height, rise))
+    return planned
+
+
+@dataclass(frozen=True)
+class Roof:
+    """The roof of a house in the orthophoto."""
+
+    house: House
+    shift: tuple[float, float]
+    """Displacement in the plan's frame (m)."""
+    facade_as_road: bool
+    """Whether the segmentation mistakes the visible facades for road."""
+
+
+def roofs_seen(
+    houses: Sequence[House], seed: int, ground_at: GroundAt, lean: float, facades: float
+) -> tuple[Roof, ...]:
+    """Return the roofs of all houses.
+
+    Parameters
+    ----------
+    houses : sequence of House
+        The houses.
+    seed : int
+        Seed of the world.
+    ground_at : callable
+        Returns the ground at points.
+    lean : float
+        Displacement per height above the ground, at the edge of an image.
+    facades : float
+        Fraction of the houses whose facades are mistaken for road.
+    """
+    if not houses:
+        return ()
+    x, y = (np.array([getattr(house, axis) for house in houses]) for axis in ("x", "y"))
+    height = np.array([house.eaves for house in houses]) - ground_at(x, y).bare
+    phase = generator(seed, "images").uniform(0, IMAGE_M, 2)
+    shift = lean * height * np.stack([_from_middle(x + phase[0]), _from_middle(y + phase[1])])
+    return tuple(
+        Roof(house, (float(east), float(north)), _drawn(house, seed) < facades)
+        for house, east, north in zip(houses, *shift, strict=True)
+    )
+
+
+def _from_middle(coordinate: Floats) -> Floats:
+    """Return the place in an image, from -1 at its one edge to 1 at the other."""
+    return 2 * (coordinate / IMAGE_M % 1) - 1
+
+
+def _drawn(house: House, seed: int) -> float:
+    return float(generator(seed, "facade", int(house.x // 1), int(house.y // 1)).random())

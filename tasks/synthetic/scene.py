@@ -8,23 +8,21 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.acquire.points.binning import bins
+from flexroad.tasks.acquire.types import Points
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.synthetic.mixing import mixed
-from flexroad.tasks.synthetic.network import Box, Plan
+from flexroad.tasks.synthetic.network import Box, Plan, find_stratum
 from flexroad.tasks.synthetic.noise import generator, waves
 from flexroad.tasks.synthetic.objects import GroundAt
 from flexroad.tasks.synthetic.options import DEFAULTS, SceneOptions
-from flexroad.tasks.synthetic.plants import growth
 from flexroad.tasks.synthetic.population import Objects, populate
-from flexroad.tasks.synthetic.scars import scars
 from flexroad.tasks.synthetic.segmentation import segmentation
 from flexroad.tasks.synthetic.spoilers import BARE, Canvas, Kind, surface_model
-from flexroad.tasks.synthetic.strata import find_stratum
 from flexroad.tasks.synthetic.surfaces import CIRCLE_M, REACH_M, Ground, Ways, ground, relief
-from flexroad.tasks.synthetic.works import changes, rise
+from flexroad.tasks.synthetic.survey_errors import changes, growth, mixed, rise, scars
 from flexroad.tasks.types import Bools, Floats
 
 __all__ = ["DEFAULTS", "Scene", "SceneOptions", "make_scene"]
@@ -37,6 +35,10 @@ DTM_GRAIN_M = 3.0
 """Correlation length of the DTM's noise (m)."""
 FLIGHT_WAVES_M = (300.0, 1500.0)
 """Shortest and longest wave of the offset between two surveys (m)."""
+GROUND, DECK, OTHER = 2, 17, 1
+"""Classes by ASPRS LAS 1.4; what is neither ground nor deck is unclassified."""
+DECK_M = 0.5
+"""The true surface is a deck where it is this much above the terrain model (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,3 +230,33 @@ def _box(canvas: Canvas, margin_m: float) -> Box:
 def _centre(canvas: Canvas) -> tuple[float, float]:
     west, south, east, north = canvas.grid.bounds
     return canvas.plan.from_map((west + east) / 2, (south + north) / 2)
+
+
+def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
+    """Return points on a scene's surface, at random positions.
+
+    Heights are those of the true ground, linear between cell centres, plus what stands on the point's cell.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene without noise of its own (`SceneOptions.dsm_noise_m`).
+    per_m2 : float
+        Number of points per m2.
+    noise_m : float
+        Standard deviation of their heights (m).
+    seed : int
+        Seed of positions and noise.
+    """
+    grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
+    west, south, east, north = grid.bounds
+    number = round(per_m2 * (east - west) * (north - south))
+    easting, northing = rng.uniform(west, east, number), rng.uniform(south, north, number)
+    at = (north - northing) / grid.cell - 0.5, (easting - west) / grid.cell - 0.5
+    ground = map_coordinates(scene.reference, at, order=1, mode="nearest")
+    cells = bins(easting, northing, grid)
+    bare = np.isin(scene.kind, BARE)
+    above = np.where(bare, 0.0, scene.dsm - scene.reference).ravel()[cells]
+    deck = bare & (scene.reference - scene.dtm > DECK_M)
+    kind = np.where(deck, DECK, np.where(bare, GROUND, OTHER)).astype(np.uint8).ravel()[cells]
+    return Points(easting, northing, ground + above + noise_m * rng.standard_normal(number), kind)

@@ -9,12 +9,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.synthetic.areas import Area
 from flexroad.tasks.synthetic.noise import generator, waves
-from flexroad.tasks.synthetic.objects import GroundAt
+from flexroad.tasks.synthetic.objects import GroundAt, Roof
 from flexroad.tasks.synthetic.options import SceneOptions
-from flexroad.tasks.synthetic.population import Objects
-from flexroad.tasks.synthetic.roofs import Roof
+from flexroad.tasks.synthetic.population import Area, Objects
 from flexroad.tasks.synthetic.spoilers import Canvas, covered
 from flexroad.tasks.types import Bools, Floats
 

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.synthetic.areas import Area
-from flexroad.tasks.synthetic.linework import Trace
 from flexroad.tasks.synthetic.network import Plan
 from flexroad.tasks.synthetic.objects import Car, Crown, House
-from flexroad.tasks.synthetic.population import Objects
+from flexroad.tasks.synthetic.population import Area, Objects, Trace
 from flexroad.tasks.types import Bools, Floats
 
 

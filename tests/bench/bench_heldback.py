@@ -42,7 +42,7 @@ from flexroad.pipeline.export.source import select
 from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
 from flexroad.tasks.quality.estimate import INTERVAL
 from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.points import DECK, GROUND, scan
+from flexroad.tasks.synthetic.scene import DECK, GROUND, scan
 from flexroad.tasks.types import Bools, Floats
 
 SIDE_M, SHARE, FIRST = 5.0, 0.06, 7

@@ -13,7 +13,7 @@ from flexroad.tasks.fit import smoothing_spline
 from flexroad.tasks.quality.estimate import INTERVAL, heights_fitted
 from flexroad.tasks.quality.holdout import INSET_M, Holdout, holdout, withheld_squares
 from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.points import scan
+from flexroad.tasks.synthetic.scene import scan
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 250, 250)

@@ -17,7 +17,7 @@ from flexroad.tasks.roads.extent import beyond_extent
 from flexroad.tasks.roads.road_height import dsm_offset, with_road_heights
 from flexroad.tasks.spline.frame import Frame
 from flexroad.tasks.synthetic import SceneOptions, make_scene
-from flexroad.tasks.synthetic.points import scan
+from flexroad.tasks.synthetic.scene import scan
 from flexroad.tasks.types import RoadClusters, RoadMask, TileData
 
 GRID = Grid("EPSG:25832", 500000, 5600300, 1.0, 300, 300)

@@ -7,14 +7,15 @@ from hypothesis import strategies as st
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.tasks import TaskError
+from flexroad.tasks.acquire.points.to_rasters import Options, rasterise
 from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
-from flexroad.tasks.synthetic.network import Plan
-from flexroad.tasks.synthetic.scene import true_height
-from flexroad.tasks.synthetic.strata import STRATA, stratum_at
+from flexroad.tasks.synthetic.network import STRATA, Plan, stratum_at
+from flexroad.tasks.synthetic.scene import DECK, GROUND, scan, true_height
 
 CLEAN = SceneOptions(density=0, mask_errors=0, dsm_noise_m=(0, 0), dtm_noise_m=0)
 SILENT = SceneOptions(dsm_noise_m=(0, 0))
 SURFACE = (Kind.GROUND, Kind.DECK)
+GRID = Grid("EPSG:25832", 500000, 5600100, 1.0, 100, 100)
 
 
 @lru_cache
@@ -186,3 +187,17 @@ def test_make_scene_invalid_arguments_raise():
         make_scene(grid, 0, "city")
     with pytest.raises(TaskError, match="-1"):
         make_scene(grid, -1)
+
+
+def test_scan_has_density_noise_and_classes_of_scene():
+    scene = make_scene(GRID, 3, "suburban", SceneOptions(dsm_noise_m=(0.0, 0.0), stream_share=1.0))
+    points = scan(scene, per_m2=20, noise_m=0.03)
+    assert len(points) == 20 * 100 * 100
+    rasters = rasterise(points, GRID, Options(dtm="mean"), None)
+    bare = np.isfinite(rasters.dtm) & rasters.ground & (np.abs(scene.dtm - scene.reference) < 0.3)
+    off = (rasters.dtm - scene.reference)[bare]
+    assert abs(off.mean()) < 0.005
+    assert np.median(np.abs(rasters.dsm - scene.dsm - 0.055)) < 0.03
+    assert {GROUND, DECK} <= set(np.unique(points.kind))
+    assert np.array_equal(scan(scene, 20, 0.03).height, points.height)
+    assert not np.array_equal(scan(scene, 20, 0.03, seed=1).height, points.height)

@@ -216,7 +216,7 @@ def test_towers_overhang_and_storeys_change_roofs():
 
 
 def test_rails_and_wires_without_streets_are_empty():
-    from flexroad.tasks.synthetic.linework import rails, wires
+    from flexroad.tasks.synthetic.population import rails, wires
 
     def unused(x, y):
         raise AssertionError("the ground is not needed")

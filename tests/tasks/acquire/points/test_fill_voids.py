@@ -3,7 +3,7 @@ import pytest
 from scipy import ndimage
 
 from flexroad.catalog.grid import Grid
-from flexroad.tasks.acquire.points.tin import fill, reach_m
+from flexroad.tasks.acquire.points.tin import fill_voids, voids_reach_m
 
 CELL = 0.2
 
@@ -23,8 +23,8 @@ def test_fill_fills_voids_up_to_size_m(cells, shape):
     truth = plane(where)
     holed = truth.copy()
     holed[slice(20, 20 + cells), slice(10, 10 + cells) if shape == "square" else slice(5, 35)] = np.nan
-    np.testing.assert_allclose(fill(holed, where, cells * CELL), truth, atol=1e-9)
-    assert np.isnan(fill(holed, where, (cells - 1) * CELL)).any()
+    np.testing.assert_allclose(fill_voids(holed, where, cells * CELL), truth, atol=1e-9)
+    assert np.isnan(fill_voids(holed, where, (cells - 1) * CELL)).any()
 
 
 def test_fill_keeps_wide_voids_and_border_of_survey():
@@ -33,7 +33,7 @@ def test_fill_keeps_wide_voids_and_border_of_survey():
     lake = np.hypot(row - 30, col - 30) < 12
     beyond = col > 50
     holed = np.where(lake | beyond, np.nan, plane(where))
-    filled = np.isfinite(fill(holed, where, 5 * CELL))
+    filled = np.isfinite(fill_voids(holed, where, 5 * CELL))
     shore = ndimage.binary_erosion(lake)
     assert not filled[shore].any()
     assert not filled[beyond].any()
@@ -41,8 +41,8 @@ def test_fill_keeps_wide_voids_and_border_of_survey():
 
 def test_fill_keeps_heights_and_all_void_stays_void():
     where = grid(9, 9)
-    np.testing.assert_array_equal(fill(plane(where), where, 5), plane(where))
-    assert np.isnan(fill(np.full(where.shape, np.nan), where, 5)).all()
+    np.testing.assert_array_equal(fill_voids(plane(where), where, 5), plane(where))
+    assert np.isnan(fill_voids(np.full(where.shape, np.nan), where, 5)).all()
 
 
 @pytest.mark.parametrize("size_m", [0.0, 0.4, 0.7, 1.3])
@@ -51,11 +51,11 @@ def test_fill_cells_beyond_reach_m_have_no_effect(size_m, share):
     rng = np.random.default_rng(2)
     whole = grid(70, 60)
     heights = np.where(rng.random(whole.shape) < share, rng.uniform(100, 110, whole.shape), np.nan)
-    expected = fill(heights, whole, size_m)
-    n = round(reach_m(size_m, CELL) / CELL)
+    expected = fill_voids(heights, whole, size_m)
+    n = round(voids_reach_m(size_m, CELL) / CELL)
     for row, col in ((17, 19), (30, 41), (22, 33)):
         core = slice(row, row + 7), slice(col, col + 9)
         rim = slice(row - n, row + 7 + n), slice(col - n, col + 9 + n)
         part = grid(9 + 2 * n, 7 + 2 * n, whole.west + (col - n) * CELL, whole.north - (row - n) * CELL)
-        result = fill(heights[rim], part, size_m)[n : n + 7, n : n + 9]
+        result = fill_voids(heights[rim], part, size_m)[n : n + 7, n : n + 9]
         np.testing.assert_allclose(result, expected[core], rtol=0, atol=1e-9)

@@ -8,7 +8,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from flexroad.tasks.synthetic import Kind, Scene, SceneOptions, block, make_scene
 from flexroad.tasks.synthetic.gerod import survey
-from flexroad.tasks.synthetic.works import BESIDE_M, RISE_M, TRENCH_M
+from flexroad.tasks.synthetic.survey_errors import BESIDE_M, RISE_M, TRENCH_M
 
 GRID = block(1)[0][1]
 INNER = np.s_[8:-8, 8:-8]
