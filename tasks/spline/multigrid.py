@@ -7,8 +7,8 @@ points (Briggs, Henson and McCormick, "A multigrid tutorial", chapters 3 and 10)
 equations of one line of control points after the other. The cycle is symmetric, down from the first line and
 back from the last, and therefore a preconditioner for conjugate gradients whatever the stiffnesses are.
 
-A function of the coarser spline is a sum of p + 2 functions of the finer one: function J is made of those from
-``2 J - p`` to ``2 J + 1``, as far as they exist, along both axes.
+A function of the coarser spline is a sum of p + 2 functions of the finer one: function J is made of those
+from ``2 J - p`` to ``2 J + 1``, as far as they exist, along both axes.
 """
 
 from __future__ import annotations
