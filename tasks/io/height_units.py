@@ -16,7 +16,6 @@ from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster import RasterWindow
 from flexroad.tasks.types import Floats
 
-
 SMALLER = {"cm": 100, "mm": 1000}
 """Units that heights outside the range may be in, with their number in a metre."""
 
