@@ -32,12 +32,17 @@ from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg, opendrive
-from flexroad.tasks.roads import height_grid as grids
-from flexroad.tasks.roads import profiles as profiling
 from flexroad.tasks.roads import reference_line as lines
-from flexroad.tasks.roads.height_grid import HeightAt, HeightGrid, grid_error
+from flexroad.tasks.roads.along_line import (
+    HeightAt,
+    HeightGrid,
+    Profiles,
+    grid_error,
+    height_grid,
+    profile_error,
+    profiles,
+)
 from flexroad.tasks.roads.local_frame import LocalFrame
-from flexroad.tasks.roads.profiles import Profiles, profile_error
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Floats
@@ -187,7 +192,7 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
         heights = work.vertical or "as in the run"
         comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
         files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
-        rows.append(row(road, grid, height, profiling.profiles(grid, profiling.Options())))
+        rows.append(row(road, grid, height, profiles(grid)))
     return Piece(files, _route_row(unit, rows, problem))
 
 
@@ -197,7 +202,7 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
     grids_of, problem = _grids(unit, work)
     for part, (grid, height) in enumerate(grids_of):
         road = unit.road_id(part)
-        fitted = profiling.profiles(grid, profiling.Options())
+        fitted = profiles(grid)
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
         texts.append(opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg), work.left_hand))
         rows.append(row(road, grid, height, fitted))
@@ -215,7 +220,7 @@ def _grids(unit: RouteUnit, work: Work) -> tuple[list[tuple[HeightGrid, HeightAt
     if line is None:
         return [], problem
     parts = lines.usable(line, height(line.x, line.y), lines.Options())
-    return [(grids.height_grid(part, height, grids.Options()), height) for part in parts], ""
+    return [(height_grid(part, height), height) for part in parts], ""
 
 
 def reference_line(unit: RouteUnit) -> tuple[ReferenceLine | None, str]:
@@ -236,14 +241,14 @@ def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
 
 def row(road: int, grid: HeightGrid, height: HeightAt, fitted: Profiles) -> Row:
     """Return a road's row of the report."""
-    line, own = grid.line, grid_error(grid, height)
-    missed = profile_error(grid, fitted)
+    line = grid.line
+    (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
     half = float(line.width.max()) / 2
     errors = {
-        "crg_median_mm": own.median_m,
-        "crg_max_mm": own.max_m,
-        "profiles_mean_mm": missed.mean_m,
-        "profiles_max_mm": missed.max_m,
+        "crg_median_mm": crg_median,
+        "crg_max_mm": crg_max,
+        "profiles_mean_mm": mean,
+        "profiles_max_mm": most,
         "off_centre_line_mm": line.offset_m,
     }
     return {

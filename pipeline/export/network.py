@@ -72,7 +72,7 @@ def network(source: Source, options: Options) -> Network:
         raise ConfigError(f"{given}: no road lies on the tiles; check the file's CRS and the selected tiles")
     frame = _frame(source)
     local = [replace(line, points=np.column_stack(frame.to_local(*line.points.T))) for line in lines]
-    routes = tuple(routing.routes(local, routing.Options()))
+    routes = tuple(routing.routes(local))
     shapes = [shapely.LineString(np.column_stack(frame.to_run(*route.points.T))) for route in routes]
     touched = tuple(_touched(routes, shapes, boxes))
     lengths = tuple(map(float, shapely.length(shapely.intersection(shapes, ground))))

@@ -33,8 +33,8 @@ from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.export import road_lines
 from flexroad.tasks.export.road_lines import RoadLine
 from flexroad.tasks.roads import reference_line as lines
+from flexroad.tasks.roads.along_line import Stations, stations
 from flexroad.tasks.roads.reference_line import ReferenceLine
-from flexroad.tasks.roads.stations import Stations, stations
 
 PERCENT = 100.0
 

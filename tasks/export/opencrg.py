@@ -11,7 +11,7 @@ import numpy as np
 
 from flexroad.catalog.text import printable
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.roads.height_grid import HeightGrid
+from flexroad.tasks.roads.along_line import HeightGrid
 
 VERSION = 1
 NAME = ".crg"

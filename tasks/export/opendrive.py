@@ -18,7 +18,7 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.text import printable
-from flexroad.tasks.roads.profiles import Profiles
+from flexroad.tasks.roads.along_line import Profiles
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.types import Floats
 

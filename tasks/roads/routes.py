@@ -16,9 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from pydantic import Field
 
-from flexroad.tasks import options as base
 from flexroad.tasks.types import Floats
 
 SAME_M = 0.05
@@ -28,13 +26,6 @@ DIRECTION_M = 8.0
 
 End = tuple[int, bool]
 """An end of a line: its index, and whether it is the line's last point."""
-
-
-class Options(base.Options):
-    """Where routes end."""
-
-    max_turn_deg: float = Field(45.0, gt=0, lt=90, description="largest turn within a route (degrees)")
-    max_length_m: float = Field(5000.0, ge=100, description="longest route (m); longer ones are divided")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,19 +68,28 @@ class Route:
         return np.asarray(points[np.concatenate([[True], apart])])
 
 
-def routes(lines: Sequence[CentreLine], options: Options) -> list[Route]:
+def routes(
+    lines: Sequence[CentreLine], max_turn_deg: float = 45.0, max_length_m: float = 5000.0
+) -> list[Route]:
     """Return the routes that lines form; each line, or each piece of a line with sharp turns, is in one.
 
     The result does not depend on the direction in which lines of two-way roads were drawn, but for its own
     direction, which is that of the first line of a route.
+
+    Parameters
+    ----------
+    max_turn_deg : float
+        Largest turn within a route (degrees), below 90.
+    max_length_m : float
+        Longest route (m); longer ones are divided.
     """
     pieces = [
         part
         for line in lines
-        for piece in _pieces(line, options.max_turn_deg)
-        for part in _divided(piece, options.max_length_m)
+        for piece in _pieces(line, max_turn_deg)
+        for part in _divided(piece, max_length_m)
     ]
-    follows = _continuations(pieces, options.max_turn_deg)
+    follows = _continuations(pieces, max_turn_deg)
     free = set(range(len(pieces)))
     found: list[Route] = []
     for first in range(len(pieces)):
@@ -97,7 +97,7 @@ def routes(lines: Sequence[CentreLine], options: Options) -> list[Route]:
             chain = list(_chain(first, follows))
             free.difference_update(index for index, _ in chain)
             directed = [pieces[index] if onward else pieces[index].reverse for index, onward in chain]
-            found += _simple(directed, options.max_length_m)
+            found += _simple(directed, max_length_m)
     return found
 
 

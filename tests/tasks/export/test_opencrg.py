@@ -4,7 +4,7 @@ import pytest
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import opencrg
-from flexroad.tasks.roads.height_grid import HeightGrid, Options, height_grid
+from flexroad.tasks.roads.along_line import HeightGrid, height_grid
 from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import reference_line
@@ -42,7 +42,7 @@ def grid(points: np.ndarray = BENDS, **options: float) -> HeightGrid:
     x, y = FRAME.to_local(*(points + SOUTH_WEST).T)
     line = reference_line(Route((CentreLine(np.stack([x, y], axis=1), 6.0),)), LineOptions())
     assert line is not None
-    return height_grid(line, height, Options(**options))
+    return height_grid(line, height, **options)
 
 
 def read(data: bytes) -> tuple[dict[str, float], list[str], np.ndarray]:

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.export import opendrive
-from flexroad.tasks.roads.height_grid import HeightAt, height_grid
-from flexroad.tasks.roads.height_grid import Options as GridOptions
-from flexroad.tasks.roads.profiles import Options as ProfileOptions
-from flexroad.tasks.roads.profiles import profile_error, profiles
+from flexroad.tasks.roads.along_line import HeightAt, height_grid, profile_error, profiles
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
@@ -38,9 +35,7 @@ def reference(points: np.ndarray = BENDS, **known: object) -> ReferenceLine:
 def road(
     line: ReferenceLine, height: HeightAt = hills, name: str = "1", crg: str | None = None
 ) -> opendrive.Road:
-    return opendrive.Road(
-        name, line, profiles(height_grid(line, height, GridOptions()), ProfileOptions()), crg
-    )
+    return opendrive.Road(name, line, profiles(height_grid(line, height)), crg)
 
 
 def written(*roads: opendrive.Road, left_hand: bool = False, **options: object) -> bytes:
@@ -85,7 +80,7 @@ def test_write_pieces_of_the_plan_meet_with_the_same_heading(points):
 
 def test_write_heights_miss_the_surface_as_reported():
     line = reference()
-    grid = height_grid(line, hills, GridOptions())
+    grid = height_grid(line, hills)
     element = only(road(line))
     worst = 0.0
     for s in line.s:
@@ -94,9 +89,9 @@ def test_write_heights_miss_the_surface_as_reported():
         for t in (-3.0, -1.0, 0.0, 2.0, 3.0):
             z = polynomial(element, "elevationProfile/elevation", s) + t * slope
             worst = max(worst, abs(z - hills(x - t * sin(heading), y + t * cos(heading))))
-    reported = profile_error(grid, profiles(grid, ProfileOptions()))
-    assert worst == pytest.approx(reported.max_m, rel=0.1)
-    assert reported.mean_m < reported.max_m < 0.05
+    mean_m, max_m = profile_error(grid, profiles(grid))
+    assert worst == pytest.approx(max_m, rel=0.1)
+    assert mean_m < max_m < 0.05
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.roads.height_grid import HeightGrid, height_grid
-from flexroad.tasks.roads.height_grid import Options as GridOptions
-from flexroad.tasks.roads.profiles import Options, Profiles, profile_error, profiles
+from flexroad.tasks.roads.along_line import HeightGrid, Profiles, height_grid, profile_error, profiles
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
@@ -19,7 +17,7 @@ def straight(length: float = 120.0) -> ReferenceLine:
 
 
 def grid(heights_at, length: float = 120.0) -> HeightGrid:
-    return height_grid(straight(length), heights_at, GridOptions())
+    return height_grid(straight(length), heights_at)
 
 
 def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -28,8 +26,8 @@ def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def fitted(heights: HeightGrid) -> tuple[Profiles, float]:
-    result = profiles(heights, Options())
-    return result, profile_error(heights, result).max_m
+    result = profiles(heights)
+    return result, profile_error(heights, result)[1]
 
 
 @pytest.mark.parametrize("length", [10.0, 11.0, 25.0, 120.0])
@@ -60,7 +58,7 @@ def test_profile_error_of_a_crown_is_what_a_straight_section_misses():
     v = np.arange(-3, 3.1, 0.25)
     truth = np.abs(0.01 * (v**2 - (v**2).mean()))
     assert worst == pytest.approx(truth.max(), abs=1e-6)
-    assert profile_error(crowned, result).mean_m == pytest.approx(truth.mean(), abs=1e-6)
+    assert profile_error(crowned, result)[0] == pytest.approx(truth.mean(), abs=1e-6)
 
 
 def test_profiles_unknown_cross_sections_are_bridged():
@@ -75,7 +73,7 @@ def test_profiles_unknown_cross_sections_are_bridged():
 def test_profile_error_without_heights_is_nan():
     whole = grid(hill)
     nothing = HeightGrid(whole.line, whole.v, whole.heights * np.nan)
-    assert np.isnan(profile_error(nothing, profiles(nothing, Options())).max_m)
+    assert np.isnan(profile_error(nothing, profiles(nothing))[1])
 
 
 def test_profiles_are_smooth_at_their_knots():

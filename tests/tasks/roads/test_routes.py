@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
-from flexroad.tasks.roads.routes import CentreLine, Options, Route, routes
+from flexroad.tasks.roads.routes import CentreLine, Route, routes
 
 A, B, C = (0.0, 0.0), (100.0, 0.0), (200.0, 10.0)
 
@@ -12,7 +12,7 @@ def line(*points: tuple[float, float], **known: object) -> CentreLine:
 
 
 def ways(lines: list[CentreLine], max_turn_deg: float = 45.0) -> list[list[list[float]]]:
-    return [route.points.tolist() for route in routes(lines, Options(max_turn_deg=max_turn_deg))]
+    return [route.points.tolist() for route in routes(lines, max_turn_deg)]
 
 
 @pytest.mark.parametrize("second", [(B, C), (C, B)])
@@ -67,7 +67,7 @@ def test_routes_chain_that_would_cross_itself_is_cut():
     turn = np.radians(np.linspace(-90, 180, 28))
     loop = np.stack([100 + 30 * np.cos(turn), 30 + 30 * np.sin(turn)], axis=1)
     down = CentreLine(np.array([loop[-1], [70.0, -50.0]]), 6.0)
-    found = routes([line(A, tuple(loop[0])), CentreLine(loop, 6.0), down], Options())
+    found = routes([line(A, tuple(loop[0])), CentreLine(loop, 6.0), down])
     assert [len(route.parts) for route in found] == [2, 1]
 
 
@@ -82,7 +82,7 @@ def test_routes_ring_of_lines_is_one_closed_route():
     turn = np.radians(np.linspace(0, 360, 73))
     ring = np.stack([50 * np.cos(turn), 50 * np.sin(turn)], axis=1)
     ring[-1] = ring[0]
-    found = routes([CentreLine(ring[:37], 6.0), CentreLine(ring[36:], 6.0)], Options())
+    found = routes([CentreLine(ring[:37], 6.0), CentreLine(ring[36:], 6.0)])
     assert len(found) == 1
     points = found[0].points
     np.testing.assert_array_equal(points[0], points[-1])
@@ -97,7 +97,7 @@ def test_route_points_repeated_points_are_dropped():
 def test_routes_long_lines_and_chains_are_divided():
     chain = [CentreLine(np.array([[x, 0.0], [x + 90.0, 0.0]]), 6.0) for x in (0.0, 90.0, 180.0, 270.0)]
     whole = CentreLine(np.array([[0.0, 50.0], [500.0, 50.0]]), 6.0, name="long")
-    found = routes([*chain, whole], Options(max_length_m=200.0))
+    found = routes([*chain, whole], max_length_m=200.0)
     spans = [(float(route.points[0, 0]), float(route.points[-1, 0])) for route in found]
     np.testing.assert_allclose(
         spans, [(0, 180), (180, 360), (0, 500 / 3), (500 / 3, 1000 / 3), (1000 / 3, 500)]

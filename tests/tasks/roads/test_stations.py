@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from flexroad.tasks.roads.along_line import stations
 from flexroad.tasks.roads.reference_line import Options, ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
-from flexroad.tasks.roads.stations import stations
 
 
 def line(*points: tuple[float, float], width: float = 6.0) -> ReferenceLine:

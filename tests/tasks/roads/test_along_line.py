@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from flexroad.tasks.roads.height_grid import Options, grid_error, height_grid
+from flexroad.tasks.roads.along_line import grid_error, height_grid
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
@@ -19,17 +19,17 @@ def tilted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def test_height_grid_left_of_the_line_has_positive_v():
     # Northwards: the left is in the west.
-    grid = height_grid(road(np.array([[10.0, 0.0], [10.0, 40.0]])), tilted, Options())
+    grid = height_grid(road(np.array([[10.0, 0.0], [10.0, 40.0]])), tilted)
     np.testing.assert_allclose(grid.v, np.arange(-4, 4.1, 0.25))
     y = np.arange(41.0)[:, None]
     np.testing.assert_allclose(grid.heights, tilted(10 - grid.v, y), atol=1e-9)
-    assert grid_error(grid, tilted).max_m < 1e-9
+    assert grid_error(grid, tilted)[1] < 1e-9
 
 
 def test_height_grid_narrow_bend_has_no_margin_on_its_inside():
     turn = np.radians(np.arange(0.0, 181.0, 5.0))
     bend = 6 * np.stack([np.sin(turn), 1 - np.cos(turn)], axis=1)
-    grid = height_grid(road(bend), tilted, Options(margin_m=5.0))
+    grid = height_grid(road(bend), tilted, margin_m=5.0)
     assert grid.v[0] == -8
     assert 3 < grid.v[-1] < 6
     # Cross-sections do not meet: all cells have an area.
@@ -42,16 +42,16 @@ def test_height_grid_narrow_bend_has_no_margin_on_its_inside():
 def test_grid_error_is_that_of_the_middle_of_cells():
     line = road(np.array([[0.0, 0.0], [40.0, 0.0]]))
     bowl = lambda x, y: 0.5 * (0.2 * x**2 + 0.4 * y**2)  # noqa: E731
-    error = grid_error(height_grid(line, bowl, Options()), bowl)
+    median_m, max_m = grid_error(height_grid(line, bowl), bowl)
     # h^2 / 8 of the second derivative along each direction.
-    assert error.median_m == pytest.approx(0.2 / 8 + 0.4 * 0.25**2 / 8)
-    assert error.max_m == pytest.approx(error.median_m)
+    assert median_m == pytest.approx(0.2 / 8 + 0.4 * 0.25**2 / 8)
+    assert max_m == pytest.approx(median_m)
 
 
 def test_height_grid_beyond_the_surface_is_nan_and_has_no_error():
     line = road(np.array([[0.0, 0.0], [40.0, 0.0]]))
     half = lambda x, y: np.where(y > 0, np.nan, x)  # noqa: E731
-    grid = height_grid(line, half, Options())
+    grid = height_grid(line, half)
     assert np.isnan(grid.heights[:, grid.v > 1e-6]).all()
-    assert grid_error(grid, half).max_m < 1e-9
-    assert np.isnan(grid_error(grid, lambda x, y: x + np.nan).median_m)
+    assert grid_error(grid, half)[1] < 1e-9
+    assert np.isnan(grid_error(grid, lambda x, y: x + np.nan)[0])
