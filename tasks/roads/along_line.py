@@ -60,7 +60,7 @@ def height_grid(
 
 
 def grid_error(grid: HeightGrid, height: HeightAt) -> tuple[float, float]:
-    """Return how far bilinear interpolation misses the surface in the middle of cells: median, largest (m)."""
+    """Return how far bilinear interpolation misses a surface in the middle of cells: median, largest (m)."""
     x, y = grid.line.beside((grid.v[:-1] + grid.v[1:]) / 2)
     z = grid.heights
     middle = (z[:-1, :-1] + z[1:, :-1] + z[:-1, 1:] + z[1:, 1:]) / 4

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+import shapely.ops
 
 from flexroad.tasks.types import Floats
 
