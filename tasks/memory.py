@@ -64,10 +64,6 @@ def check(needed: float, what: str, remedy: str, file: str = "") -> None:
         Estimated size (bytes).
     what : str
         What needs it, with the file and its size: the beginning of the message.
-    remedy : str
-        What the user can do.
-    file : str
-        The file at fault.
 
     Raises
     ------

@@ -107,14 +107,10 @@ def sample(
 
     Parameters
     ----------
-    surface : Surface
-        The fitted ground.
     road : RoadMask
         Gives the grids, the raw mask and the cells beyond the survey, where the mesh ends.
     clusters : RoadClusters
         Gives the filtered mask.
-    options : Options
-        Spacings in metres.
     frame : Frame, optional
         What the tile shares with its neighbours; None if its surface was fitted without.
 

@@ -46,10 +46,6 @@ def image_errors(failure: str, remedy: str, file: Path) -> Iterator[None]:
     ----------
     failure : str
         Beginning of the message: the image, and that it cannot be read.
-    remedy : str
-        What the user can do.
-    file : Path
-        The file at fault.
 
     Raises
     ------

@@ -111,8 +111,6 @@ def ecsrc(data: TileData, road: RoadMask, options: Options) -> RoadClusters:
         Its DSM gives the points' heights, its DTM the ground's, ``(H, W)``, m.
     road : RoadMask
         The raw mask M^r on the same grid.
-    options : Options
-        Thresholds in metres.
 
     Returns
     -------

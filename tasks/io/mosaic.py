@@ -120,10 +120,6 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     ----------
     tile : Tile
         With the files to read (`Tile.within`, `Tile.around`).
-    layer : Layer
-        The layer of the tile.
-    grid : Grid
-        The cells of the result.
     core : Grid
         The tile that the files are of: the position of a file without georeference and of unknown extent.
     around : bool

@@ -107,12 +107,8 @@ def read_window(
 
     Parameters
     ----------
-    path : Location
-        The file.
     name : str
         Name of the file in messages: ``dsm a.tif``.
-    grid : Grid
-        The grid to cover.
     core : Grid
         Position of a file without georeference, if it has as many cells.
     crs : str, optional
@@ -187,8 +183,6 @@ def read_raster(
         As of `read_window`.
     read : callable
         Takes the open raster.
-    by : callable
-        Opens it.
     missing : frozenset of str, optional
         Full names of the files that are known to be missing; None if that is not known.
 

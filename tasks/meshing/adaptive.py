@@ -82,8 +82,6 @@ def adaptive(surface: Surface, area: Area, border: Floats, same_m: float) -> tup
 
     Parameters
     ----------
-    surface : Surface
-    area : Area
     border : ndarray, (b, 3)
         All vertices on the border of the domain.
     same_m : float
@@ -144,7 +142,6 @@ def free_sides(area: Area, marks: Floats) -> Iterator[tuple[Floats, Bools, Bools
 
     Parameters
     ----------
-    area : Area
     marks : ndarray, (m, 2)
         Further points on the border, which are needed.
     """

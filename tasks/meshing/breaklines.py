@@ -45,7 +45,6 @@ def breaklines(surface: SteppedSurface, local: Bounds) -> Breaklines:
 
     Parameters
     ----------
-    surface : SteppedSurface
     local : tuple of float
         West, south, east and north of the tile, from the origin of its cells (m).
     """

@@ -29,7 +29,6 @@ def divided(
 
     Parameters
     ----------
-    lines : shapely.MultiLineString
     fine_m, coarse_m : float
         Largest distance of points where ``is_fine``, and elsewhere (m).
     is_fine : callable

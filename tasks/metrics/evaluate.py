@@ -41,8 +41,6 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
 
     Parameters
     ----------
-    mesh : Mesh
-        The sampled surface.
     data : TileData
         Reference heights, else the DTM, are the truth.
     road : RoadMask

@@ -104,8 +104,6 @@ def assess(
         The raw mask and the cells beyond the survey.
     clusters : RoadClusters
         The road cells that the filter kept.
-    surface : Surface
-        The fitted surface.
     options : Options
         Tolerance, thresholds and the share of the road that is withheld.
     refit : callable, optional

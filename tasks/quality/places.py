@@ -25,10 +25,6 @@ def places(cells: Compared, grid: Grid, options: Options) -> dict[str, Place]:
     ----------
     cells : Compared
         The surface beside DSM and DTM, in the cells of ``grid``.
-    grid : Grid
-        The core of the tile.
-    options : Options
-        Tolerance between two heights of the same ground.
 
     Returns
     -------

@@ -51,8 +51,6 @@ def read_centre_lines(source: Source, bounds: Bounds, crs: str, options: Options
         West, south, east and north (m, in ``crs``).
     crs : str
         CRS of the result.
-    options : Options
-        Selection of roads, and their widths.
 
     Raises
     ------

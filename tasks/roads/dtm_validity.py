@@ -42,8 +42,6 @@ def invalid_dtm(data: TileData, road: RoadMask, kept: Bools) -> Bools:
     ----------
     data : TileData
         DSM and DTM, m.
-    road : RoadMask
-        The raw mask.
     kept : (H, W) array of bool
         The filtered mask.
     """

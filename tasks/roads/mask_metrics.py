@@ -87,8 +87,6 @@ def judge(
         Probability of road, ``(H, W)``, 0 to 1.
     valid : Bools
         Cells to compare, ``(H, W)``; an edge counts if both its cells are valid.
-    grid : Grid
-        Grid of the arrays.
     """
     none = np.zeros(STEPS + 1, np.int64)
     road = ground = none

@@ -107,8 +107,6 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
         The tile's layer ``roads``.
     grid : Grid
         The area to read; roads that touch it are returned whole.
-    options : Options
-        Selection and widths.
 
     Raises
     ------

@@ -183,10 +183,8 @@ def usable(line: ReferenceLine, known: Floats, options: Options) -> list[Referen
 
     Parameters
     ----------
-    line : ReferenceLine
     known : ndarray, (n,)
         Heights at its points, NaN beyond the surface.
-    options : Options
     """
     return parts(line, np.isfinite(known) & (np.abs(line.curvature) * line.width / 2 < FOLD), options)
 

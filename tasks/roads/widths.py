@@ -128,8 +128,6 @@ def widths(table: Any, classes: Any, options: Options) -> tuple[Floats, tuple[st
         Its columns may hold widths and numbers of lanes; names in lower case.
     classes : sequence of str or None
         Class of each row.
-    options : Options
-        Source of widths.
     """
     bare_m = FOOT_M if options.width_unit == "ft" else 1.0
     width, unreadable = np.full(len(table), np.nan), []

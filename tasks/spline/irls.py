@@ -159,8 +159,6 @@ def minimise(loss: HuberObjective, start: Floats, iterations: int, tolerance: fl
 
     Parameters
     ----------
-    loss : HuberObjective
-        The convex loss.
     start : ndarray, (m, n)
         Control heights (m); not changed.
     iterations : int

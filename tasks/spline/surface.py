@@ -70,7 +70,6 @@ def basis(knots: Floats, degree: int, u: Floats) -> tuple[Starts, Floats, Floats
     Parameters
     ----------
     knots : ndarray, (points + degree + 1,)
-    degree : int
     u : ndarray, (N,)
         Parameters in the domain. A knot belongs to the span on its right, the last to the span on its left.
 

@@ -99,8 +99,6 @@ def survey(scenes: int = len(SITES), seed: int = 0) -> list[Place]:
     ----------
     scenes : int
         Number of scenes, the first of `SITES`.
-    seed : int
-        Seed of the world.
     """
     return [_locate(row, site, seed) for row, site in enumerate(SITES[:scenes])]
 

@@ -144,8 +144,6 @@ def survey(tiles: int = TILES, seed: int = 0) -> list[tuple[str, Grid, str, Scen
     ----------
     tiles : int
         Number of tiles; 240 as in the paper.
-    seed : int
-        Seed of the world and of each tile's options.
     """
     return [
         _place(row, stratum, number, seed)

@@ -316,12 +316,6 @@ def roofs_seen(
 
     Parameters
     ----------
-    houses : sequence of House
-        The houses.
-    seed : int
-        Seed of the world.
-    ground_at : callable
-        Returns the ground at points.
     lean : float
         Displacement per height above the ground, at the edge of an image.
     facades : float

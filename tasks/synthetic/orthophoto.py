@@ -73,14 +73,10 @@ def orthophoto(
 
     Parameters
     ----------
-    grid : Grid
-        The tile's cells.
     seed : int
         Seed of the world, 0 or more.
     stratum : str, optional
         See `make_scene`.
-    options : SceneOptions
-        Contents of the world.
     gsd : float
         Ground sampling distance (m).
 

@@ -58,8 +58,6 @@ def photogrammetry(place: Place, seed: int) -> PhotogrammetryScene:
     ----------
     place : Place
         A place from `tasks.synthetic.dsc3d.survey`.
-    seed : int
-        Seed of the survey.
 
     Returns
     -------

@@ -79,16 +79,10 @@ def populate(
 
     Parameters
     ----------
-    streets : sequence of Street
-        Streets whose objects are returned.
     farther : sequence of Street
         These and more streets; houses do not stand on their car parks and fields.
-    seed : int
-        Seed of the world.
     ground_at : callable
         Returns the ground at points, with all streets nearby.
-    options : SceneOptions
-        Amounts of each kind of object.
     """
     density, errors = options.density, options.mask_errors
     parks = car_parks(farther, seed, ground_at, options.car_parks * density)

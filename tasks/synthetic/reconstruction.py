@@ -76,8 +76,6 @@ def reconstruct(scene: Scene, seed: int, faults: Faults) -> Reconstruction:
         A scene without noise; cells of 0.5 m resolve cars and walls.
     seed : int
         Seed of the world; bumps and holes are functions of seed and coordinates.
-    faults : Faults
-        Size of the faults.
     """
     grid = scene.grid
     smoothed = ndimage.gaussian_filter(_static_surface(scene), faults.melt_m / grid.cell, mode="nearest")

@@ -82,14 +82,10 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
 
     Parameters
     ----------
-    grid : Grid
-        The tile's cells.
     seed : int
         Seed of the world, 0 or more.
     stratum : str, optional
         Stratum of the complete world: ``urban``, ``suburban`` or ``rural``; by default a mix of districts.
-    options : SceneOptions
-        Contents of the world.
 
     Raises
     ------
@@ -245,8 +241,6 @@ def scan(scene: Scene, per_m2: float, noise_m: float, seed: int = 0) -> Points:
         Number of points per m2.
     noise_m : float
         Standard deviation of their heights (m).
-    seed : int
-        Seed of positions and noise.
     """
     grid, rng = scene.grid, generator(seed, "scan", *map(int, scene.grid.origin))
     west, south, east, north = grid.bounds

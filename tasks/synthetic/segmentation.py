@@ -33,8 +33,6 @@ def segmentation(
 
     Parameters
     ----------
-    canvas : Canvas
-        The tile's cells.
     edge : (H, W) array
         Distance of the cells to the nearest carriageway's edge, negative on the road (m).
     objects : Objects

@@ -50,8 +50,6 @@ def relief(seed: int, slope: float, roughness_m: float, datum_m: float, embankme
 
     Parameters
     ----------
-    seed : int
-        Seed of the world.
     slope : float
         Root mean square slope of the hills.
     roughness_m : float

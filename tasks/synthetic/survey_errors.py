@@ -108,8 +108,6 @@ def growth(
 
     Parameters
     ----------
-    seed : int
-        Seed of the world.
     x, y, edge : (H, W) array
         Coordinates in the plan's frame, and distance to the nearest carriageway (m).
     height_m : float

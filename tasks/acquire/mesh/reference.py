@@ -40,12 +40,8 @@ def refine(dtm: Floats, ground: Bools, grid: Grid, fill_m: float, options: ecsrc
         Bare ground as given by a ground filter, m; NaN where there is none.
     ground : ndarray of bool, (H, W)
         Cells with ground points; the heights of the others are interpolated.
-    grid : Grid
-        The cells of the DTM.
     fill_m : float
         Gaps up to this width are interpolated linearly (m), wider ones become NaN.
-    options : ecsrc.Options
-        Thresholds in metres.
 
     Returns
     -------
@@ -72,10 +68,6 @@ def reference(
         Highest surface and refined bare ground, m; NaN where there is none.
     road : ndarray of bool, (H, W)
         The raw road mask.
-    grid : Grid
-        The cells.
-    options : ecsrc.Options
-        Thresholds in metres.
     """
     kept = _kept(dsm, road, grid, options)
     return np.where(kept, dsm, dtm), kept

@@ -99,8 +99,6 @@ def sample(mesh: TexturedMesh, density: float, seed: int) -> Iterator[Points]:
         In a CRS in metres.
     density : float
         Points per m2 of surface.
-    seed : int
-        Seed of the random numbers.
 
     Yields
     ------
@@ -131,8 +129,6 @@ def orthophoto(mesh: TexturedMesh, grid: Grid) -> Orthophoto:
     ----------
     mesh : TexturedMesh
         Must be in a CRS in metres, and all faces must have a colour.
-    grid : Grid
-        The pixels.
 
     Returns
     -------

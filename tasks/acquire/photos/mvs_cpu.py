@@ -113,14 +113,10 @@ def photo_cloud(view: View, others: Sequence[View], points: Floats, options: Opt
 
     Parameters
     ----------
-    view : View
-        The photograph.
     others : Sequence of View
         Its partners; with fewer than 2 the cloud is empty.
     points : Floats
         Sparse points visible in the photograph, ``(n, 3)``, m; they limit the range of depths.
-    options : Options
-        Image size and tolerance.
 
     Raises
     ------

@@ -37,8 +37,6 @@ def patchmatch(reconstruction: Reconstruction, work: Path, options: Options) -> 
         Its model and photographs are read from their files.
     work : Path
         Folder for undistorted photographs and depth maps: about 20 bytes per pixel of each photograph.
-    options : Options
-        Size of the photographs.
 
     Raises
     ------

@@ -54,7 +54,6 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
     ----------
     easting, northing, height : ndarray, (n,)
         In metres. Points with NaN or infinite coordinates are not ground.
-    options : Options
 
     Returns
     -------
@@ -82,7 +81,6 @@ def ground_cells(heights: Floats, cell: float, options: Options) -> Bools:
         In metres; cells with NaN are not ground.
     cell : float
         Cell size (m).
-    options : Options
 
     Returns
     -------

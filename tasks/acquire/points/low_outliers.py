@@ -64,7 +64,6 @@ def without_low_outliers(
         In metres.
     radius_m : float
         Radius of searches in the buckets (m), for their size.
-    options : Options
 
     Raises
     ------

@@ -54,7 +54,6 @@ def ground(easting: Floats, northing: Floats, height: Floats, options: Options) 
     ----------
     easting, northing, height : ndarray, (n,)
         In metres. Points with NaN or infinite coordinates are not ground.
-    options : Options
 
     Returns
     -------

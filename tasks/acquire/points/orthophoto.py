@@ -25,8 +25,6 @@ def photo(points: Points, grid: Grid, fill_m: float) -> Orthophoto:
     ----------
     points : Points
         Must have colours, and include a rim of ``fill_m`` around the grid.
-    grid : Grid
-        The pixels.
     fill_m : float
         Pixels whose centre is farther than this from that of a valid pixel stay without colour (m).
     """

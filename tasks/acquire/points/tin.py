@@ -49,8 +49,6 @@ def triangulated(
         The cells of the ground points, ``(n,)``.
     easting, northing, height : Floats
         The ground points, ``(n,)``, m.
-    grid : Grid
-        The cells.
     void_m : float
         The DTM is NaN where a circle of this diameter plus `EMPTY_CIRCLE_CELLS` has no node (m).
     """
@@ -79,8 +77,6 @@ def tin(east: Floats, north: Floats, height: Floats, grid: Grid, widest_m: float
         Position of a cell's node, from the grid's north-west corner, ``(H, W)``, m.
     height : Floats
         Height of a cell's node, ``(H, W)``, m; NaN if the cell has no node.
-    grid : Grid
-        The cells.
     widest_m : float
         Largest diameter of a triangle's circumcircle (m).
 

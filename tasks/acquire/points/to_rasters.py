@@ -74,10 +74,6 @@ def rasterise(points: Points, grid: Grid, options: Options, dop_cell: float | No
     ----------
     points : Points
         In the grid's CRS (m), including a rim of `reach_m` around the grid; others have no effect.
-    grid : Grid
-        The cells.
-    options : Options
-        Voids, classes and methods.
     dop_cell : float, optional
         Pixel of the orthophoto (m); None makes no orthophoto.
 
