@@ -20,6 +20,7 @@ from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.layers import fitting_config
+from flexroad.pipeline.prepare.options import MIN_COVER_HELP
 
 app = group("catalog", "Make, show and check catalogs of tiles.")
 
@@ -72,7 +73,7 @@ MinCover = Annotated[
         min=0,
         max=1,
         metavar="SHARE",
-        help=options.MIN_COVER_HELP,
+        help=MIN_COVER_HELP,
         rich_help_panel=options.TILES,
     ),
 ]

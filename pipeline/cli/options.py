@@ -28,7 +28,6 @@ HEADINGS = (
 
 ON_FAILURE = "FLEXROAD_ON_FAILURE"
 """Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
-MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Literal
 
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.pipeline.errors import ConfigError
+
+MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
 
 
 def written(paths: Iterable[Path]) -> datetime:
@@ -16,36 +19,64 @@ def written(paths: Iterable[Path]) -> datetime:
     return datetime.fromtimestamp(max(path.stat().st_mtime for path in paths), UTC)
 
 
+def _option(heading: str, help: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
+    """Return what help pages say of a field's option: heading, meaning, word for a value, limits.
+
+    The option has the name of the field without its unit, if `name` does not give another.
+    """
+    return {"heading": heading, "help": help, "metavar": metavar, **more}
+
+
 @dataclass(frozen=True)
 class PrepareOptions:
-    """The options shared by all commands."""
+    """The options shared by all commands; the command line makes its options of these fields."""
 
-    cell_m: float = 1.0
-    """Cell of the heights (m)."""
-    dop_cell_m: float = 0.5
-    """Pixel of the orthophoto (m)."""
-    crs: str | None = None
-    """CRS of inputs without one."""
-    to_crs: str | None = None
-    """CRS of the rasters, in metres; by default derived from that of the input."""
-    height_unit: str | None = None
-    """``metre``, ``foot`` or ``us-foot``, if the input's CRS has no height unit; by default its plan unit."""
-    roads: Path | None = None
-    """Roads for the mask: polygons, a raster, or a mesh projected vertically; lines make no mask."""
-    roads_layer: str | None = None
-    """Layer of ``roads``, for a vector file with several."""
-    roads_where: str | None = None
-    """SQL condition that selects features of ``roads``: ``class = 'road'``."""
-    tile_size_m: float = 250
-    """Side of a tile (m)."""
-    min_cover: float = MIN_COVER
-    """Tiles with a DSM height in less than this share (0 to 1) of their cells are left out."""
-    date: datetime | None = None
-    """Acquisition date; takes precedence over the files."""
+    cell_m: float = field(
+        default=1.0, metadata=_option("Rasters", "Cell of the heights in m.", "METRES", min=0.01)
+    )
+    dop_cell_m: float = field(
+        default=0.5, metadata=_option("Rasters", "Pixel of the orthophoto in m.", "METRES", min=0.01)
+    )
+    crs: str | None = field(
+        default=None, metadata=_option("Inputs", "CRS of inputs without one, e.g. EPSG:2994.", "CRS")
+    )
+    to_crs: str | None = field(
+        default=None,
+        metadata=_option("Rasters", "CRS of the rasters; default: the input's, in metres.", "CRS"),
+    )
+    height_unit: Literal["metre", "foot", "us-foot"] | None = field(
+        default=None,
+        metadata=_option("Inputs", "Unit of heights if the CRS has none; default: that of the plan."),
+    )
+    roads: Path | None = field(
+        default=None,
+        metadata=_option("Inputs", "Roads: polygons, a raster or a mesh, for the mask; or lines.", "FILE"),
+    )
+    """A mesh is projected vertically; lines make no mask."""
+    roads_layer: str | None = field(
+        default=None, metadata=_option("Inputs", "Layer of --roads, if the file has several.", "NAME")
+    )
+    roads_where: str | None = field(
+        default=None, metadata=_option("Inputs", "SQL condition on --roads: \"class = 'road'\".", "SQL")
+    )
+    tile_size_m: float = field(
+        default=250, metadata=_option("Rasters", "Side of a tile in m; a smaller area is one tile.", "METRES")
+    )
+    min_cover: float = field(
+        default=MIN_COVER, metadata=_option("Rasters", MIN_COVER_HELP, "SHARE", min=0, max=1)
+    )
+    date: datetime | None = field(
+        default=None,
+        metadata=_option("Inputs", "Date of the survey; default: that of the files.", "YYYY-MM-DD"),
+    )
     assumed_date: datetime | None = None
-    """Date, marked as assumed, if neither the option nor the files give one."""
-    dataset: str | None = None
-    """Name of the data in reports; by default the name of the source."""
+    """Date, marked as assumed, if neither the option nor the files give one; not on the command line."""
+    dataset: str | None = field(
+        default=None,
+        metadata=_option(
+            "Outputs", "Name of the data in reports; default: the input's name.", "NAME", name="name"
+        ),
+    )
 
     @property
     def step_m(self) -> float:
