@@ -10,6 +10,7 @@ The names below are imported on first use: ``import flexroad`` alone loads no nu
 """
 
 import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -59,9 +60,7 @@ _HOME = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib.metadata import version
-
-        value: Any = version("flexroad")
+        value: Any = importlib.metadata.version("flexroad")
     elif name in _HOME:
         value = getattr(importlib.import_module(f"flexroad.{_HOME[name]}"), name)
     else:

@@ -17,6 +17,8 @@ from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor, SerialExecutor
+from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
+from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.tasks.synthetic import dsc3d
 from flexroad.tasks.synthetic.dsc3d import Place
 from flexroad.tasks.synthetic.photogrammetry import encode, photogrammetry
@@ -77,9 +79,6 @@ def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Execut
 
 
 def _write_scene(job: _Job) -> str:
-    from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
-    from flexroad.pipeline.prepare.options import PrepareOptions
-
     scene = photogrammetry(job.place, job.seed)
     folder = Path(job.folder) / scene.name
     truth = scene.truth

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import rioxarray  # noqa: F401 (adds .rio to datasets)
+import xarray as xr
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.synthetic import make_scene
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 LAYERS = ("dsm", "dtm", "road_mask", "reference")
 CRS = "EPSG:25832"
@@ -45,9 +43,6 @@ def example(seed: int = 0, size_m: int = 120) -> xr.Dataset:
     >>> list(scene.data_vars), dict(scene.sizes)
     (['dsm', 'dtm', 'road_mask', 'reference'], {'y': 60, 'x': 60})
     """
-    import rioxarray  # noqa: F401 (adds .rio to datasets)
-    import xarray as xr
-
     if seed < 0 or not 60 <= size_m <= 1000:
         raise ConfigError(f"seed {seed}, size_m {size_m}: give a seed from 0 and a size from 60 to 1000 m")
     grid = Grid(CRS, WEST_M, SOUTH_M + size_m, 1.0, size_m, size_m)

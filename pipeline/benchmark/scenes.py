@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import shapely
+
 from flexroad.catalog import Catalog, Grid, Tile
 from flexroad.catalog.headers.vectors import opened, with_roads
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
 from flexroad.pipeline.benchmark.dsc3d import write_stand_in
@@ -20,6 +23,8 @@ from flexroad.tasks.io.vectors import vector_date
 from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
 from flexroad.tasks.synthetic.orthophoto import orthophoto
+
+geopandas = lazy("geopandas")
 
 PRESETS = ("gerod", "dsc3d")
 TILES, SIZE_M = 4, 250
@@ -152,9 +157,6 @@ def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> 
 
 
 def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
-    import geopandas
-    import shapely
-
     target = output_file(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.gpkg")
     columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}

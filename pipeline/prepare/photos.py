@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import some
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
@@ -31,6 +32,8 @@ from flexroad.tasks.acquire.photos.poisson import poisson
 from flexroad.tasks.acquire.photos.sfm import Reconstruction, View
 from flexroad.tasks.acquire.points import to_rasters
 from flexroad.tasks.types import Floats
+
+cv2 = lazy("cv2")
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 ON_GPU, ON_CPU = "PatchMatch on the GPU", "semi-global matching on the CPU, as this pycolmap has no CUDA"
@@ -266,8 +269,6 @@ def _jobs(
 
 
 def _match(job: DepthJob) -> Path:
-    import cv2
-
     # Photographs are matched in parallel, one thread each; OpenCV does not read the environment.
     cv2.setNumThreads(1)
     cloud = mvs_cpu.photo_cloud(job.view, job.others, job.points, job.options)

@@ -18,15 +18,21 @@ from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.vectors import VectorFile, layers, listed, opened
+from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.tasks import memory
+from flexroad.tasks.acquire.mesh.read import read_mesh
+from flexroad.tasks.acquire.mesh.sample import covered_cells, in_metres
 from flexroad.tasks.io.vectors import has_place
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
+
+geopandas = lazy("geopandas")
+pyogrio = lazy("pyogrio")
 
 MESHES = (".obj", ".ply", ".glb", ".gltf")
 AREAS = ("Polygon", "MultiPolygon")
@@ -133,9 +139,6 @@ def _no_overlap(path: Path, grid: Grid) -> ConfigError:
 
 
 def _mesh(path: Path, grid: Grid) -> Bools:
-    from flexroad.tasks.acquire.mesh.read import read_mesh
-    from flexroad.tasks.acquire.mesh.sample import covered_cells, in_metres
-
     mesh = read_mesh(path, colours=False)
     return covered_cells(in_metres(mesh, MetricTransform.of(mesh.crs, mesh.bounds[:2], grid.crs)), grid)
 
@@ -202,9 +205,6 @@ def _osm(path: Path, layer: str | None) -> bool:
 
 def _read(path: Path, layer: str | None, where: str | None, rows: int | None = None) -> Any:
     """Return the features of a layer; ``rows`` limits their number."""
-    import geopandas
-    from pyogrio.errors import DataLayerError, DataSourceError
-
     try:
         file = vector_name(path)
         found = layers(path)
@@ -217,7 +217,7 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
         if layer is not None and layer not in names:
             raise ConfigError(f"--roads {path} has no layer {layer!r}; it has {listed(found)}")
         features = geopandas.read_file(file, layer=layer or names[0], where=where, rows=rows)
-    except (DataSourceError, DataLayerError, ValueError, OSError) as error:
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
             f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"
         ) from error
