@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hypothesis import settings
 
 from flexroad.pipeline import ONE_THREAD
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
@@ -15,6 +16,10 @@ from tests import changed, command_line
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell starts background jobs with Ctrl-C ignored, and the processes of the tests would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests never assert on time. --hypothesis-profile is loaded after this.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 QUICK = {
     "fit": {"method": "nurbs", "control_points": [12, 12], "iterations": 30},

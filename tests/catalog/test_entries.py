@@ -230,7 +230,7 @@ VALUES = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_change_gives_a_catalog_or_one_line(data, valid, tmp_path):
     first, second, *_ = bad_entries.features(valid)

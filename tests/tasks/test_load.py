@@ -87,7 +87,7 @@ def test_load_offset_below_tolerance_is_copied(tmp_path, dtm):
     assert data.notes == ()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(row=st.integers(-25, 25), col=st.integers(-25, 25), size=st.tuples(*2 * [st.integers(1, 45)]))
 def test_load_any_position_puts_cells_in_place(tmp_path_factory, row, col, size):
     root = tmp_path_factory.mktemp("window")

@@ -172,7 +172,7 @@ def test_dynamic_is_delaunay():
     method=st.sampled_from(["dynamic", "dynamic", "uniform", "corners"]),
     data=st.data(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_sample_any_mask_and_lattice_covers_domain(cell, shape, corner, road_m, ratio, halo, method, data):
     core = ground(shape[1], shape[0], cell, *corner)
     grid = core.buffered(halo)
@@ -341,7 +341,7 @@ def test_dynamic_mesh_beyond_survey_raises():
 
 
 @given(seed=st.integers(0, 2**31), halo=st.sampled_from([0, 2]), share=st.floats(0.05, 0.95))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_dynamic_mesh_of_any_survey_has_every_centre_with_data(seed, halo, share):
     core = ground(30, 24)
     grid = core.buffered(halo)

@@ -84,7 +84,7 @@ def union(parts):
     return Union.of((mesh.vertices + np.array(mesh.origin), mesh.faces) for mesh in parts)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**31),
     cell=st.sampled_from([0.1, 0.2, 0.5, 1.0, 2.0]),
@@ -199,7 +199,7 @@ def test_mesh_of_covered_tile_is_the_same_beside_end_of_survey():
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.02, 0.98), cell=st.sampled_from([0.2, 0.5, 1.0]))
 def test_meshes_of_any_survey_meet(seed, share, cell):
     rng = np.random.default_rng(seed)

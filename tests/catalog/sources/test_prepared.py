@@ -89,7 +89,7 @@ def test_write_tile_without_date_uses_file_time(tmp_path):
     assert before < tile.datetime < datetime.now(UTC) + timedelta(seconds=5)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     cell=st.sampled_from([0.1, 0.2, 0.3, 1 / 3, 0.7, 2.5, 10.0]),
     west=st.floats(0, 1e6, allow_subnormal=False),

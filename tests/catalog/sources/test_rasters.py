@@ -180,7 +180,7 @@ def test_cover_counts_overlapping_files_once(tmp_path):
     assert len(index(tmp_path, {"dsm": "*.tif"}, min_cover=0.4).tiles) == 1
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     west=st.integers(-300, 300),
     north=st.integers(-300, 300),

@@ -38,7 +38,7 @@ def test_read_templates_give_id_layers_and_stratum(tmp_path):
     assert result.notes == ("no dtm at '{stratum}/{tile}/dtm_*.tif' for 1 of 3 tiles: one",)
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     tile=st.text("abcXYZ019_-.+()[]", min_size=1, max_size=12).filter(lambda name: name.strip(".")),
     template=st.sampled_from(

@@ -228,7 +228,7 @@ def changed(draw, value):
 
 
 @given(st.data())
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_change_gives_a_configuration_or_lines(tmp_path, data):
     text = yaml.dump(changed(data.draw, data.draw(st.sampled_from(SEEDS)))).encode(errors="replace")
     if data.draw(st.booleans()):

@@ -47,7 +47,7 @@ def cases(draw):
 
 
 @given(cases(), thresholds, st.sampled_from([1.0, 0.5, 0.2]))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_ecsrc_any_input_equals_algorithm_1(case, options, cell):
     mask, dsm = case
     result = cluster(mask, dsm, options, cell)
@@ -64,7 +64,6 @@ def test_ecsrc_streets_equals_algorithm_1(seed, options):
 
 
 @given(cases())
-@settings(deadline=None)
 def test_merge_without_growth_gives_same_labels(case):
     mask, dsm = case
     heights = oracle.points(mask, dsm)
@@ -75,7 +74,6 @@ def test_merge_without_growth_gives_same_labels(case):
 
 
 @given(cases(), thresholds, st.integers(-400, 4000))
-@settings(deadline=None)
 def test_ecsrc_constant_added_keeps_labels(case, options, constant):
     mask, dsm = case
     np.testing.assert_array_equal(
@@ -84,7 +82,6 @@ def test_ecsrc_constant_added_keeps_labels(case, options, constant):
 
 
 @given(cases(), st.sampled_from([np.flipud, np.fliplr, np.transpose]))
-@settings(deadline=None)
 def test_ecsrc_mirrored_tile_gives_mirrored_clusters(case, mirror):
     mask, dsm = case
     mirrored = mirror(cluster(mask, dsm).labels)

@@ -188,7 +188,7 @@ def test_labels_split_at_gaps_in_order_of_first_cell():
 
 
 @given(st.integers(0, 10_000), st.floats(0, 9), st.sampled_from([0.5, 1.0]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_labels_on_level_ground_equal_components_of_near_cells(seed, gap, cell):
     mask = scattered_blocks(seed)
     level = np.zeros(mask.shape)
@@ -200,7 +200,7 @@ def test_labels_on_level_ground_equal_components_of_near_cells(seed, gap, cell):
 
 
 @given(st.integers(0, 10_000), st.floats(0.5, 50), st.sampled_from([0.5, 1.0]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_verge_on_level_ground_equals_cells_near_kept_parts(seed, verge, cell):
     mask = scattered_blocks(seed)
     level = np.zeros(mask.shape)
@@ -231,14 +231,14 @@ def test_planar_tiny_mask_keeps_nothing(mask):
 
 
 @given(st.integers(0, 10_000), st.sampled_from([np.flipud, np.fliplr, np.transpose]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_planar_mirrored_tile_gives_mirrored_result(seed, mirror):
     case = random_crossing(seed)
     np.testing.assert_array_equal(mirror(classified(*case)), classified(*(mirror(layer) for layer in case)))
 
 
 @given(st.integers(0, 10_000), st.integers(-400, 4000), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_planar_plane_added_keeps_result(seed, constant, south, east):
     mask, dsm, dtm = random_crossing(seed)
     row, col = np.indices(mask.shape)
@@ -247,7 +247,7 @@ def test_planar_plane_added_keeps_result(seed, constant, south, east):
 
 
 @given(st.integers(0, 10_000), st.tuples(*[st.integers(0, 12)] * 4))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_planar_cropped_tile_gives_same_result(seed, cut):
     case = random_crossing(seed)
     rows, cols = slice(cut[0], 90 - cut[1]), slice(cut[2], 90 - cut[3])
@@ -258,7 +258,7 @@ def test_planar_cropped_tile_gives_same_result(seed, cut):
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_flat_patches_equal_least_squares(seed):
     mask, dsm, _ = random_crossing(seed, n=40)
     mask = np.isfinite(dsm) & (np.random.default_rng(seed).random(dsm.shape) < 0.97)

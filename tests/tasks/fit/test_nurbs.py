@@ -282,7 +282,7 @@ def test_fit_equal_inputs_give_equal_surfaces():
     np.testing.assert_array_equal(a.W, b.W)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.integers(10, 60), st.integers(10, 60), st.integers(1, 4), st.integers(5, 8), st.integers(5, 8))
 def test_fit_any_tile_shape_and_grid(rows, cols, degree, n, m):
     data, clusters, truth = tile(shape=(rows, cols))

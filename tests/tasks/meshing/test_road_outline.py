@@ -198,7 +198,7 @@ def test_outline_and_end_of_survey_cross():
     assert shapely.area(drawn(mesh) ^ (truth & covered)) < 1.0
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 25), cell=st.sampled_from([0.5, 1.0]))
 @example(seed=23, count=25, cell=0.5)
 @example(seed=25, count=23, cell=0.5)

@@ -56,7 +56,7 @@ def test_constrained_crossing_segment_is_left_out():
     assert doubled_areas(points, faces).sum() == 32
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(seed=st.integers(0, 2**31), count=st.integers(3, 60), on_lattice=st.booleans())
 def test_constrained_has_all_segments_that_do_not_cross(seed, count, on_lattice):
     rng = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ def test_second_point_near_a_node_is_kept():
     assert set(np.unique(faces)) == set(range(len(points)))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**31),
     step=st.sampled_from([1.0, 0.5, 0.3]),

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
@@ -187,7 +187,6 @@ def test_evaluate_ignores_halo():
     corner=st.tuples(st.floats(-1e3, 8e5), st.floats(0, 9e6)),
     step=st.sampled_from([0.2, 1.0, 1.7, 50.0]),
 )
-@settings(deadline=None)
 def test_drape_covered_hull_has_no_nan(shape, cell, corner, step):
     grid = ground(shape[1], shape[0], cell, *corner)
     plane = tilt(0.1, 0.2)

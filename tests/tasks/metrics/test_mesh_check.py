@@ -205,14 +205,14 @@ def triangles(draw):
     return places[used], faces.reshape(-1, 3)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(triangles())
 def test_faults_agree_with_pairwise_intersections(made):
     places, faces = made
     assert (faults(mesh_of(places, faces)) == ()) == conforming(places, faces)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     cell=st.sampled_from([0.2, 0.5, 1.0]),
     shape=st.tuples(st.integers(6, 24), st.integers(6, 24)),
@@ -242,7 +242,7 @@ def test_sampled_mesh_of_any_mask_and_survey_has_no_fault(
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_winding_consistent
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 2**31),
     share=st.floats(0, 1),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
@@ -81,7 +81,6 @@ def plane_field(heights, ground):
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-500, 5000))
-@settings(deadline=None)
 def test_extrapolated_plane_reproduces_plane(by_row, by_col, level):
     plane = level + by_row * ROW + by_col * COL
     ground = STREET & ((COL < 22) | (COL > 30))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.ndimage import distance_transform_edt
@@ -49,7 +49,6 @@ def test_within_a_reach_beyond_the_grid_needs_a_cell_of_the_mask(shape):
 
 
 @given(MASKS, st.sampled_from([1.0, 0.5, 0.2, 0.1]), st.sampled_from([0.0, 0.3, 0.7, 1.0, 2.5]))
-@settings(deadline=None)
 def test_within_measures_between_cell_centres(mask, cell, reach):
     if mask.any():
         distance = distance_transform_edt(~mask) * cell

@@ -31,7 +31,7 @@ def parse_mask(text):
 
 
 @given(arrays.arrays(bool, st.tuples(st.integers(1, 10), st.integers(1, 10))), cells, widths)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_close_keeps_ground_that_holds_a_disc(mask, cell, width):
     n = int(width / cell + 1e-9) + 1
     rows, cols = np.indices((n, n)) - (n - 1) / 2
@@ -46,7 +46,6 @@ def test_close_keeps_ground_that_holds_a_disc(mask, cell, width):
 
 
 @given(masks, cells, widths, areas)
-@settings(deadline=None)
 def test_steps_are_monotonic_and_idempotent(mask, cell, width, area):
     for step, size in ((close, width), (fill, area)):
         result = step(mask, cell, size)
@@ -58,7 +57,6 @@ def test_steps_are_monotonic_and_idempotent(mask, cell, width, area):
 
 
 @given(masks, cells, areas)
-@settings(deadline=None)
 def test_drop_and_fill_match_scipy_labels(mask, cell, area):
     def small(cells, joined, limit):
         labels, count = ndimage.label(cells, joined)
@@ -120,7 +118,6 @@ def test_clean_adds_no_cells_beyond_survey():
 
 
 @given(masks)
-@settings(deadline=None)
 def test_clean_without_steps_changes_nothing(mask):
     np.testing.assert_array_equal(clean(mask, tile(mask.shape), NOTHING), mask)
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from sklearn.metrics import f1_score, jaccard_score, precision_score, recall_score
@@ -24,7 +24,6 @@ def cases(draw):
 
 
 @given(cases())
-@settings(deadline=None)
 def test_judge_figures_and_curve_match_scikit_learn(case):
     result, truth, known, probability = case
     quality = judge(result, probability, truth, known, grid(result.shape))
@@ -46,7 +45,6 @@ def test_judge_figures_and_curve_match_scikit_learn(case):
 
 
 @given(cases(), cases())
-@settings(deadline=None)
 def test_together_adds_counts_of_tiles(a, b):
     parts = [judge(f, p, t, k, grid(f.shape)) for f, t, k, p in (a, b)]
     whole = together(parts)

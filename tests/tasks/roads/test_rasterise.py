@@ -35,7 +35,7 @@ def test_line_is_buffered_to_its_width_with_flat_ends(tmp_path):
     np.testing.assert_array_equal(mask, truth)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(turn=st.floats(-2.5, 2.5), wide=st.floats(2, 20), narrow=st.floats(2, 20))
 def test_joined_lines_leave_no_wedge(tmp_path_factory, turn, wide, narrow):
     """Everything within the narrower half width of the joint is road, nothing beyond the round buffers."""

@@ -221,7 +221,7 @@ def test_fit_without_road_or_terrain_follows_other_data():
     ],
     ids=["adam", "huber", "absolute"],
 )
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), road=st.floats(0, 1), missing=st.floats(0, 0.8), scale=st.floats(-3, 3))
 def test_fit_any_input_has_no_pole_and_bounded_weights(method, options, seed, road, missing, scale):
     """Any mask and DSM: the surface stays within its control heights and near the data."""

@@ -36,7 +36,7 @@ def surface(column, row, control, n, m, p=3, size=(250.0, 200.0)):
     return NurbsSurface("EPSG:25832", bounds, (p, p), *knots, a, np.ones_like(a), 0.0, (west, south))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(4, 70), st.integers(4, 70), st.integers(2, 5))
 def test_surfaces_with_common_points_meet_exactly(seed, n, m, p):
     rng = np.random.default_rng(seed)

@@ -26,7 +26,7 @@ def made(m, n, p, cells, seed=0):
     return stencil, design.T @ (weight.ravel()[:, None] * design), axes, design
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 999), st.integers(2, 3), st.integers(6, 37), st.integers(6, 37), st.floats(0, 0.6))
 def test_solve_equals_dense_solution(seed, p, m, n, held_share):
     """The free points alone; held points keep their height."""

@@ -200,7 +200,7 @@ def test_part_without_a_known_value_is_zero():
 
 
 @given(st.integers(0, 999), st.floats(0.1, 0.9))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_each_filled_value_is_the_mean_of_its_neighbours(seed, share):
     rng = np.random.default_rng(seed)
     cells = INSIDE & (rng.random(ROW.shape) < 0.8)

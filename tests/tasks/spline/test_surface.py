@@ -105,7 +105,7 @@ def test_height_and_lattice_equal_definition(degree):
     np.testing.assert_allclose(lattice[5, 7], (b * s.W * (s.A / s.W + s.datum)).sum() / (b * s.W).sum())
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(2, 10), st.integers(2, 10), st.integers(0, 1000))
 def test_slopes_equal_finite_differences(p, q, seed):
     s = surface((p, q), seed=seed, points=(12, 12))

@@ -23,7 +23,7 @@ def test_survey_24_tiles_is_stratified():
     assert Counter(stratum for _, _, stratum, _ in survey(24)) == {"urban": 17, "suburban": 2, "rural": 5}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(1, 300), st.integers(0, 5))
 def test_survey_any_size_has_shares_of_paper(tiles, seed):
     places = survey(tiles, seed)

@@ -152,7 +152,7 @@ def test_make_scene_small_tile_with_small_blocks_has_streets():
         assert 0.1 < road.mean() < 0.9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10**6), st.floats(-25, 25), st.floats(0, 1))
 def test_street_foot_is_nearest_point_of_centre_line(seed, lateral, part):
     plan = Plan(seed, 100.0, 0.0, "urban")

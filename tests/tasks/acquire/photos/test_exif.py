@@ -60,7 +60,7 @@ def test_place_photos_to_other_crs_keeps_the_position(three):
 
 
 @given(st.floats(-179.9, 179.9).filter(lambda degrees: abs(degrees) > 1e-3), st.floats(-80, 80))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_read_shot_position_is_right_in_all_hemispheres(longitude, latitude):
     zone = f"+proj=aeqd +lon_0={longitude} +lat_0={latitude}"
     tags = make_photos.exif(CENTRE)

@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
@@ -32,7 +32,6 @@ def raster(values: dict[tuple[int, int], float]):
 
 
 @given(clouds)
-@settings(deadline=None)
 def test_highest_and_means_match_definition(cloud):
     easting, northing, height = points(cloud)
     cells = bins(easting, northing, GRID)
@@ -46,7 +45,6 @@ def test_highest_and_means_match_definition(cloud):
 
 
 @given(clouds, st.sampled_from([0.25, 1.0]))
-@settings(deadline=None)
 def test_spikes_match_definition(cloud, despike_m):
     by_index = by_cell(cloud)
     expected = []
@@ -80,7 +78,6 @@ def layer_of(easting, northing, height, grid=GRID, depth_m=DEPTH_M):
 
 
 @given(clouds)
-@settings(deadline=None)
 def test_top_layer_matches_definition(cloud):
     x, y, z = np.array(cloud, float).reshape(-1, 3).T
     layer = layer_of(GRID.west + x / 8, GRID.north - y / 8, z / 4)

@@ -32,7 +32,7 @@ def check_equals_oracle(cloud, options):
 
 
 @given(clouds, rules)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_ground_equals_comparison_of_all_pairs(points, options):
     check_equals_oracle(points.T, options)
 

@@ -40,7 +40,7 @@ def literal(x, y, z, options):
     return z <= own + options.slope * options.cell_m + options.tolerance_m
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 999), st.integers(1, 60), st.sampled_from([1.0, 2.0]))
 def test_ground_equals_literal_openings(seed, number, cell):
     """Cells without points, inside and along the edge, included."""

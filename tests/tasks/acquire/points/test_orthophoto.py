@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexroad.catalog.grid import Grid
@@ -27,7 +27,6 @@ def points(cloud) -> Points:
 
 
 @given(clouds, st.sampled_from([0, 1, 2, 3]))
-@settings(deadline=None)
 def test_photo_matches_definition(cloud, pixels):
     tops = {}
     for col, row, z, colour in cloud:
