@@ -69,7 +69,7 @@ def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
 def draped_obj_piece(item: TileItem, vertical: str | None) -> Piece:
     """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
     tile, name = item.tile, safe_name(item.id)
-    image = texture_of(tile).image
+    image = texture_of(tile)
     materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
     piece = _obj(tile, vertical, materials, image.bounds if image else None)
     if image is None:

@@ -27,7 +27,7 @@ from flexroad.pipeline.run.finished import (
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import SourceChanged
-from flexroad.pipeline.worker.texture import TileTexture, tile_texture
+from flexroad.pipeline.worker.texture import tile_texture
 from flexroad.tasks.export.glb import Texture
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.meshing.aerial import Aerial
@@ -204,8 +204,8 @@ def photographed(tile: FinishedTile) -> TileItem:
     return TileItem(tile, f"{tile.fingerprint} {layer_state(tile.tile, 'dop')}")
 
 
-def texture_of(tile: FinishedTile) -> TileTexture:
-    """Return the photo of a tile, also if the products of its run have none.
+def texture_of(tile: FinishedTile) -> Texture | None:
+    """Return the photo of a tile, None if it has none; also if the products of its run have none.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def texture_of(tile: FinishedTile) -> TileTexture:
     pattern = tile.place.pattern
     with_photo = replace(pattern, export=pattern.export.model_copy(update={"texture": True}))
     try:
-        return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))
+        return tile_texture(with_photo.graph(tile.tile, tile.place.checksum))[0]
     except SourceChanged as error:
         raise ConfigError(f"{error.file} {error}") from error
 

@@ -32,7 +32,6 @@ from flexroad.pipeline.export.source import Options, Source, TileItem, aerial_of
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.worker.exports import GLB, file_name
-from flexroad.pipeline.worker.texture import TileTexture
 from flexroad.tasks.export import glb, tiles3d
 from flexroad.tasks.meshing import aerial, relief
 from flexroad.tasks.meshing.aerial import Aerial
@@ -284,7 +283,7 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     """
     tile = leaf.tile
     own, draped = _choice(tile, drape)
-    mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if draped else TileTexture()
+    mesh, grid, texture = tile.mesh, tile.tile.grid, texture_of(tile) if draped else None
     points = mesh.vertices + mesh.origin
     heights = float(points[:, 2].min()), float(points[:, 2].max())
     name = safe_name(tile.id)
@@ -294,25 +293,25 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     ground = relief.of_mesh(points, mesh.faces, TILE.spacing_m)
     colours = glb.ROAD_SRGB, glb.TERRAIN_SRGB
     image = aerial.of_classes(points, mesh.faces, mesh.road, colours, ground.bounds, pixel_m)
-    if texture.image:
-        photo = aerial.joined([aerial_of(texture.image, pixel_m)], ground.bounds, pixel_m)
+    if texture:
+        photo = aerial.joined([aerial_of(texture, pixel_m)], ground.bounds, pixel_m)
         image = replace(photo, share=image.share)
     files, referred = record(name, ground, image)
     side = LEVELS[0].side_m
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
-    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture.image}
+    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture}
     return Piece({uri: _glb(tile, own, place, texture), **files}, row | referred)
 
 
-def _glb(tile: FinishedTile, own: bool, place: Place, texture: TileTexture) -> bytes:
+def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | None) -> bytes:
     """Return the GLB file of the run, or a new one if the run has none that fits."""
     file = TileProducts.of(parse_location(place.run), tile.id).file(file_name(tile.id, tile.variant, GLB))
-    if (own or not texture.image) and exists(file):
+    if (own or not texture) and exists(file):
         data = read(file)
         tile.check_unchanged()
         return data
-    return glb.encode(tile.mesh, (*place.origin, 0.0), texture.image, tile.surface)
+    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, tile.surface)
 
 
 def _without_photo(ids: Sequence[str]) -> str:

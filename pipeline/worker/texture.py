@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from flexroad.catalog import Layer, Tile
 from flexroad.pipeline.graph.graph import TileGraph
@@ -16,18 +16,15 @@ from flexroad.tasks.types import Orthophoto
 NO_PHOTO = "dop: no orthophoto on the tile; its GLB has no texture"
 
 
-@dataclass(frozen=True)
-class TileTexture:
-    """The texture of a tile's meshes."""
-
-    image: glb.Texture | None = None
-    """None if there is none: the configuration wants none, or the tile has no photo."""
-    note: str = ""
-    """What the photo lacks, or empty."""
-
-
-def tile_texture(graph: TileGraph) -> TileTexture:
+def tile_texture(graph: TileGraph) -> tuple[glb.Texture | None, str]:
     """Return the texture of a tile's meshes: its orthophoto, at its own resolution up to `export.texture_px`.
+
+    Returns
+    -------
+    texture : Texture or None
+        None if the configuration wants none, or the tile has no photo.
+    note : str
+        What the photo lacks, or empty.
 
     Raises
     ------
@@ -38,19 +35,19 @@ def tile_texture(graph: TileGraph) -> TileTexture:
     """
     export, tile = graph.export, graph.tile
     if not export.texture:
-        return TileTexture()
+        return None, ""
     if not graph.product_sources:
-        return TileTexture(note=NO_PHOTO)
+        return None, NO_PHOTO
     (layer,) = graph.product_sources
     try:
         photo = tile_photo(tile, layer, export.texture_px)
     finally:
         check_unchanged(graph, tile.paths(layer))
     if photo is None:
-        return TileTexture(note=NO_PHOTO)
+        return None, NO_PHOTO
     unknown = 1 - photo.known.mean()
     note = f"dop: {unknown:.1%} of the texture has no orthophoto and takes its mean colour" if unknown else ""
-    return TileTexture(glb.texture(photo, export.texture_quality), note)
+    return glb.texture(photo, export.texture_quality), note
 
 
 def tile_photo(tile: Tile, layer: Layer, largest_px: int) -> Orthophoto | None:

@@ -219,9 +219,9 @@ def _finish(
     """Write the products and the item of a finished tile; return its record and all notes."""
     span = evaluator.spans["export"]
     with span.measure():
-        texture = tile_texture(job.graph)
-        files = products(job.graph, evaluator, job.origin, texture.image)
-        notes = (*notes, texture.note) if texture.note else notes
+        texture, note = tile_texture(job.graph)
+        files = products(job.graph, evaluator, job.origin, texture)
+        notes = (*notes, note) if note else notes
         seconds = round(_seconds(evaluator), 4)
         written = _item(job, rows, files, notes, seconds)
         job.folder.finish(written, {name: file.data for name, file in files.items()}, job.flushed)
