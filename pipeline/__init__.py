@@ -46,7 +46,7 @@ def _set_numba_cache() -> None:
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME", "/"), ".cache"))
     if "NUMBA_CACHE_DIR" in os.environ or _writable(beside) or _writable(home / "numba"):
         return
-    from flexroad.catalog.storage.scratch import ScratchFolder
+    from flexroad.catalog.storage.scratch import ScratchFolder  # noqa: PLC0415 after the variables above
 
     # A new private folder, because numba executes the code that it reads from its cache.
     folder = ScratchFolder()

@@ -252,7 +252,7 @@ def catalog_synthetic(
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""
-    from flexroad.pipeline.benchmark.scenes import write_scenes  # loads scipy, others do not need it
+    from flexroad.pipeline.benchmark.scenes import write_scenes  # noqa: PLC0415 loads scipy
 
     path = write_scenes(output, tiles, seed, tile_size, dop, preset)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")

@@ -84,7 +84,7 @@ class DaskExecutor:
         if self.scheduler:
             check_address(self.scheduler)
         # A run with nothing to do, which comes no further, starts without Dask.
-        from flexroad.pipeline.execute import clusters, session, workers
+        from flexroad.pipeline.execute import clusters, session, workers  # noqa: PLC0415
 
         with (
             clusters.quiet(),
