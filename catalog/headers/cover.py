@@ -16,6 +16,7 @@ from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.headers.open_raster import ERRORS
 from flexroad.catalog.headers.rasters import georeference_fault, heights_fault, quiet
+from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.trust import AllowedFolders
 
@@ -81,7 +82,7 @@ def _add(known: NDArray[Any], grid: Grid, raster: Any, crs: str | None) -> bool:
     window = Window(left, top, columns.max() - left + 1, rows.max() - top + 1)
     if window.width * window.height > MAX_CELLS:
         return False
-    values = raster.read(1, window=window, masked=True)[rows - top, columns - left]
+    values = read_valid(raster, window=window)[rows - top, columns - left]
     heights = np.ma.filled(values * raster.scales[0] + raster.offsets[0], np.nan)
     with np.errstate(invalid="ignore"):
         known[inside] |= (heights > LOWEST) & (heights < HIGHEST)

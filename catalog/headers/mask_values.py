@@ -12,6 +12,7 @@ from rasterio.windows import Window
 from flexroad.catalog.headers.cover import AS_TEXT
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.text import some
 
 MOST_FILES = 8
@@ -74,14 +75,14 @@ def _values(path: Path) -> tuple[set[float], bool]:
     """Return the values of the first band in parts of a raster, and whether cells of them are nodata."""
     values, has_nodata = set[float](), False
     with quiet(), open_raster(path) as raster:
-        for window in _windows(raster):
-            cells = raster.read(1, window=window, masked=True)
+        for window in windows(raster):
+            cells = read_valid(raster, window=window)
             values |= set(np.unique(cells.compressed()).astype(float).tolist())
             has_nodata |= bool(np.ma.getmaskarray(cells).any())
     return values, has_nodata
 
 
-def _windows(raster: Any) -> Iterator[Window]:
+def windows(raster: Any) -> Iterator[Window]:
     """Yield all of a small raster, or squares spread over a large one."""
     if max(raster.shape) <= SIDE:
         yield Window(0, 0, raster.width, raster.height)

@@ -25,13 +25,14 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.plateaus import plateau_notes
 from flexroad.catalog.headers.point_clouds import chunks
 from flexroad.catalog.headers.rasters import RasterFile, glob, opened, scan, skip, there, unlisted_lines
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.storage.outputs import atomic_path
 from flexroad.catalog.text import some
-from flexroad.catalog.tile import Tile
+from flexroad.catalog.tile import HEIGHTS, Tile
 from flexroad.catalog.tiling import Conversion, TilingResult, cut
 
 Floats = NDArray[np.float64]
@@ -144,6 +145,8 @@ def index(
         layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
         left_out += skipped
         notes += mask_notes(root, "road_mask", [file.name for file in layer_files["road_mask"]], road_values)
+    for layer in (heights for heights in HEIGHTS if heights in layer_files):
+        notes += plateau_notes(layer, {file.name: root / file.name for file in layer_files[layer]})
     indexed = cut(
         root,
         layer_files,

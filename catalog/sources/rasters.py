@@ -9,10 +9,11 @@ from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.mask_values import mask_notes
+from flexroad.catalog.headers.plateaus import plateau_notes
 from flexroad.catalog.headers.rasters import scan
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
-from flexroad.catalog.tile import LAYERS
+from flexroad.catalog.tile import HEIGHTS, LAYERS
 from flexroad.catalog.tiling import MASKS, NO_CONVERSION, Conversion, TilingResult, cut
 
 
@@ -73,6 +74,8 @@ def index(
     notes = []
     for name in (mask for mask in MASKS if mask in scanned):
         notes += mask_notes(root, name, [file.name for file in scanned[name][0]], road_values)
+    for name in (heights for heights in HEIGHTS if heights in scanned):
+        notes += plateau_notes(name, {file.name: root / file.name for file in scanned[name][0]})
     indexed = cut(
         root,
         {name: files for name, (files, _) in scanned.items()},

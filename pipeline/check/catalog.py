@@ -13,11 +13,13 @@ from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
+from flexroad.catalog.headers.plateaus import plateau_notes
 from flexroad.catalog.headers.rasters import quiet
 from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
+from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
@@ -62,7 +64,19 @@ def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
     except ConfigError as error:
         yield Finding(f"a run would not start: {error}", fault=True)
     yield from expected_failures(catalog.tiles, config, LAYERS)
+    yield from _plateaus(tiles)
     yield from _photos([tile for tile in tiles if tile.layer("dop")])
+
+
+def _plateaus(tiles: Sequence[Tile]) -> Iterator[Finding]:
+    """Name the files of heights of which many cells have one exact value."""
+    files: dict[str, dict[str, Location]] = defaultdict(dict)
+    for tile in tiles:
+        for layer in (layer for layer in tile.layers if layer.name in HEIGHTS):
+            files[layer.name].update(zip(layer.files, tile.paths(layer), strict=True))
+    for name in (name for name in HEIGHTS if name in files):
+        for note in plateau_notes(name, files[name], tiles[0].allowed):
+            yield Finding(note)
 
 
 def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[str]) -> Iterator[Finding]:

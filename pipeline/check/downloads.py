@@ -19,6 +19,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.point_clouds import inspect
 from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.headers.vectors import layers as layers_of
 from flexroad.catalog.headers.vectors import listed
 from flexroad.catalog.sources import nrw
@@ -184,7 +185,7 @@ def _of_mask(values: str) -> str:
 def _values(raster: Any) -> tuple[str, str]:
     """Return the range of the first band's values, and the values if they are few whole numbers."""
     shape = (min(raster.height, PREVIEW), min(raster.width, PREVIEW))
-    cells = raster.read(1, out_shape=shape, masked=True).compressed()
+    cells = read_valid(raster, out_shape=shape).compressed()
     cells = cells[np.isfinite(cells)]
     if not cells.size:
         return "only nodata", ""

@@ -17,6 +17,7 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.headers.vectors import VectorFile, layers, listed, opened
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import count
@@ -163,7 +164,7 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
             )
             mask = np.zeros(grid.shape, np.uint8)
             reproject(
-                (source.read(1, masked=True).filled(0) != 0).astype(np.uint8),
+                (read_valid(source).filled(0) != 0).astype(np.uint8),
                 mask,
                 src_transform=source.transform,
                 src_crs=source.crs,

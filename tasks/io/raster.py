@@ -23,6 +23,7 @@ from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.headers.open_raster import ERRORS, files_of, has_own_blocks, open_raster
 from flexroad.catalog.headers.rasters import heights_fault
 from flexroad.catalog.headers.refused import Refused, read_through
+from flexroad.catalog.headers.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
@@ -36,6 +37,8 @@ T = TypeVar("T")
 EXACT = 1e-9
 """Largest error of transformed positions, in cells; GDAL interpolates them with 0.125 by default, and takes 0
 for no value."""
+STRIP = 64
+"""Number of rows of means that are computed at once where an alpha band is read cell by cell."""
 Slices = tuple[slice, slice]
 """Rows, from the north, and columns of a file."""
 
@@ -470,6 +473,9 @@ def _whole_and_rest(part: slice, step: int) -> tuple[slice | None, slice | None]
 def _part(
     src: Any, lattice: RasterGrid, step: int, rows: slice, cols: slice, resampling: Resampling
 ) -> Floats:
+    found = header(src)
+    if step > 1 and found.alpha and resampling == Resampling.average:
+        return _means(src, lattice, step, rows, cols)
     top = lattice.height - rows.stop if lattice.northward else rows.start
     tall, wide = rows.stop - rows.start, cols.stop - cols.start
     how: dict[str, Any] = {"window": Window(cols.start, top, wide, tall)}
@@ -478,9 +484,29 @@ def _part(
     values: Floats = src.read(1, **how).astype(np.float64)
     if (src.scales[0], src.offsets[0]) != (1.0, 0.0):
         values = values * src.scales[0] + src.offsets[0]
-    has_nan, all_valid = header(src).nan_is_nodata, header(src).all_valid
     # Cells whose nodata value is NaN are NaN already.
-    if not all_valid and not (has_nan and step == 1):
+    if not found.all_valid and not (found.nan_is_nodata and step == 1):
         how |= {"resampling": Resampling.mode} if step > 1 else {}
         values[src.read_masks(1, **how) == 0] = np.nan
+        if found.alpha:
+            values[transparent(src, found.alpha, **how)] = np.nan
     return values[::-1] if lattice.northward else values
+
+
+def _means(src: Any, lattice: RasterGrid, step: int, rows: slice, cols: slice) -> Floats:
+    """Return the means of ``step`` x ``step`` cells; NaN where fewer than half have a value.
+
+    GDAL would average the cells that an alpha band of this type marks as without a value, too.
+    """
+    strips = []
+    for top in range(rows.start, rows.stop, step * STRIP):
+        strip = slice(top, min(top + step * STRIP, rows.stop))
+        values = _part(src, lattice, 1, strip, cols, Resampling.average)
+        tall, wide = values.shape
+        # The last step of a file may have fewer cells.
+        values = np.pad(values, ((0, -tall % step), (0, -wide % step)), constant_values=np.nan)
+        blocks = values.reshape(len(values) // step, step, -1, step)
+        known = (~np.isnan(blocks)).sum((1, 3))
+        enough = known >= min(step, tall) * min(step, wide) / 2
+        strips.append(np.where(enough, np.nansum(blocks, (1, 3)) / np.maximum(known, 1), np.nan))
+    return np.concatenate(strips)

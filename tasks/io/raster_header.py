@@ -12,6 +12,7 @@ from rasterio.enums import MaskFlags
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.headers.rasters import georeference_fault
+from flexroad.catalog.headers.valid_cells import alpha_band
 from flexroad.catalog.storage.paths import Location
 from flexroad.tasks.errors import Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
@@ -31,6 +32,8 @@ class Header:
     """Whether the first band has no cells without a value."""
     nan_is_nodata: bool
     """Whether its cells without a value are NaN, and only they."""
+    alpha: int | None
+    """Number of the alpha band that GDAL does not take for a mask, None without one."""
 
     @classmethod
     def of(cls, src: Any) -> Header:
@@ -40,12 +43,14 @@ class Header:
         if fault is None and (transform.b or transform.d):
             fault = "is rotated; turn it north up with gdalwarp"
         known = fault is None and not transform.is_identity
+        alpha = alpha_band(src)
         return cls(
             lattice=RasterGrid.of(transform, src.width, src.height) if known else None,
             fault=None if transform.is_identity else fault,
             crs=src.crs.to_wkt() if src.crs else None,
-            all_valid=MaskFlags.all_valid in masks,
-            nan_is_nodata=masks == [MaskFlags.nodata] and math.isnan(src.nodata),
+            all_valid=MaskFlags.all_valid in masks and alpha is None,
+            nan_is_nodata=masks == [MaskFlags.nodata] and math.isnan(src.nodata) and alpha is None,
+            alpha=alpha,
         )
 
 

@@ -41,6 +41,16 @@ def test_index_file_of_a_kilometre_gives_sixteen_tiles(tmp_path):
     assert result.notes == ()
 
 
+def test_height_that_many_cells_share_is_noted(tmp_path):
+    heights = np.arange(6400.0).reshape(80, 80)
+    write(tmp_path / "dsm.tif", heights)
+    heights[:8] = -9999
+    write(tmp_path / "dtm.tif", heights)
+    result = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=40, date=datetime(2020, 5, 1))
+    (note,) = result.notes
+    assert note.startswith("dtm: many cells have the exact height -9999: dtm.tif (10.0%); if they are voids")
+
+
 def test_tile_lists_every_file_in_reach(tmp_path):
     """Four files meet in the middle of a tile; a file 190 m away is in reach, one 210 m away is not."""
     for name, west, north in [("d", 0, 300), ("c", 125, 300), ("b", 0, 125), ("a", 125, 125)]:

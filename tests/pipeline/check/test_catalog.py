@@ -122,6 +122,21 @@ def test_dsm_of_several_tiles_is_opened_once(tmp_path, monkeypatch):
     assert opened == ["dsm.tif"]
 
 
+def test_check_names_heights_that_many_cells_share(survey):
+    def flood(raster):
+        heights = raster.read(1)
+        heights[:9] = 0
+        raster.write(heights, 1)
+
+    tile = Catalog.read(survey).tiles[0]
+    change(tile, "dtm", flood)
+    notes = [f for f in check(Catalog.read(survey), load_config("production")) if "exact height" in f.text]
+    (name,) = tile.layer("dtm").reaching(tile.grid.bounds).files
+    share = 9 / tile.grid.height
+    assert [note.fault for note in notes] == [False]
+    assert notes[0].text.startswith(f"dtm: many cells have the exact height 0: {name} ({share:.1%});")
+
+
 def test_check_shifted_photo_and_missing_file_are_faults(tmp_path):
     path = write_scenes(tmp_path, 2, seed=3, size_m=120, dop=True)
     assert not any(finding.fault for finding in check(Catalog.read(path), load_config("production")))
