@@ -25,28 +25,23 @@ from flexroad.pipeline.export import (
     tiles3d,
 )
 from flexroad.pipeline.export.network import network
-from flexroad.pipeline.export.pieces import Encode, Piece, figures, part_name, write_joined, write_pieces
+from flexroad.pipeline.export.pieces import Encode, Piece, Row, figures, part_name, write_joined, write_pieces
 from flexroad.pipeline.export.source import Options, Source, TileItem, photographed, texture_of
 from flexroad.pipeline.graph.borders import has_borders
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rhino, step
 from flexroad.tasks.export import road_lines as line_file
+from flexroad.tasks.georeference import Georeference
+from flexroad.tasks.roads.extent import covered
 from flexroad.tasks.spline.stepped import without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
 """Name of the file of materials that all OBJ files share."""
+BEYOND = "a part of the surface is beyond the survey (beyond_survey_m2)"
+CUT = "surface cut to the rectangle that the survey covers"
 NO_PHOTO = "no orthophoto, in plain colours"
-
-
-@dataclass(frozen=True)
-class CityPlace:
-    """What the header of a CityJSON file says, on which the parts of all tiles depend."""
-
-    crs: str
-    origin: tuple[float, float, float]
-    vertical: str | None
 
 
 def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
@@ -55,33 +50,32 @@ def landxml_part(tile: FinishedTile, project: landxml.Project) -> Piece:
     return Piece({part_name(tile.id): part}, {"height_error_m": _error_m(tile, 10**-landxml.DECIMALS)})
 
 
-def cityjson_part(tile: FinishedTile, place: CityPlace) -> Piece:
+def cityjson_part(tile: FinishedTile, place: Georeference) -> Piece:
     """Return the lines of a CityJSON file."""
     lines = cityjson.features(tile.id, tile.mesh, place.origin, place.vertical)
     return Piece({part_name(tile.id): lines}, {"height_error_m": _error_m(tile, cityjson.SCALE_M)})
 
 
-def obj_piece(tile: FinishedTile, vertical: str | None) -> Piece:
+def obj_piece(tile: FinishedTile, place: Georeference) -> Piece:
     """Return the mesh as OBJ, and its place as JSON and, for GIS programs, as ``.prj``."""
-    return _obj(tile, vertical, MATERIALS, None)
+    return _obj(tile, place, MATERIALS, None)
 
 
-def draped_obj_piece(item: TileItem, vertical: str | None) -> Piece:
+def draped_obj_piece(item: TileItem, place: Georeference) -> Piece:
     """Return the mesh as OBJ with its own materials, its photo, if it has one, and its place."""
     tile, name = item.tile, safe_name(item.id)
     image = texture_of(tile)
     materials, photo = f"{name}{obj.NAME_MATERIALS}", f"{name}{obj.NAME_TEXTURE}"
-    piece = _obj(tile, vertical, materials, image.bounds if image else None)
+    piece = _obj(tile, place, materials, image.bounds if image else None)
     if image is None:
         return Piece({**piece.files, materials: obj.encode_materials()}, piece.row | {"note": NO_PHOTO})
     return Piece({**piece.files, materials: obj.encode_materials(photo), photo: image.jpeg}, piece.row)
 
 
-def _obj(tile: FinishedTile, vertical: str | None, materials: str, photo: Bounds | None) -> Piece:
+def _obj(tile: FinishedTile, place: Georeference, materials: str, photo: Bounds | None) -> Piece:
     mesh, name = tile.mesh, safe_name(tile.id)
-    place = obj.georeference(mesh, vertical)
     files = {
-        f"{name}{obj.NAME}": obj.encode(mesh, materials, vertical, photo),
+        f"{name}{obj.NAME}": obj.encode(mesh, materials, place, photo),
         f"{name}.json": place.sidecar(obj.AXES),
         f"{name}.prj": place.prj(),
     }
@@ -110,24 +104,37 @@ def _error_m(tile: FinishedTile, unit_m: float) -> float:
     return float(np.nanmax(np.abs(errors), initial=0.0))
 
 
-def step_piece(tile: FinishedTile, vertical: str | None) -> Piece:
-    """Return the surface as STEP, cut to the tile, and its place as JSON."""
+def step_piece(tile: FinishedTile, place: Georeference) -> Piece:
+    """Return the surface as STEP, cut to what the survey covers of the tile, and its place as JSON."""
     surface, source, name = tile.surface, tile.tile, safe_name(tile.id)
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
+    bounds, beyond_m2 = covered(tile.road)
     files = {
-        f"{name}{step.NAME}": step.encode(surface, source.grid.bounds, tile.id, source.datetime, vertical),
-        f"{name}{step.NAME_SIDECAR}": step.georeference(surface, vertical).sidecar(step.AXES),
+        f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
+        f"{name}{step.NAME_SIDECAR}": place.sidecar(
+            step.AXES, bounds=list(bounds), beyond_survey_m2=beyond_m2
+        ),
     }
-    return Piece(files, {})
+    return Piece(files, _cut_note(bounds, beyond_m2, source.grid.bounds))
 
 
-def rhino_piece(tile: FinishedTile, vertical: str | None) -> Piece:
-    """Return surface and mesh as 3DM."""
+def rhino_piece(tile: FinishedTile, place: Georeference) -> Piece:
+    """Return the surface, cut to what the survey covers of the tile, and the mesh as 3DM."""
     surface = tile.surface
     nurbs = surface if isinstance(surface, NurbsSurface) else None
-    data = rhino.encode(tile.mesh, nurbs, tile.tile.grid.bounds, vertical)
-    return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, {})
+    bounds, beyond_m2 = covered(tile.road)
+    texts = {"bounds": " ".join(f"{v:.15g}" for v in bounds), "beyond_survey_m2": f"{beyond_m2:g}"}
+    data = rhino.encode(tile.mesh, nurbs, bounds, place, texts)
+    row = _cut_note(bounds, beyond_m2, tile.tile.grid.bounds) if nurbs else {}
+    return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, row)
+
+
+def _cut_note(bounds: Bounds, beyond_m2: float, tile: Bounds) -> Row:
+    """Return the note on a surface that ends with the survey or goes on beyond it, if it does."""
+    parts = [CUT] if bounds != tile else []
+    parts += [BEYOND] if beyond_m2 else []
+    return {"note": "; ".join(parts)} if parts else {}
 
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]
@@ -173,7 +180,7 @@ def write_cityjson(
     source: Source, tiles: Iterable[FinishedTile], folder: Location, options: Options, executor: Executor
 ) -> dict[str, Any]:
     """Write all meshes as one CityJSONSeq file."""
-    place = CityPlace(source.crs, (*source.origin, 0.0), source.vertical)
+    place = source.place
 
     def join(local: Path, parts: Iterator[bytes]) -> None:
         with local.open("wb") as file:
@@ -193,7 +200,7 @@ def write_obj(
         return _write_each(obj.VERSION, obj_piece, source, tiles, folder, options, executor)
     remove(folder / MATERIALS)
     items, encode = map(photographed, tiles), draped_obj_piece
-    return figures(write_pieces(items, folder, obj.VERSION, encode, source.vertical, executor))
+    return figures(write_pieces(items, folder, obj.VERSION, encode, source.place, executor))
 
 
 def _write_each(
@@ -206,7 +213,7 @@ def _write_each(
     executor: Executor,
 ) -> dict[str, Any]:
     """Write a format that has files of its own for each tile."""
-    return figures(write_pieces(tiles, folder, version, encode, source.vertical, executor))
+    return figures(write_pieces(tiles, folder, version, encode, source.place, executor))
 
 
 def _per_tile(

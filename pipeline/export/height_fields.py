@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from flexroad.catalog.ids import safe_name
 from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.errors import ConfigError
@@ -21,6 +23,7 @@ from flexroad.tasks.export.heightfield import HeightField
 VERSION = heightfield.VERSION
 SPACING_M = 1.0
 """Largest distance of nodes (m)."""
+BEYOND = "nodes beyond the survey are flat, and holes in the mask"
 NO_LIMITS = (math.nan, math.nan)
 
 
@@ -86,16 +89,18 @@ def piece(tile: FinishedTile, scene: Scene) -> Piece:
     field = _field(tile, scene)
     files = {
         heightfield.NAME_PNG: heightfield.encode_png(field),
+        heightfield.NAME_HOLES: heightfield.encode_holes(field),
         heightfield.NAME_R16: heightfield.encode_r16(field),
         heightfield.NAME_MUJOCO: heightfield.encode_mujoco(field),
         heightfield.NAME_SIDECAR: heightfield.encode_sidecar(field, tile.tile.grid.crs, scene.vertical),
     }
     named = {f"{safe_name(tile.id)}{name}": data for name, data in files.items()}
-    return Piece(named, {"height_error_m": field.step_m / 2})
+    note = {"note": BEYOND} if np.isnan(field.heights).any() else {}
+    return Piece(named, {"height_error_m": field.step_m / 2} | note)
 
 
 def _field(tile: FinishedTile, scene: Scene) -> HeightField:
     # Neighbours take the same positions for nodes on their edge.
     bounds = tile.tile.grid.exact_bounds
     size = heightfield.size_at_spacing(bounds, SPACING_M, scene.nodes)
-    return heightfield.sampled(tile.surface, bounds, size, scene.limits)
+    return heightfield.sampled(tile.surface, bounds, size, scene.limits, tile.road)

@@ -29,6 +29,7 @@ from flexroad.pipeline.run.status import Track, untracked
 from flexroad.pipeline.worker.evaluator import SourceChanged
 from flexroad.pipeline.worker.texture import tile_texture
 from flexroad.tasks.export.glb import Texture
+from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.meshing.aerial import Aerial
 
@@ -112,6 +113,11 @@ class Source:
     def origin(self) -> tuple[float, float]:
         """Whole-metre easting and northing that meshes of the run are relative to."""
         return self.run.origin
+
+    @property
+    def place(self) -> Georeference:
+        """What local coordinates of files are relative to: the run's origin, at the height 0."""
+        return Georeference(self.crs, (*self.origin, 0.0), self.vertical)
 
     def finished(self) -> Iterator[FinishedTile]:
         """Yield the tiles one by one, as they were when they were selected.

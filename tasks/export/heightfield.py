@@ -4,34 +4,41 @@ The nodes of the field span its bounds: the first and the last column lie on the
 the first and the last row on the northern and southern one. Heights are those of the surface at the nodes.
 PNG and R16 have 65,536 values from the lowest to the highest height, so that a height is exact to half a
 step; MuJoCo's file has float32 numbers from 0 to 1. None of the formats has a value for nodes without a
-height: they have the lower limit, and the JSON file beside the field has their number.
+height, as beyond the survey: they have the height of the nearest node that has one. A mask of 8 bits has them
+as holes, and the JSON file beside the field has their number.
 """
 
 from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.georeference import Georeference
-from flexroad.tasks.types import Floats, Surface
+from flexroad.tasks.roads.extent import nodes_beyond
+from flexroad.tasks.types import Floats, RoadMask, Surface
 
 Image = lazy("PIL.Image")
 
-VERSION = 2
+VERSION = 3
 NAME_PNG = "_heightfield.png"
 NAME_R16 = "_heightfield.r16"
+NAME_HOLES = "_holes.png"
 NAME_MUJOCO = "_heightfield.bin"
 NAME_SIDECAR = "_heightfield.json"
 MEDIA_TYPE_PNG = "image/png"
 MEDIA_TYPE = "application/octet-stream"
 
+HOLE = 255
+"""Value of a node without a height in the mask; others have 0."""
 STEPS = 65535
 """Steps from the lowest to the highest value of 16 bits."""
 SIZES: dict[str, tuple[int, ...]] = {
@@ -73,10 +80,17 @@ class HeightField:
         """Height of one step of 16 bits (m); a height is exact to half of it."""
         return (self.high - self.low) / STEPS
 
-    @property
+    @cached_property
     def filled(self) -> Floats:
-        """Heights with the lowest one where there is none, ``(n, n)``, m."""
-        return np.where(np.isnan(self.heights), self.low, self.heights)
+        """Heights with that of the nearest node where there is none, ``(n, n)``, m."""
+        unknown = np.isnan(self.heights)
+        if not unknown.any():
+            return self.heights
+        across, along = self.spacing_m
+        nearest = scipy.ndimage.distance_transform_edt(
+            unknown, (along, across), return_distances=False, return_indices=True
+        )
+        return np.asarray(self.heights[tuple(nearest)])
 
     @property
     def values(self) -> NDArray[np.uint16]:
@@ -106,7 +120,11 @@ def size_at_spacing(bounds: Bounds, spacing_m: float, family: Literal["power", "
 
 
 def sampled(
-    surface: Surface, bounds: Bounds, size: int, limits: tuple[float, float] | None = None
+    surface: Surface,
+    bounds: Bounds,
+    size: int,
+    limits: tuple[float, float] | None = None,
+    road: RoadMask | None = None,
 ) -> HeightField:
     """Sample a surface at the nodes of a lattice.
 
@@ -121,6 +139,8 @@ def sampled(
     limits : tuple of float, optional
         Lowest and highest height (m), where several fields have to have equal steps, as neighbours in one
         scene; by default those of this field.
+    road : RoadMask, optional
+        Gives the cells beyond the survey, where nodes have no height; None if all are covered.
 
     Raises
     ------
@@ -135,6 +155,8 @@ def sampled(
     heights = np.concatenate(
         [surface.lattice(eastings, northings[row : row + ROWS]) for row in range(0, size, ROWS)]
     )
+    if road is not None:
+        heights[nodes_beyond(road, eastings, northings)] = np.nan
     if np.isnan(heights).all():
         raise TaskError("the surface has no height within the bounds of the height field; choose others")
     lowest, highest = float(np.nanmin(heights)), float(np.nanmax(heights))
@@ -149,8 +171,20 @@ def sampled(
 
 def encode_png(field: HeightField) -> bytes:
     """Return a field as PNG, 16-bit grey; row 0 is in the north."""
+    return _png(field.values)
+
+
+def encode_holes(field: HeightField) -> bytes:
+    """Return the nodes without a height as PNG, 8-bit grey: `HOLE` there, 0 elsewhere; row 0 is in the north.
+
+    Unreal Engine takes it as the layer of its landscape's visibility.
+    """
+    return _png(np.where(np.isnan(field.heights), HOLE, 0).astype(np.uint8))
+
+
+def _png(values: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     encoded = io.BytesIO()
-    Image.fromarray(field.values).save(encoded, "PNG")
+    Image.fromarray(values).save(encoded, "PNG")
     return encoded.getvalue()
 
 
@@ -200,6 +234,7 @@ def encode_sidecar(field: HeightField, crs: str, vertical: str | None = None) ->
         step_m=field.step_m,
         precision_m=field.step_m / 2,
         nodes_without_height=int(np.isnan(field.heights).sum()),
+        holes=f"{HOLE} in the mask of holes; the height of the nearest node with one in the field",
         unreal={
             "scale": [100 * across, 100 * along, 100 * span / UNREAL_RANGE_M],
             # An Unreal landscape has the height of its origin at the value 32768.

@@ -1,7 +1,8 @@
 """The mesh of a tile as Wavefront OBJ and MTL, with the orthophoto as its texture where there is one.
 
-Z is up. Coordinates are relative to the tile's whole-metre origin, since most readers compute in float32. The
-format has no CRS: origin and CRS are comments of the file, and entries of a JSON file beside it.
+Z is up, and the height. In plan coordinates are relative to a whole-metre origin that all tiles of a run
+share, since most readers compute in float32. The format has no CRS: origin and CRS are comments of the file,
+and entries of a JSON file beside it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.meshing.parts import texture_coordinates
 from flexroad.tasks.types import Mesh
 
-VERSION = 1
+VERSION = 2
 NAME = ".obj"
 NAME_MATERIALS = ".mtl"
 NAME_TEXTURE = ".jpg"
@@ -26,14 +27,14 @@ NAME_PRJ = ".prj"
 MEDIA_TYPE = "model/obj"
 MEDIA_TYPE_MATERIALS = "model/mtl"
 
-AXES = "x east, y north, z up; relative to origin; metres"
+AXES = "x east, y north, relative to origin; z height; metres"
 DECIMALS = 4
 """Decimals of coordinates (m): they are rounded to 0.05 mm."""
 COLOURS = {"road": (0.23, 0.23, 0.25), "terrain": (0.77, 0.745, 0.68)}
 """Red, green and blue of the classes without a texture, 0 to 1, sRGB."""
 
 
-def encode(mesh: Mesh, materials: str, vertical: str | None = None, photo: Bounds | None = None) -> bytes:
+def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None = None) -> bytes:
     """Return a mesh as OBJ with a group and a material for road and for terrain.
 
     Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
@@ -45,15 +46,16 @@ def encode(mesh: Mesh, materials: str, vertical: str | None = None, photo: Bound
         The mesh of one tile.
     materials : str
         Name of the file of `encode_materials`, without a folder.
-    vertical : str, optional
-        CRS of the heights, if known.
+    place : Georeference
+        What coordinates are relative to.
     photo : tuple of float, optional
         West, south, east and north of the outer edges of the image that the materials name (m); None if they
         name none.
     """
-    head = [f"# {line}" for line in georeference(mesh, vertical).lines()]
+    head = [f"# {line}" for line in place.lines()]
     blocks = ["\n".join([*head, f"# axes {AXES}", f"mtllib {materials}", ""])]
-    blocks.append(_rows("v %.4f %.4f %.4f\n", mesh.vertices.T))
+    shift = np.subtract(mesh.origin, place.origin)
+    blocks.append(_rows("v %.4f %.4f %.4f\n", (mesh.vertices + shift).T))
     if photo:
         blocks.append(_rows("vt %.7f %.7f\n", texture_coordinates(mesh, photo).T))
     row = "f %d/%d %d/%d %d/%d\n" if photo else "f %d %d %d\n"
@@ -80,11 +82,6 @@ def encode_materials(texture: str | None = None) -> bytes:
         # Without options such as -clamp, which many readers take for a part of the name.
         lines += [f"map_Kd {texture}"] if texture else []
     return "\n".join([*lines, ""]).encode()
-
-
-def georeference(mesh: Mesh, vertical: str | None = None) -> Georeference:
-    """Return the place of a file's coordinates, of which the JSON and the ``.prj`` file are made."""
-    return Georeference(mesh.crs, mesh.origin, vertical)
 
 
 def _rows(row: str, columns: Iterable[NDArray[Any]]) -> str:

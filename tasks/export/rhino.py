@@ -1,13 +1,14 @@
 """The surface of a tile and its mesh as 3DM file, for Rhino and Grasshopper; needs the library rhino3dm.
 
 The file has three layers: ``surface``, the NURBS surface cut to the tile's core (`tasks.spline.cut`),
-``road`` and ``terrain``, the faces of the mesh. Coordinates are float64, in metres, relative to the mesh's
-whole-metre origin in plan; z is the height. Origin and CRS are in the document's user texts.
+``road`` and ``terrain``, the faces of the mesh. Coordinates are float64, in metres, relative to a whole-metre
+origin in plan that all tiles of a run share; z is the height. The document's user texts have origin and CRS.
 """
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
@@ -21,7 +22,7 @@ from flexroad.tasks.spline.cut import patch
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Mesh
 
-VERSION = 1
+VERSION = 2
 NAME = ".3dm"
 MEDIA_TYPE = "model/vnd.3dm"
 
@@ -33,7 +34,13 @@ TOLERANCE_M = 1e-4
 """Distance below which Rhino takes points for equal (m)."""
 
 
-def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: str | None = None) -> bytes:
+def encode(
+    mesh: Mesh,
+    surface: NurbsSurface | None,
+    bounds: Bounds,
+    place: Georeference,
+    more: Mapping[str, str] | None = None,
+) -> bytes:
     """Return a surface and a mesh as 3DM.
 
     Two files of equal inputs differ in their identifiers and times, which the library chooses.
@@ -46,8 +53,10 @@ def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: s
         The surface of the tile; None if it is no NURBS. Its layer is then empty.
     bounds : tuple of float
         West, south, east and north of the part of the surface, as the tile's core (m).
-    vertical : str, optional
-        CRS of the heights, if known.
+    place : Georeference
+        What coordinates are relative to; its height is 0.
+    more : mapping, optional
+        Other user texts by name.
 
     Raises
     ------
@@ -58,16 +67,14 @@ def encode(mesh: Mesh, surface: NurbsSurface | None, bounds: Bounds, vertical: s
     model = rhino.File3dm()
     model.Settings.ModelUnitSystem = rhino.UnitSystem.Meters
     model.Settings.ModelAbsoluteTolerance = TOLERANCE_M
-    east, north, _ = mesh.origin
-    place = Georeference(mesh.crs, (east, north, 0.0), vertical)
-    for key, value in _texts(place).items():
+    for key, value in (_texts(place) | dict(more or {})).items():
         model.Strings[key] = value
     layers = {name: _layer(rhino, model, name, colour) for name, colour in COLOURS.items()}
     if surface is not None:
         model.Objects.AddSurface(_surface(rhino, surface, bounds, place), layers["surface"])
     for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
         if faces.any():
-            model.Objects.AddMesh(_mesh(rhino, mesh, faces), layers[name])
+            model.Objects.AddMesh(_mesh(rhino, mesh, faces, place), layers[name])
     return base64.b64decode(model.Encode())
 
 
@@ -107,8 +114,7 @@ def _layer(rhino: Any, model: Any, name: str, colour: tuple[int, int, int]) -> A
 
 def _surface(rhino: Any, surface: NurbsSurface, bounds: Bounds, place: Georeference) -> Any:
     """Return the part of a surface as rhino3dm's surface."""
-    nurbs, rational = patch(surface, bounds)
-    shift = np.subtract(nurbs.origin, place.origin[:2])
+    nurbs, rational = patch(surface, bounds, place.origin[:2])
     rows, cols, _ = nurbs.points.shape
     p, q = nurbs.degree
     made = rhino.NurbsSurface.Create(3, rational, p + 1, q + 1, cols, rows)
@@ -117,7 +123,6 @@ def _surface(rhino: Any, surface: NurbsSurface, bounds: Bounds, place: Georefere
         for k, knot in enumerate(knots[1:-1].tolist()):
             into[k] = knot
     points = nurbs.points.copy()
-    points[..., :2] += shift
     points[..., :3] *= points[..., 3:]
     for row in range(rows):
         for col in range(cols):
@@ -125,10 +130,10 @@ def _surface(rhino: Any, surface: NurbsSurface, bounds: Bounds, place: Georefere
     return made
 
 
-def _mesh(rhino: Any, mesh: Mesh, faces: Bools) -> Any:
+def _mesh(rhino: Any, mesh: Mesh, faces: Bools, place: Georeference) -> Any:
     """Return some faces as rhino3dm's mesh."""
     used, corners = part(mesh, faces)
-    points = mesh.vertices[used] + (0.0, 0.0, mesh.origin[2])
+    points = mesh.vertices[used] + np.subtract(mesh.origin, place.origin)
     made = rhino.Mesh()
     made.Vertices.UseDoublePrecisionVertices = True
     for point in points.tolist():

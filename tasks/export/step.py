@@ -3,7 +3,7 @@
 The file has the surface itself and no triangles: an open shell of one face, bounded by its four border
 curves, in metres. It is cut to the given bounds by knot insertion, which is exact. With equal weights the
 surface is a polynomial spline of its own degree; else it is rational (`tasks.spline.surface.exact`).
-Coordinates are relative to the surface's whole-metre origin in plan; z is the height.
+Coordinates are relative to a whole-metre origin in plan that all tiles of a run share; z is the height.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from flexroad.tasks.spline.cut import patch
 from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface
 from flexroad.tasks.types import Floats
 
-VERSION = 1
+VERSION = 2
 NAME = ".stp"
 NAME_SIDECAR = "_stp.json"
 MEDIA_TYPE = "model/step"
@@ -45,9 +45,7 @@ Knots = tuple[Sequence[int], Sequence[float]]
 """Multiplicities and values of the different knots."""
 
 
-def encode(
-    surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, vertical: str | None = None
-) -> bytes:
+def encode(surface: NurbsSurface, bounds: Bounds, name: str, written: datetime, place: Georeference) -> bytes:
     """Return the part of a surface within bounds as STEP file.
 
     Coordinates have all digits of their float64 numbers. Equal inputs give equal bytes.
@@ -63,16 +61,16 @@ def encode(
         Name of the product, as the tile id.
     written : datetime
         Date and time of the file, which the format requires.
-    vertical : str, optional
-        CRS of the heights, if known.
+    place : Georeference
+        What coordinates are relative to; its height is 0.
 
     Raises
     ------
     TaskError
         If the bounds and the surface's domain do not overlap.
     """
-    nurbs, rational = patch(surface, bounds)
-    lines = [f"FlexRoad surface {name}", f"axes {AXES}", *georeference(surface, vertical).lines()]
+    nurbs, rational = patch(surface, bounds, place.origin[:2])
+    lines = [f"FlexRoad surface {name}", f"axes {AXES}", *place.lines()]
     cut = [line[k : k + LONGEST] for line in lines for k in range(0, len(line), LONGEST)]
     content = FILE.format(
         description=_list(map(_text, cut)),
@@ -81,11 +79,6 @@ def encode(
         data=_Data(rational).shape(nurbs, name),
     )
     return content.encode("ascii")
-
-
-def georeference(surface: NurbsSurface, vertical: str | None = None) -> Georeference:
-    """Return the place of a file's coordinates, of which the JSON file is made."""
-    return Georeference(surface.crs, (*surface.origin, 0.0), vertical)
 
 
 @dataclass

@@ -1,11 +1,19 @@
-"""The extent of the survey: cells beyond it get no mesh."""
+"""The extent of the survey: cells beyond it get no mesh.
+
+A fitted surface goes on beyond the survey, but its heights there are no heights of the ground. Formats
+without meshes ask here what is covered.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy
 
-from flexroad.tasks.types import Bools, TileData
+from flexroad.catalog.grid import Bounds
+from flexroad.tasks.types import Bools, Floats, RoadMask, TileData
+
+ROUNDING_M = 1e-6
+"""Points this near to the border of a cell are on it (m)."""
 
 
 def beyond_extent(data: TileData) -> Bools:
@@ -24,3 +32,40 @@ def beyond_extent(data: TileData) -> Bools:
     beyond[0] = False
     outside: Bools = beyond[labels]
     return outside
+
+
+def nodes_beyond(road: RoadMask, eastings: Floats, northings: Floats) -> Bools:
+    """Return which nodes of a lattice lie beyond the survey, ``(len(northings), len(eastings))``.
+
+    A node on the border of cells is beyond the survey if all of them are, so that tiles agree on the nodes of
+    their common edge.
+    """
+    north_row, west_col = road.grid.cells(eastings - ROUNDING_M, northings + ROUNDING_M)
+    south_row, east_col = road.grid.cells(eastings + ROUNDING_M, northings - ROUNDING_M)
+    rows = road.outside[north_row] & road.outside[south_row]
+    return np.asarray(rows[:, west_col] & rows[:, east_col])
+
+
+def covered(road: RoadMask) -> tuple[Bounds, float]:
+    """Return the smallest rectangle around all covered cells of a tile, and what of it is beyond the survey.
+
+    Returns
+    -------
+    bounds : tuple of float
+        West, south, east and north (m); those of the core if none of its cells is covered.
+    beyond_m2 : float
+        Area within the bounds that is beyond the survey (m2).
+    """
+    core, inside = road.core, ~road.outside[road.grid.window(road.core)]
+    if inside.all() or not inside.any():
+        return core.bounds, float((~inside).sum() * core.cell**2)
+    rows, cols = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
+    west, north = core.bounds[0], core.bounds[3]
+    bounds = (
+        float(west + left * core.cell),
+        float(north - bottom * core.cell),
+        float(west + right * core.cell),
+        float(north - top * core.cell),
+    )
+    return bounds, float((~inside[top:bottom, left:right]).sum() * core.cell**2)

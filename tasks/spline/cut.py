@@ -50,8 +50,17 @@ def cut(surface: NurbsSurface, bounds: Bounds) -> NurbsSurface:
     )
 
 
-def patch(surface: NurbsSurface, bounds: Bounds) -> tuple[ExactNurbs, bool]:
+def patch(surface: NurbsSurface, bounds: Bounds, origin: tuple[float, float]) -> tuple[ExactNurbs, bool]:
     """Return the part of a surface within bounds as a NURBS with control points in space; exact.
+
+    Parameters
+    ----------
+    surface : NurbsSurface
+        The surface.
+    bounds : tuple of float
+        West, south, east and north of the part (m).
+    origin : tuple of float
+        Easting and northing that the control points are relative to (m).
 
     Returns
     -------
@@ -65,7 +74,7 @@ def patch(surface: NurbsSurface, bounds: Bounds) -> tuple[ExactNurbs, bool]:
     TaskError
         If the bounds and the domain do not overlap.
     """
-    part = cut(surface, bounds)
+    part = replace(cut(surface, bounds), origin=origin)
     if np.ptp(surface.W):
         return exact(part), True
     points = part.control_points - np.array([*part.origin, 0, 0])

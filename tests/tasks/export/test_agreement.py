@@ -11,11 +11,14 @@ import trimesh
 
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.export import cityjson, glb, landxml, obj
+from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 from flexroad.tasks.types import Mesh, RoadClusters, RoadMask
 
 GRID = Grid("EPSG:25832", 295500.0, 5629350.0, 1.0, 100, 100)
+PLACE = Georeference(GRID.crs, (295000.0, 5629000.0, 0.0))
+"""What all tiles of a run are relative to."""
 CENTRE = (295550.0, 5629300.0, 100.0)
 
 
@@ -50,8 +53,8 @@ def of_cityjson(mesh: Mesh) -> np.ndarray:
 
 
 def of_obj(mesh: Mesh) -> np.ndarray:
-    lines = obj.encode(mesh, "tile.mtl").decode().splitlines()
-    return np.array([line.split()[1:] for line in lines if line.startswith("v ")], float) + mesh.origin
+    lines = obj.encode(mesh, "tile.mtl", PLACE).decode().splitlines()
+    return np.array([line.split()[1:] for line in lines if line.startswith("v ")], float) + PLACE.origin
 
 
 def of_glb(mesh: Mesh) -> np.ndarray:

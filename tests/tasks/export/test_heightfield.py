@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flexroad.catalog.grid import Grid
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import heightfield
 from flexroad.tasks.export.heightfield import sampled, size_at_spacing
+from flexroad.tasks.types import RoadMask
 
 BOUNDS = (295500.0, 5629250.0, 295750.0, 5629500.0)
 
@@ -32,6 +34,13 @@ class Hills:
 
     def normal(self, easting, northing):
         raise NotImplementedError
+
+
+class Ramp(Hills):
+    """A slope of 10% to the east from 150 m."""
+
+    def height(self, easting, northing):
+        return 150 + 0.1 * (easting - BOUNDS[0]) + 0 * northing
 
 
 def truth(size: int, surface=None) -> np.ndarray:
@@ -113,11 +122,33 @@ def test_sidecar_has_place_and_voids():
     field = sampled(Hills(hole=BOUNDS[0] + 240), BOUNDS, 33)
     content = sidecar(field)
     assert content["nodes_without_height"] == 2 * 33
-    assert (field.values[:, -2:] == 0).all()
+    # Flat, at the height of the nearest node that has one.
+    np.testing.assert_array_equal(field.values[:, -2:], field.values[:, [-3, -3]])
+    holes = np.asarray(Image.open(io.BytesIO(heightfield.encode_holes(field))))
+    assert holes.dtype == np.uint8
+    assert (holes[:, -2:] == 255).all()
+    assert not holes[:, :-2].any()
     assert content["origin"][:2] == [295500.0, 5629250.0]
     assert (content["crs"], content["vertical_crs"]) == ("EPSG:25832", "EPSG:7837")
     assert (content["size"], content["bounds"]) == ([33, 33], list(BOUNDS))
     assert content["spacing_m"] == [250 / 32, 250 / 32]
+
+
+def test_nodes_beyond_the_survey_have_no_height_and_do_not_stretch_the_range():
+    """The surface goes on beyond the survey, up to 175 m; the covered west ends at 162.5 m."""
+    grid = Grid("EPSG:25832", BOUNDS[0], BOUNDS[3], 1.0, 250, 250)
+    outside = np.zeros(grid.shape, bool)
+    outside[:, 125:] = True
+    road = RoadMask(grid, grid, ~outside, outside)
+    ramp = Ramp()
+    field = sampled(ramp, BOUNDS, 257, road=road)
+    x = BOUNDS[0] + np.arange(257) * (250 / 256)
+    # The node at 125 m is on the border of a covered cell.
+    beyond = x > BOUNDS[0] + 125
+    np.testing.assert_array_equal(np.isnan(field.heights), np.tile(beyond, (257, 1)))
+    assert (field.low, field.high) == (150, 162.5)
+    np.testing.assert_array_equal(field.filled[:, beyond], 162.5)
+    assert sidecar(field)["nodes_without_height"] == 128 * 257
 
 
 def test_flat_surface_is_exact():

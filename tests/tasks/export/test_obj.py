@@ -1,14 +1,15 @@
-import json
-
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
 from flexroad.tasks.export import obj
+from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.types import Mesh
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
+PLACE = Georeference("EPSG:25832", (295400.0, 5629200.0, 0.0), "EPSG:7837")
+"""What all tiles of a run are relative to."""
 PHOTO = (295500.0, 5629248.0, 295512.0, 5629260.0)
 
 
@@ -25,7 +26,7 @@ def hills(n: int = 9, road_east: float = 4.0) -> Mesh:
 
 def loaded(folder, mesh: Mesh, textured: bool = False) -> dict[str, trimesh.Trimesh]:
     """Return the meshes of both materials as trimesh reads them from the files."""
-    (folder / "tile.obj").write_bytes(obj.encode(mesh, "tile.mtl", photo=PHOTO if textured else None))
+    (folder / "tile.obj").write_bytes(obj.encode(mesh, "tile.mtl", PLACE, PHOTO if textured else None))
     (folder / "tile.mtl").write_bytes(obj.encode_materials("tile.jpg" if textured else None))
     if textured:
         Image.new("RGB", (24, 24), (10, 200, 30)).save(folder / "tile.jpg")
@@ -39,7 +40,7 @@ def test_encode_is_read_by_trimesh(tmp_path, textured):
     parts = loaded(tmp_path, mesh, textured)
     assert set(parts) == {"road", "terrain"}
     for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
-        truth = mesh.vertices[mesh.faces[faces]]
+        truth = np.add(mesh.vertices, (100, 50, 150))[mesh.faces[faces]]
         np.testing.assert_allclose(parts[name].triangles, truth, rtol=0, atol=0.6e-4)
         assert (parts[name].face_normals[:, 2] > 0).all()
 
@@ -47,7 +48,7 @@ def test_encode_is_read_by_trimesh(tmp_path, textured):
 def test_encode_texture_coordinates_are_places_in_the_photo(tmp_path):
     for part in loaded(tmp_path, hills(), textured=True).values():
         x, y, _ = part.vertices.T
-        np.testing.assert_allclose(part.visual.uv, np.c_[x / 12, (y + 2) / 12], atol=1e-5)
+        np.testing.assert_allclose(part.visual.uv, np.c_[(x - 100) / 12, (y - 48) / 12], atol=1e-5)
         assert part.visual.material.image.size == (24, 24)
 
 
@@ -59,23 +60,21 @@ def test_materials_have_colours_or_the_texture():
 
 
 def test_encode_comments_have_the_place():
-    lines = obj.encode(hills(), "tile.mtl", "EPSG:7837").decode("ascii").splitlines()
+    lines = obj.encode(hills(), "tile.mtl", PLACE).decode("ascii").splitlines()
     assert lines[:5] == [
-        "# origin 295500 5629250 150 (easting northing height, m)",
+        "# origin 295400 5629200 0 (easting northing height, m)",
         "# crs EPSG:25832",
         "# vertical crs EPSG:7837",
-        "# axes x east, y north, z up; relative to origin; metres",
+        "# axes x east, y north, relative to origin; z height; metres",
         "mtllib tile.mtl",
     ]
-    content = json.loads(obj.georeference(hills()).sidecar(obj.AXES))
-    assert (content["origin"], content["vertical_crs"]) == (list(ORIGIN), None)
 
 
 @pytest.mark.parametrize(("road_east", "group"), [(-1, "terrain"), (99, "road")])
 def test_encode_class_without_faces_has_no_group(road_east, group):
-    lines = obj.encode(hills(road_east=road_east), "tile.mtl").decode().splitlines()
+    lines = obj.encode(hills(road_east=road_east), "tile.mtl", PLACE).decode().splitlines()
     assert [line for line in lines if line.startswith("g ")] == [f"g {group}"]
 
 
 def test_encode_equal_meshes_give_equal_bytes():
-    assert obj.encode(hills(), "a.mtl") == obj.encode(hills(), "a.mtl")
+    assert obj.encode(hills(), "a.mtl", PLACE) == obj.encode(hills(), "a.mtl", PLACE)

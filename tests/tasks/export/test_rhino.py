@@ -5,11 +5,14 @@ import pytest
 
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import rhino
+from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from flexroad.tasks.types import Mesh
 
 BOUNDS = (295450.0, 5629200.0, 295800.0, 5629550.0)
 CORE = (295500.0, 5629250.0, 295750.0, 5629500.0)
+PLACE = Georeference("EPSG:25832", (295000.0, 5629100.0, 0.0), "EPSG:7837")
+"""What all tiles of a run are relative to."""
 
 
 def surface(weights: bool) -> NurbsSurface:
@@ -45,45 +48,48 @@ def read(data: bytes):
 def test_encode_surface_read_back_equals_surface(weights):
     pytest.importorskip("rhino3dm")
     truth = surface(weights)
-    _, found = read(rhino.encode(tile(), truth, CORE))
+    _, found = read(rhino.encode(tile(), truth, CORE, PLACE))
     nurbs = found["surface"]
     assert nurbs.IsValid
     assert nurbs.IsRational == weights
     for u, v in [(0, 0), (1, 1), (0.5, 0.5), (0.123, 0.77), (0.9, 0.31), (1, 0)]:
         point = nurbs.PointAt(u, v)
         x, y, z = point.X, point.Y, point.Z
-        np.testing.assert_allclose((x, y), (250 * u, 250 * v), atol=1e-9)
-        np.testing.assert_allclose(z, truth.height(CORE[0] + x, CORE[1] + y), rtol=0, atol=3e-9)
+        np.testing.assert_allclose((x, y), (500 + 250 * u, 150 + 250 * v), atol=1e-9)
+        np.testing.assert_allclose(
+            z, truth.height(PLACE.origin[0] + x, PLACE.origin[1] + y), rtol=0, atol=3e-9
+        )
 
 
 def test_encode_meshes_read_back_are_exact():
     pytest.importorskip("rhino3dm")
     mesh = tile()
-    _, found = read(rhino.encode(mesh, None, CORE))
+    _, found = read(rhino.encode(mesh, None, CORE, PLACE))
     assert set(found) == {"road", "terrain"}
     for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
         part = found[name]
         points = np.array([(p.X, p.Y, p.Z) for p in map(part.Vertices.Point3dAt, range(len(part.Vertices)))])
         corners = np.array([part.Faces[k][:3] for k in range(len(part.Faces))])
-        truth = (mesh.vertices + np.array([0, 0, 1500]))[mesh.faces[faces]]
+        truth = (mesh.vertices + np.array([500, 150, 1500]))[mesh.faces[faces]]
         np.testing.assert_array_equal(points[corners], truth)
         assert part.IsValid
 
 
 def test_encode_document_has_place_and_layers():
     pytest.importorskip("rhino3dm")
-    model, _ = read(rhino.encode(tile(), None, CORE, "EPSG:7837"))
+    model, _ = read(rhino.encode(tile(), None, CORE, PLACE, {"beyond_survey_m2": "7"}))
     assert [layer.Name for layer in model.Layers] == ["surface", "road", "terrain"]
     texts = {model.Strings[k][0]: model.Strings[k][1] for k in range(len(model.Strings))}
     assert texts == {
         "crs": "EPSG:25832",
         "vertical_crs": "EPSG:7837",
-        "origin": "295500 5629250 0",
+        "origin": "295000 5629100 0",
         "axes": rhino.AXES,
+        "beyond_survey_m2": "7",
     }
 
 
 def test_encode_without_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rhino3dm", None)
     with pytest.raises(TaskError, match=r"3DM files need rhino3dm: pip install 'flexroad\[export\]'"):
-        rhino.encode(tile(), None, CORE)
+        rhino.encode(tile(), None, CORE, PLACE)

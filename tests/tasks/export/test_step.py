@@ -9,11 +9,14 @@ import pytest
 from geomdl import NURBS, BSpline
 
 from flexroad.tasks.export import step
+from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from tests.validators.opencascade import read_step
 
 BOUNDS = (295450.0, 5629200.0, 295800.0, 5629550.0)
 CORE = (295500.0, 5629250.0, 295750.0, 5629500.0)
+PLACE = Georeference("EPSG:25832", (295000.0, 5629100.0, 0.0), "EPSG:7837")
+"""What all tiles of a run are relative to."""
 WRITTEN = datetime(2026, 5, 4, 3, 2, 1)
 
 
@@ -31,8 +34,8 @@ def surface(weights: bool, crs: str = "EPSG:25832") -> NurbsSurface:
     )
 
 
-def encoded(weights: bool, **options) -> str:
-    return step.encode(surface(weights), CORE, "295500_5629250", WRITTEN, **options).decode("ascii")
+def encoded(weights: bool) -> str:
+    return step.encode(surface(weights), CORE, "295500_5629250", WRITTEN, PLACE).decode("ascii")
 
 
 def entities(text: str) -> dict[str, str]:
@@ -116,8 +119,8 @@ def test_encode_evaluated_by_geomdl_equals_surface(weights):
     assert peer.rational == weights
     for u, v in [(0, 0), (1, 1), (0, 1), (0.5, 0.5), (0.123, 0.77), (0.9, 0.31)]:
         x, y, z = peer.evaluate_single((u, v))
-        assert x == pytest.approx(250 * u, abs=1e-9)
-        assert y == pytest.approx(250 * v, abs=1e-9)
+        assert x == pytest.approx(500 + 250 * u, abs=1e-9)
+        assert y == pytest.approx(150 + 250 * v, abs=1e-9)
         # A northing has a rounding error of 1e-9 m, and slopes here are below 1.
         assert z == pytest.approx(float(truth.height(CORE[0] + 250 * u, CORE[1] + 250 * v)), abs=2e-9)
 
@@ -129,8 +132,10 @@ def test_encode_read_by_opencascade_is_valid_and_equals_surface(tmp_path, weight
     valid, points = read_step(tmp_path / "tile.step", 9)
     assert valid
     x, y, z = points.T
-    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((0, 250, 0, 250), abs=1e-9)
-    np.testing.assert_allclose(z, surface(weights).height(CORE[0] + x, CORE[1] + y), rtol=0, atol=2e-9)
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((500, 750, 150, 400), abs=1e-9)
+    np.testing.assert_allclose(
+        z, surface(weights).height(PLACE.origin[0] + x, PLACE.origin[1] + y), rtol=0, atol=2e-9
+    )
 
 
 @pytest.mark.parametrize("weights", [False, True])
@@ -166,17 +171,19 @@ def test_encode_references_have_entities():
 
 
 def test_encode_head_has_schema_time_and_place():
-    text = encoded(False, vertical="EPSG:7837")
+    text = encoded(False)
     assert "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));" in text
     assert "FILE_NAME('295500_5629250','2026-05-04T03:02:01'," in text
-    assert "'origin 295500 5629250 0 (easting northing height, m)','crs EPSG:25832'" in text
+    assert "'origin 295000 5629100 0 (easting northing height, m)','crs EPSG:25832'" in text
     assert "'vertical crs EPSG:7837'" in text
     assert "SI_UNIT($,.METRE.)" in text
 
 
 def test_encode_long_and_foreign_text_is_divided_and_escaped():
     wkt = "PROJCRS['Réunion'," + "x" * 600 + "]"
-    text = step.encode(surface(False, wkt), CORE, "tîle 'a'\\b", WRITTEN).decode("ascii")
+    text = step.encode(
+        surface(False, wkt), CORE, "tîle 'a'\\b", WRITTEN, Georeference(wkt, (0.0, 0.0, 0.0))
+    ).decode("ascii")
     (description,) = re.findall(r"FILE_DESCRIPTION\((.*),'2;1'\);", text)
     assert max(map(len, re.findall(r"'((?:[^']|'')*)'", description))) <= 256
     assert r"PRODUCT('t\X4\000000EE\X0\le ''a''\\b'," in text

@@ -38,7 +38,7 @@ def evaluated(nurbs: ExactNurbs, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("bounds", [WITHIN, BOUNDS, (295400.0, 5629300.0, 295600.0, 5629999.0)])
 def test_patch_equals_surface_within_a_nanometre(degree, clamped, weights, bounds):
     whole = surface(degree, clamped, weights)
-    nurbs, rational = patch(whole, bounds)
+    nurbs, rational = patch(whole, bounds, whole.origin)
     assert rational == weights
     assert nurbs.degree == tuple(p + weights for p in degree)
     west, south, east, north = (
@@ -79,7 +79,8 @@ def test_cut_in_one_span_has_as_few_points_as_possible():
 
 
 def test_patch_equal_weights_other_than_1_is_not_rational():
-    nurbs, rational = patch(surface(constant=2.5), WITHIN)
+    whole = surface(constant=2.5)
+    nurbs, rational = patch(whole, WITHIN, whole.origin)
     assert not rational
     np.testing.assert_array_equal(nurbs.points[..., 3], 1)
     t = np.array([0.0, 0.3, 1.0])

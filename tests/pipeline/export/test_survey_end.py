@@ -1,0 +1,136 @@
+"""Formats without a mesh where the survey ends on a tile: no heights of ground that nobody measured."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from PIL import Image
+
+from flexroad.catalog import Catalog
+from flexroad.pipeline.benchmark.scenes import write_scenes
+from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.execute import SerialExecutor
+from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.source import Options, select
+from flexroad.pipeline.run.record import Run
+from flexroad.pipeline.run.runner import run_tiles
+from tests.tasks.export.test_step import read_surface
+
+COLUMNS, ROWS, SIZE_M = 40, 45, 60
+"""Cells with data of the eastern tile: the western columns, without the rows in the north."""
+MISSING = SIZE_M - ROWS
+
+
+def ground(easting, west):
+    """A slope of 10% to the east."""
+    return 125 + 0.1 * (easting - west)
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    """A run of two tiles of 60 m; of the eastern one, 40 m x 45 m in the south-west have data."""
+    folder = tmp_path_factory.mktemp("survey_end")
+    catalog = Catalog.read(write_scenes(folder / "survey", 2, seed=3, size_m=SIZE_M))
+    west = min(tile.grid.west for tile in catalog.tiles)
+    for tile in catalog.tiles:
+        plane = np.tile(ground(tile.grid.eastings, west), (SIZE_M, 1)).astype(np.float32)
+        if tile.grid.west > west:
+            plane[:MISSING] = plane[:, COLUMNS:] = np.nan
+        for layer in ("dsm", "dtm"):
+            with rasterio.open(folder / "survey" / layer / f"{tile.id}.tif", "r+") as raster:
+                raster.nodata = np.nan
+                raster.write(plane, 1)
+    run = Run.create(folder / "run", load_config("production"), catalog)
+    assert run_tiles(run, SerialExecutor()).done == 2
+    return run.path
+
+
+@pytest.fixture(scope="module")
+def exported(survey, tmp_path_factory):
+    out = tmp_path_factory.mktemp("exported")
+    formats = ["heightfield", "step", "3dm", "obj"]
+    return out, export(select(survey), out, formats, Options(), SerialExecutor())["formats"]
+
+
+@pytest.fixture(scope="module")
+def tiles(survey):
+    """The western tile and the eastern one."""
+    return sorted((tile.tile for tile in select(survey).finished()), key=lambda tile: tile.grid.west)
+
+
+def test_height_field_is_flat_beyond_the_survey_with_holes_and_a_number(exported, tiles):
+    out, manifest = exported
+    west, east = (
+        json.loads((out / "heightfield" / f"{tile.id}_heightfield.json").read_text()) for tile in tiles
+    )
+    values, holes = (
+        np.asarray(Image.open(out / "heightfield" / f"{tiles[1].id}{name}"))
+        for name in ("_heightfield.png", "_holes.png")
+    )
+    size = len(values)
+    x = np.arange(size) * SIZE_M / (size - 1)
+    beyond = (x > COLUMNS) | (x < MISSING)[:, None]
+    # Nodes on the common edge are on the ground of the western tile.
+    beyond[:, 0] = False
+    np.testing.assert_array_equal(holes, np.where(beyond, 255, 0))
+    assert (west["nodes_without_height"], east["nodes_without_height"]) == (0, beyond.sum())
+    # The lowest and highest covered place have 125 m and 135 m; limits are whole metres around them.
+    assert (west["low_m"], west["high_m"]) == (east["low_m"], east["high_m"])
+    assert east["low_m"] in (124, 125)
+    assert east["high_m"] in (135, 136)
+    heights = east["low_m"] + values * east["step_m"]
+    expected = np.tile(131 + 0.1 * np.minimum(x, x[x <= COLUMNS].max()), (size, 1))
+    np.testing.assert_allclose(heights[x >= MISSING], expected[x >= MISSING], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(heights[~beyond], expected[~beyond], rtol=0, atol=2e-3)
+    assert heights.min() == pytest.approx(131, abs=2e-3)
+    assert heights.max() == pytest.approx(expected.max(), abs=2e-3)
+    assert manifest["heightfield"]["notes"] == [
+        "1 tile: nodes beyond the survey are flat, and holes in the mask"
+    ]
+
+
+def test_step_and_3dm_end_with_the_survey_and_tiles_lie_side_by_side(exported, survey, tiles):
+    """The eastern tile begins where the western one ends, as all have one origin."""
+    out, manifest = exported
+    origin = Run.open(survey).origin
+    ends = []
+    for tile in tiles:
+        place = json.loads((out / "step" / f"{tile.id}_stp.json").read_text())
+        assert (place["origin"], place["beyond_survey_m2"]) == ([*origin, 0.0], 0.0)
+        surface = read_surface((out / "step" / f"{tile.id}.stp").read_text())
+        low, high = (np.array(surface.evaluate_single(corner)) for corner in ((0, 0), (1, 1)))
+        np.testing.assert_allclose([*(low[:2] + origin), *(high[:2] + origin)], place["bounds"], atol=1e-6)
+        heights = ground(np.array([low[0], high[0]]) + origin[0], tiles[0].grid.west)
+        np.testing.assert_allclose([low[2], high[2]], heights, rtol=0, atol=2e-3)
+        ends.append((low, high))
+    (_, (across, _, _)), (low, high) = ends
+    assert low[0] == pytest.approx(across, abs=1e-9)
+    np.testing.assert_allclose((high - low)[:2], (COLUMNS, ROWS), rtol=0, atol=1e-6)
+    note = "1 tile: surface cut to the rectangle that the survey covers"
+    assert manifest["step"]["notes"] == manifest["3dm"]["notes"] == [note]
+
+
+def test_3dm_has_the_surface_of_the_covered_rectangle(exported, survey, tiles):
+    rhino3dm = pytest.importorskip("rhino3dm")
+    out, _ = exported
+    model = rhino3dm.File3dm.Read(str(out / "3dm" / f"{tiles[1].id}.3dm"))
+    (surface,) = (item.Geometry for item in model.Objects if item.Attributes.Name == "surface")
+    first, last = surface.PointAt(0, 0), surface.PointAt(1, 1)
+    east, north, _, _ = np.array(tiles[1].grid.bounds) - np.tile(Run.open(survey).origin, 2)
+    np.testing.assert_allclose([first.X, first.Y, first.Z], [east, north, 131], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(
+        [last.X, last.Y, last.Z], [east + COLUMNS, north + ROWS, 135], rtol=0, atol=2e-3
+    )
+
+
+def test_obj_of_all_tiles_has_one_origin(exported, survey, tiles):
+    out, _ = exported
+    origin = Run.open(survey).origin
+    for tile in tiles:
+        assert json.loads((out / "obj" / f"{tile.id}.json").read_text())["origin"] == [*origin, 0.0]
+        lines = (out / "obj" / f"{tile.id}.obj").read_text().splitlines()
+        x, y, z = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float).T
+        assert x.min() == pytest.approx(tile.grid.west - origin[0], abs=1e-4)
+        assert y.min() == pytest.approx(tile.grid.south - origin[1], abs=1e-4)
+        np.testing.assert_allclose(z, ground(x + origin[0], tiles[0].grid.west), rtol=0, atol=2e-3)
