@@ -19,18 +19,34 @@ from pathlib import Path
 from weakref import finalize
 
 PREFIX = "flexroad-"
+HIDDEN = f".{PREFIX}"
+"""Prefix beside outputs."""
 LOCK = ".flexroad.lock"
 
 
 class ScratchFolder(tempfile.TemporaryDirectory[str]):
     """A temporary folder; a context manager that gives its path, and removes it at the end.
 
-    Without `with` it is removed by `cleanup`, or when the process ends.
+    Without `with` it is removed by `cleanup`, or when the process ends. In a parent folder, for outputs that
+    are renamed or need much space, it is hidden, and those of processes that have ended are removed first.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
     """
 
-    def __init__(self) -> None:
-        super().__init__(prefix=PREFIX, ignore_cleanup_errors=True)
-        opened = _held(Path(self.name))
+    def __init__(self, parent: Path | None = None) -> None:
+        if parent is not None:
+            remove_abandoned(parent)
+        while True:
+            super().__init__(prefix=HIDDEN if parent else PREFIX, dir=parent, ignore_cleanup_errors=True)
+            try:
+                opened = _held(Path(self.name))
+                break
+            except (FileNotFoundError, BlockingIOError):
+                # Another process took it for abandoned.
+                super().cleanup()
         self._unlock = finalize(self, os.close, opened) if opened is not None else lambda: None
 
     def cleanup(self) -> None:
@@ -46,25 +62,30 @@ def abandoned() -> Iterator[Path]:
             yield folder
 
 
-def remove_abandoned() -> int:
-    """Remove the folders of this user whose process has ended; return their number.
+def remove_abandoned(parent: Path | None = None) -> int:
+    """Remove the folders of this user whose process has ended, in a parent folder; return their number.
 
-    Folders without a lock file are not touched: other programs or users may have made them.
+    By default the parent is that of the system. Folders without a lock file are not touched: other programs
+    or users may have made them. Only empty hidden ones are removed, whose process ended before it had a lock.
     """
     removed = 0
-    for folder in _folders():
+    for folder in _folders(parent):
         # In use, or another process removes it.
         with contextlib.suppress(OSError), _locked(folder):
             # It does not follow links.
             shutil.rmtree(folder)
             removed += 1
+    for folder in parent.glob(f"{HIDDEN}*") if parent else ():
+        with contextlib.suppress(OSError):
+            folder.rmdir()
     return removed
 
 
-def _folders() -> Iterator[Path]:
+def _folders(parent: Path | None = None) -> Iterator[Path]:
     """Yield the folders of this user with a lock file; links to folders are left out."""
     with contextlib.suppress(OSError):
-        for folder in sorted(Path(tempfile.gettempdir()).glob(f"{PREFIX}*")):
+        where = parent or Path(tempfile.gettempdir())
+        for folder in sorted(where.glob(f"{HIDDEN if parent else PREFIX}*")):
             with contextlib.suppress(OSError):
                 for path, is_kind in ((folder, stat.S_ISDIR), (folder / LOCK, stat.S_ISREG)):
                     status = path.lstat()
@@ -75,20 +96,30 @@ def _folders() -> Iterator[Path]:
 
 
 def _held(folder: Path) -> int | None:
-    """Return the descriptor of the locked file of a new folder, None if there can be none."""
-    # The file gets its name when the lock is held: before, the folder could be taken for abandoned.
-    new = folder / f"{LOCK}.new"
+    """Return the descriptor of the locked file of a new folder, None if there can be none.
+
+    Raises
+    ------
+    FileNotFoundError, BlockingIOError
+        If another process removes the folder, which it may until the lock is held.
+    """
     try:
-        opened = os.open(new, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
+        opened = os.open(folder / LOCK, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
+    except FileNotFoundError:
+        raise
     except OSError:
         return None
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        new.rename(folder / LOCK)
-    except OSError:
-        # Not every disk has locks.
+    except OSError as error:
         os.close(opened)
+        if isinstance(error, BlockingIOError):
+            raise
+        # Not every disk has locks.
         return None
+    if not os.fstat(opened).st_nlink:
+        os.close(opened)
+        raise FileNotFoundError(folder / LOCK)
     return opened
 
 

@@ -37,7 +37,7 @@ rasterio = lazy("rasterio")
 
 VERSION = 1
 DRAFTS = ".drafts"
-"""Name of the folder of temporary rasters."""
+"""Name of the folder of temporary rasters in earlier versions."""
 NORMAL_STEPS = 32767
 """Value of a component of length 1."""
 NO_NORMAL = -32768
@@ -109,18 +109,12 @@ def write_mosaics(
 @contextmanager
 def _drafts(folder: Location) -> Iterator[Path]:
     """Yield a temporary folder beside the files, as they need the most space; of a bucket, a local one."""
-    if not isinstance(folder, Path):
-        with ScratchFolder() as name:
-            yield Path(name)
-        return
-    drafts = folder / DRAFTS
-    # That of an export that was killed is large.
-    shutil.rmtree(drafts, ignore_errors=True)
-    drafts.mkdir()
-    try:
-        yield drafts
-    finally:
-        shutil.rmtree(drafts, ignore_errors=True)
+    beside = folder if isinstance(folder, Path) else None
+    if beside:
+        # That of an export of an earlier version that was killed is large.
+        shutil.rmtree(beside / DRAFTS, ignore_errors=True)
+    with ScratchFolder(beside) as name:
+        yield Path(name)
 
 
 @contextmanager

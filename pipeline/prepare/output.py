@@ -11,6 +11,7 @@ from pathlib import Path
 from flexroad.catalog import LAYERS
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.storage.outputs import output_file
+from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import write_reason
 from flexroad.pipeline.errors import ConfigError
 
@@ -19,6 +20,8 @@ NAMES = (CATALOG, *(f"{layer}.tif" for layer in LAYERS))
 """The files that a command writes, or removes if it does not write them."""
 LAYER_TAG = "LAYER"
 """TIFF tag with the layer of a raster: shows that this program has written it."""
+FORMER = ".prepare-*"
+"""Temporary folders in the output folder of processes of earlier versions that were killed."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FULL_BYTES = 2**24
 """A disk with less free space counts as full if an error has no number, as those of GDAL."""
@@ -70,6 +73,33 @@ def disk_errors(where: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise write_error(where, error) from error
+
+
+@contextlib.contextmanager
+def scratch_folder(out: Path) -> Iterator[Path]:
+    """Context manager that makes a hidden temporary folder inside ``out`` and removes it at the end.
+
+    ``out`` is created if it does not exist, and removed again if nothing was written to it.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    """
+    new = not out.exists()
+    try:
+        with contextlib.ExitStack() as stack:
+            with disk_errors(out):
+                out.mkdir(parents=True, exist_ok=True)
+                for former in out.glob(FORMER):
+                    shutil.rmtree(former, ignore_errors=True)
+                folder = Path(stack.enter_context(ScratchFolder(out)))
+            yield folder
+    finally:
+        if new:
+            # Fails, as intended, if the folder has published rasters.
+            with contextlib.suppress(OSError):
+                out.rmdir()
 
 
 def write_error(where: Path, error: Exception) -> ConfigError:

@@ -20,8 +20,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.mesh import MeshOptions, publish_mesh
 from flexroad.pipeline.prepare.options import PrepareOptions, written
-from flexroad.pipeline.prepare.output import disk_errors
-from flexroad.pipeline.prepare.point_buckets import scratch_folder
+from flexroad.pipeline.prepare.output import disk_errors, scratch_folder
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset
 from flexroad.pipeline.prepare.roads import check_roads
 from flexroad.tasks import TaskError

@@ -6,12 +6,9 @@ in tenths of a millimetre, so that they do not depend on the division into block
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
-import os
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -296,30 +293,3 @@ def _records(
         records["colour"] = colours.bytes(chunk.colour[valid])
     plan = np.stack([easting[valid], northing[valid]])
     return np.rint(plan * PER_METRE).astype(np.int64), records
-
-
-@contextlib.contextmanager
-def scratch_folder(out: Path) -> Iterator[Path]:
-    """Context manager that makes a hidden temporary folder inside ``out`` and removes it at the end.
-
-    ``out`` is created if it does not exist, and removed again if nothing was written to it.
-
-    Raises
-    ------
-    ConfigError
-        If the folder cannot be written.
-    """
-    # Same prefix as the folders of `RasterWriter`, which removes those of killed processes.
-    folder, new = out / f".prepare-points-{os.getpid()}", not out.exists()
-    shutil.rmtree(folder, ignore_errors=True)
-    try:
-        # Inside: an interruption right after it must not leave the folder behind.
-        with disk_errors(out):
-            folder.mkdir(parents=True)
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        if new:
-            # Fails, as intended, if the folder has published rasters.
-            with contextlib.suppress(OSError):
-                out.rmdir()

@@ -19,13 +19,8 @@ from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
 from flexroad.pipeline.prepare.options import PrepareOptions, written
-from flexroad.pipeline.prepare.point_buckets import (
-    RECORD,
-    BucketedPoints,
-    block_edge_of,
-    bucket_points,
-    scratch_folder,
-)
+from flexroad.pipeline.prepare.output import scratch_folder
+from flexroad.pipeline.prepare.point_buckets import RECORD, BucketedPoints, block_edge_of, bucket_points
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset, RasterWriter
 from flexroad.pipeline.prepare.roads import add_roads, check_roads
 from flexroad.tasks.acquire.points.to_rasters import BRIDGE_CLASSES, Options, reach_m, tags

@@ -7,8 +7,6 @@ files behind, and new rasters replace old ones by renaming. The catalog is writt
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -35,7 +33,14 @@ from flexroad.catalog.text import some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
 from flexroad.catalog.tiling import cut
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.prepare.output import CATALOG, LAYER_TAG, NAMES, write_error
+from flexroad.pipeline.prepare.output import (
+    CATALOG,
+    LAYER_TAG,
+    NAMES,
+    disk_errors,
+    scratch_folder,
+    write_error,
+)
 from flexroad.tasks.types import Orthophoto
 
 PHOTO = "dop"
@@ -100,23 +105,19 @@ class RasterWriter:
         self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None
         self.tags = dict(tags)
         self._crs_of_heights = compound(grid.crs, vertical) if vertical else grid.crs
-        self._new = not out.exists()
         self._open: dict[str, Any] = {}
         self._roads: list[VectorFile] = []
         self._notes: list[str] = []
-        self.scratch = out / f".prepare-{os.getpid()}"
-        """Folder for temporary files, also of the caller; removed when the context ends."""
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            for name in NAMES:
-                # Refused at the start and not after the rasters are computed.
+        self.scratch = out
+        """Folder for temporary files, also of the caller; made and removed with the context."""
+        self._stack = contextlib.ExitStack()
+        for name in NAMES:
+            # Refused at the start and not after the rasters are computed.
+            with disk_errors(out / name):
                 output_file(out / name)
-            _remove_stale(out)
-            self.scratch.mkdir()
-        except OSError as error:
-            raise ConfigError(f"cannot write to {out}: {error}") from error
 
     def __enter__(self) -> Self:
+        self.scratch = self._stack.enter_context(scratch_folder(self.out))
         return self
 
     def __exit__(
@@ -125,10 +126,7 @@ class RasterWriter:
         for raster in self._open.values():
             with contextlib.suppress(RasterioError, OSError):
                 raster.close()
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        if error is not None and self._new:
-            with contextlib.suppress(OSError):
-                self.out.rmdir()
+        self._stack.close()
 
     def write(self, layer: str, part: Grid, values: NDArray[Any]) -> None:
         """Write a window of a layer: heights (m, NaN where there is none) or a mask, ``(H, W)``.
@@ -326,14 +324,3 @@ def _to_cog(source: Path, target: Path, layer: str) -> None:
 def _window(whole: Grid, part: Grid) -> Window:
     rows, cols = whole.window(part)
     return Window.from_slices(rows, cols)
-
-
-def _remove_stale(out: Path) -> None:
-    """Remove the temporary folders of processes that no longer exist."""
-    for folder in out.glob(".prepare-*"):
-        try:
-            os.kill(int(folder.name.rpartition("-")[2]), 0)
-        except (ProcessLookupError, ValueError):
-            shutil.rmtree(folder, ignore_errors=True)
-        except PermissionError:
-            continue

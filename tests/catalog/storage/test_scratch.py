@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from flexroad.catalog.storage import scratch
 from flexroad.catalog.storage.scratch import LOCK, ScratchFolder, abandoned, remove_abandoned
 
 PROCESS = """
 import sys, time
+from pathlib import Path
 from flexroad.catalog.storage.scratch import ScratchFolder
-with ScratchFolder() as folder:
+with ScratchFolder(*map(Path, sys.argv[2:])) as folder:
     print(folder, flush=True)
     time.sleep(600 if "wait" in sys.argv else 0)
 """
@@ -56,6 +58,58 @@ def test_folder_of_killed_process_is_removed_and_that_of_living_kept(temporary):
         process.kill()
         process.wait()
         process.stdout.close()
+
+
+def test_folder_in_parent_is_hidden_and_those_of_killed_processes_are_removed(temporary):
+    parent = temporary / "parent"
+    parent.mkdir()
+    command = [sys.executable, "-c", PROCESS, "wait", parent]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        name = Path(process.stdout.readline().strip()).name
+        with ScratchFolder(parent) as first, ScratchFolder(parent) as second:
+            living = {Path(first).name, Path(second).name, name}
+            assert set(names(parent)) == living
+            assert all(hidden.startswith(".flexroad-") for hidden in living)
+        assert names(parent) == [name]
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        (parent / ".flexroad-before-its-lock").mkdir()
+        (parent / ".flexroad-data").mkdir()
+        (parent / ".flexroad-data" / "file").touch()
+        with ScratchFolder(parent) as own:
+            assert names(parent) == sorted([Path(own).name, ".flexroad-data"])
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+@pytest.mark.parametrize("at", ["open", "flock", "fstat"])
+def test_folder_that_another_process_removes_before_its_lock_is_made_again(temporary, monkeypatch, at):
+    module = scratch.fcntl if at == "flock" else os
+    plain, taken = getattr(module, at), []
+
+    def late(*arguments):
+        if not taken:
+            (folder,) = temporary.glob(".flexroad-*")
+            taken.append(folder)
+            if at == "open":
+                folder.rmdir()
+            else:
+                (folder / LOCK).unlink()
+                folder.rmdir()
+            if at == "flock":
+                raise BlockingIOError
+        return plain(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, at, late)
+        own = ScratchFolder(temporary)
+    assert names(temporary) == [Path(own.name).name]
+    assert names(Path(own.name)) == [LOCK]
+    assert taken != [Path(own.name)]
+    own.cleanup()
 
 
 def test_other_folders_and_links_are_kept(temporary):

@@ -14,6 +14,7 @@ from rio_cogeo import cog_validate
 from scipy.ndimage import map_coordinates
 
 from flexroad.catalog import Grid
+from flexroad.catalog.storage.scratch import LOCK
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import mosaic
@@ -168,9 +169,13 @@ def test_full_disk_leaves_no_file(town, written, tmp_path, monkeypatch, part):
 
 
 def test_files_of_an_export_that_was_killed_are_removed(town, tmp_path):
-    left = tmp_path / "mosaic" / mosaic.DRAFTS / "height"
-    left.parent.mkdir(parents=True)
-    left.write_bytes(b"draft")
+    """Also those of earlier versions, which have no lock."""
+    of_earlier = tmp_path / "mosaic" / mosaic.DRAFTS
+    of_killed = tmp_path / "mosaic" / ".flexroad-killed"
+    for left in (of_earlier, of_killed):
+        left.mkdir(parents=True)
+        (left / "height").write_bytes(b"draft")
+    (of_killed / LOCK).touch()
     export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
     assert sorted(file.name for file in (tmp_path / "mosaic").iterdir()) == [f"{name}.tif" for name in NAMES]
 

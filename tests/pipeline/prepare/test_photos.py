@@ -8,6 +8,7 @@ import rasterio
 from PIL import Image
 
 from flexroad.catalog import Catalog
+from flexroad.catalog.lazy import lazy
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.prepare.options import PrepareOptions
@@ -86,6 +87,8 @@ def test_prepare_photos_invalid_input_leaves_no_folder(tmp_path, monkeypatch, in
         os.mkfifo(folder / "9.jpg")
     if invalid == "pycolmap":
         monkeypatch.setitem(sys.modules, "pycolmap", None)
+        # Earlier tests have loaded it.
+        monkeypatch.setattr(sfm, "pycolmap", lazy("pycolmap"))
     messages = {
         "gps": r"0\.jpg has no GNSS position",
         "pycolmap": "pip install",

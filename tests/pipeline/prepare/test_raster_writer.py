@@ -1,6 +1,7 @@
 """The rasters of an area are valid COGs that `run` can read; a failure leaves no partial files."""
 
 import os
+import signal
 from datetime import datetime
 
 import numpy as np
@@ -149,11 +150,25 @@ def test_publish_again_replaces_existing_outputs(tmp_path):
 
 
 def test_writer_removes_folder_of_killed_process(tmp_path):
-    stale = tmp_path / ".prepare-999999999"
-    stale.mkdir()
-    (stale / "dsm.tmp.tif").write_bytes(b"x")
-    with RasterWriter(tmp_path, grid(50, 50), None, TAGS):
-        assert not stale.exists()
+    """Also those of earlier versions, which have no lock."""
+    if child := os.fork():
+        _, status = os.waitpid(child, 0)
+        assert os.WIFSIGNALED(status)
+    else:
+        try:
+            with RasterWriter(tmp_path, grid(50, 50), None, TAGS) as writer:
+                write_layers(writer, dop=False)
+                os.kill(os.getpid(), signal.SIGKILL)
+        finally:
+            os._exit(0)
+    (killed,) = tmp_path.iterdir()
+    assert (killed / "dsm.tmp.tif").exists()
+    stale = [killed, tmp_path / ".prepare-999999999", tmp_path / ".prepare-points-999999999"]
+    for folder in stale[1:]:
+        folder.mkdir()
+        (folder / "dsm.tmp.tif").write_bytes(b"x")
+    with RasterWriter(tmp_path, grid(50, 50), None, TAGS) as writer:
+        assert list(tmp_path.iterdir()) == [writer.scratch]
 
 
 def test_writer_refuses_to_replace_pipe(tmp_path):
