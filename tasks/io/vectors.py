@@ -80,6 +80,8 @@ class _Layer:
     indexed: bool
     columns: tuple[str, ...]
     where: str | None
+    tested: tuple[str, ...]
+    """Further columns that ``where`` may name: most drivers filter only by columns that are read."""
 
 
 def read_near(request: Query, bounds: Bounds) -> Any:
@@ -194,12 +196,15 @@ def _described(request: Query, name: str, info: Any) -> _Layer:
     where = request.where
     if info["driver"] == "OSM" and name in OSM:
         where = f"({where}) AND {OSM[name]}" if where else OSM[name]
+    read = tuple(field for field in info["fields"] if field.lower() in columns)
+    named = (where or "").lower()
     return _Layer(
         name=name,
         crs=crs,
         indexed=info["capabilities"]["fast_spatial_filter"],
-        columns=tuple(field for field in info["fields"] if field.lower() in columns),
+        columns=read,
         where=where,
+        tested=tuple(field for field in info["fields"] if field not in read and field.lower() in named),
     )
 
 
@@ -208,6 +213,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     """Return a layer's features, or those that touch a square (m, in ``request.crs``), in ``request.crs``."""
     try:
         table = _read_square(request, version, layer, square)
+        table = table.drop(columns=list(layer.tested))
         if table.crs is None:
             table = table.set_crs(layer.crs)
         table = table.to_crs(request.crs)
@@ -251,7 +257,7 @@ def _read(request: Query, file: str, layer: _Layer, bbox: Bounds | None) -> Any:
         return pyogrio.read_dataframe(
             file,
             layer=layer.name,
-            columns=list(layer.columns),
+            columns=[*layer.columns, *layer.tested],
             where=layer.where,
             bbox=bbox,
             force_2d=True,

@@ -52,6 +52,15 @@ def test_burn_selects_features_by_layer_and_condition(tmp_path):
     assert not mask[:, 10:].any()
 
 
+@pytest.mark.parametrize("suffix", ["shp", "fgb", "geojson"])
+def test_burn_selects_features_by_any_column(suffix, tmp_path):
+    shapes = [box(400_000, 5_700_000, 400_010, 5_700_100), box(400_040, 5_700_000, 400_050, 5_700_100)]
+    path = write(tmp_path / f"a.{suffix}", shapes, surface=["gravel", "asphalt"])
+    mask = burn(path, None, "surface = 'asphalt'", GRID)
+    assert mask[:, 40:50].all()
+    assert mask.sum() == 1000
+
+
 def test_burn_raster_is_resampled_by_nearest_neighbour(tmp_path):
     path = tmp_path / "mask.tif"
     coarse = Grid(GRID.crs, GRID.west - 20, GRID.north + 20, 2.0, 80, 80)

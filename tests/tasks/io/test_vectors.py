@@ -7,6 +7,7 @@ import shapely
 
 from flexroad.tasks import TaskError, memory
 from flexroad.tasks.io.vectors import Query, has_place, read_near
+from tests.make_roads import write_osm
 
 CRS = "EPSG:25832"
 BOUNDS = (399_000.0, 5_699_000.0, 400_080.0, 5_700_100.0)
@@ -49,3 +50,30 @@ def test_has_place_looks_at_every_coordinate():
         True,
         True,
     ]
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "fgb", "geojson", "shp"])
+@pytest.mark.parametrize(
+    "where", ["kind = 'road'", "KIND = 'road'", "\"Kind\" LIKE 'ro%' AND lanes > 1", "lanes = 2 OR id = 7"]
+)
+def test_condition_may_name_columns_that_are_not_read(suffix, where, tmp_path):
+    shapes = [shapely.box(400_000 + x, 5_700_010, 400_005 + x, 5_700_020) for x in (0, 10, 20)]
+    columns = {"id": [1, 2, 3], "Kind": ["path", "road", None], "lanes": [1, 2, 3]}
+    path = tmp_path / f"a.{suffix}"
+    geopandas.GeoDataFrame(columns, geometry=shapes, crs=CRS).to_file(path)
+    table = read_near(Query(path, None, where, ("id",), None, CRS), BOUNDS)
+    assert list(table["id"]) == [2]
+    assert sorted(table.columns) == ["geometry", "id"]
+
+
+def test_condition_on_osm_file_may_name_columns_that_are_not_read(tmp_path):
+    ways = {"highway=path;man_made=pier": (7.56, 51.43), "highway=path": (7.57, 51.44)}
+    path = tmp_path / "map.osm"
+    write_osm(path, {tags: [place, (place[0] + 0.01, place[1])] for tags, place in ways.items()})
+
+    def read(where):
+        return read_near(Query(path, None, where, ("highway",), None, CRS), (0, 0, 1e7, 1e7))
+
+    assert len(read(None)) == 2
+    assert list(read("man_made = 'pier'")["highway"]) == ["path"]
+    assert list(read("man_made = 'pier'").columns) == list(read(None).columns)

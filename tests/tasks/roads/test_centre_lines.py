@@ -67,3 +67,15 @@ def test_read_centre_lines_equal_lines_of_two_files_are_one(tmp_path):
     paths = (write(tmp_path / "a.gpkg", [line, far]), write(tmp_path / "b.gpkg", [line, other]))
     found = read_centre_lines(Source("roads", paths), GRID.bounds, GRID.crs, Options())
     np.testing.assert_allclose([part.points[0] for part in found.lines], on_grid((10, 20), (10, 50)))
+
+
+@pytest.mark.parametrize("suffix", ["shp", "fgb"])
+def test_read_centre_lines_are_selected_by_any_column(suffix, tmp_path):
+    shapes = [shapely.LineString(on_grid((0, y), (90, y))) for y in (20, 60)]
+    path = write(tmp_path / f"a.{suffix}", shapes, surface=["gravel", "asphalt"])
+    found = read_centre_lines(
+        Source("roads", (path,)), GRID.bounds, GRID.crs, Options(where="surface = 'asphalt'")
+    )
+    assert [line.points.tolist() for line in found.lines] == [
+        [list(place) for place in on_grid((0, 60), (90, 60))]
+    ]
