@@ -76,6 +76,5 @@ def test_read_centre_lines_are_selected_by_any_column(suffix, tmp_path):
     found = read_centre_lines(
         Source("roads", (path,)), GRID.bounds, GRID.crs, Options(where="surface = 'asphalt'")
     )
-    assert [line.points.tolist() for line in found.lines] == [
-        [list(place) for place in on_grid((0, 60), (90, 60))]
-    ]
+    (line,) = found.lines
+    assert line.points.tolist() == [list(place) for place in on_grid((0, 60), (90, 60))]
