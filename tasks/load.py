@@ -24,7 +24,7 @@ from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
-VERSION = 3
+VERSION = 4
 
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES

@@ -20,8 +20,9 @@ from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.height_units import absurd_note, in_metres, smaller_unit_fault, with_unit
-from flexroad.tasks.io.raster import RasterWindow, fill_from, joined, misalignment, read_raster, read_window
+from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
+from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -125,14 +126,12 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     around : bool
         Whether the grid is ground around tiles: then it is not checked whether files have moved.
     """
-    values = np.full(grid.shape, np.nan)
     heights = layer.name in HEIGHTS
-    resampling = Resampling.bilinear if heights else Resampling.nearest
     files = _files(tile, layer)
-    warped: list[RasterWindow] = []
     read: list[tuple[SourceFile, RasterWindow]] = []
     left_out: list[tuple[SourceFile, Unusable]] = []
     absurd_cells = 0
+    coverage = Coverage(grid)
     for file in files:
         try:
             patch = _window(tile, layer, file, grid, core)
@@ -147,16 +146,10 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
         if patch is None:
             continue
         read.append((file, patch))
-        if patch.lattice.crs:
-            warped.append(patch)
-            continue
-        fill_from(patch, grid, values, resampling)
-        if not np.isnan(values).any():
+        if coverage.completed_by(patch):
             break
-    # After the files in the tile's CRS, which lose nothing.
-    for patch in joined(warped):
-        fill_from(patch, grid, values, resampling)
     patches = [patch for _, patch in read]
+    values = lay_heights(patches, grid) if heights else lay_classes(patches, grid)
     notes = _notes(layer, patches, grid)
     notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
     in_part = [(file, patch.fault) for file, patch in read if patch.fault]

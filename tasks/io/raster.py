@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -71,6 +72,8 @@ class RasterWindow:
     """Whether the file does not declare the unit."""
     step: int = 1
     """Number of cells of the file along an axis that were read as one."""
+    share: Floats | None = None
+    """Share of each cell read from several that the file has, ``(rows, cols)``; None if it has all."""
     unreadable: Bools | None = None
     """Cells that cannot be read, ``(rows, cols)``, because the file is damaged; None if all can."""
     fault: Unusable | None = None
@@ -154,7 +157,17 @@ def read_window(
         values, unreadable = reader(src, lattice, step, slices, resampling)
         shown, file_crs = lattice.cut(*slices).coarser(step), header(src).crs or crs
         unit = src.units[0] or ""
-        return RasterWindow(name, str(path), values, shown, unit, file_crs, step=step, unreadable=unreadable)
+        return RasterWindow(
+            name,
+            str(path),
+            values,
+            shown,
+            unit,
+            file_crs,
+            step=step,
+            share=_share(lattice.cut(*slices), step),
+            unreadable=unreadable,
+        )
 
     try:
         return read_raster(path, name, read, allowed, kept_raster, missing)
@@ -358,10 +371,15 @@ def _scale(ratio: float) -> float:
 
 
 def joined(patches: Sequence[RasterWindow]) -> list[RasterWindow]:
-    """Return the windows with those of one lattice in another CRS joined, so that no seam is interpolated.
+    """Return the windows with those of one lattice joined, so that no seam is interpolated.
 
     Where windows overlap, the first one with a value is used.
     """
+    return [_union(group) if len(group) > 1 else group[0] for group in same_lattice(patches)]
+
+
+def same_lattice(patches: Sequence[RasterWindow]) -> list[list[RasterWindow]]:
+    """Return the windows in groups of one lattice each, in the order of the first of each group."""
     groups: list[list[RasterWindow]] = []
     for patch in patches:
         group = next((g for g in groups if g[0].lattice.continues(patch.lattice)), None)
@@ -369,7 +387,7 @@ def joined(patches: Sequence[RasterWindow]) -> list[RasterWindow]:
             groups.append([patch])
         else:
             group.append(patch)
-    return [_union(group) if len(group) > 1 else group[0] for group in groups]
+    return groups
 
 
 def _union(group: Sequence[RasterWindow]) -> RasterWindow:
@@ -377,12 +395,17 @@ def _union(group: Sequence[RasterWindow]) -> RasterWindow:
     cells = [patch.lattice.cells_in(lattice) for patch in group]
     top, left = min(rows.start for rows, _ in cells), min(cols.start for _, cols in cells)
     bottom, right = max(rows.stop for rows, _ in cells), max(cols.stop for _, cols in cells)
-    values = np.full((bottom - top, right - left), np.nan)
+    total, share = np.zeros((2, bottom - top, right - left))
     for patch, (rows, cols) in zip(group, cells, strict=True):
-        part = values[rows.start - top : rows.stop - top, cols.start - left : cols.stop - left]
-        np.copyto(part, patch.values, where=np.isnan(part))
+        part = slice(rows.start - top, rows.stop - top), slice(cols.start - left, cols.stop - left)
+        more = np.where(np.isnan(patch.values), 0.0, 1.0 if patch.share is None else patch.share)
+        more[share[part] + more > 1 + EXACT] = 0
+        total[part] += more * np.nan_to_num(patch.values)
+        share[part] += more
+    values = np.divide(total, share, out=np.full(total.shape, np.nan), where=share > 0)
     whole = lattice.cut(slice(top, bottom), slice(left, right))
-    return replace(group[0], values=values, lattice=whole)
+    complete = all(patch.share is None for patch in group)
+    return replace(group[0], values=values, lattice=whole, share=None if complete else share)
 
 
 def misalignment(lattice: RasterGrid, grid: Grid) -> str:
@@ -398,6 +421,18 @@ def misalignment(lattice: RasterGrid, grid: Grid) -> str:
         return f"its cells are {cells}, the tile's {grid.cell:.6g} m"
     east, north = lattice.offset(grid)
     return f"its lattice is off by ({east:.2f}, {north:.2f}) m"
+
+
+def _share(lattice: RasterGrid, step: int) -> Floats | None:
+    """Return the share of each step that a part of a file has; see `RasterWindow.share`."""
+    first, counts = lattice.before(step), (lattice.height, lattice.width)
+    if not any(first) and not any(count % step for count in counts):
+        return None
+    rows, cols = (
+        np.bincount((np.arange(count) + before) // step) / step
+        for before, count in zip(first, counts, strict=True)
+    )
+    return np.outer(rows, cols)
 
 
 def all_cells(
@@ -427,7 +462,8 @@ def readable_cells(
     except ERRORS:
         axis, halves = _halves(src, lattice, step, slices)
     if not halves:
-        shape = tuple(-(-(part.stop - part.start) // step) for part in slices)
+        coarse = lattice.cut(*slices).coarser(step)
+        shape = coarse.height, coarse.width
         return np.full(shape, np.nan), np.ones(shape, np.bool_)
     read = [readable_cells(src, lattice, step, half, resampling) for half in halves]
     values, unreadable = (np.concatenate(parts, axis) for parts in zip(*read, strict=True))
@@ -438,9 +474,10 @@ def _halves(src: Any, lattice: RasterGrid, step: int, slices: Slices) -> tuple[i
     """Return the axis along which a window is halved, and its halves; none if it is within one block."""
     rows, cols = slices
     tall, wide = src.block_shapes[0]
+    above, left = lattice.before(step)
     # Blocks are counted from the first row of the file, which may be the southern one.
-    row = _border(rows, tall, lattice.height % tall if lattice.northward else 0, step)
-    col = _border(cols, wide, 0, step)
+    row = _border(rows, tall, lattice.height % tall if lattice.northward else 0, step, above)
+    col = _border(cols, wide, 0, step, left)
     if row and (not col or (rows.stop - rows.start) * wide >= (cols.stop - cols.start) * tall):
         return 0, [(slice(rows.start, row), cols), (slice(row, rows.stop), cols)]
     if col:
@@ -448,26 +485,28 @@ def _halves(src: Any, lattice: RasterGrid, step: int, slices: Slices) -> tuple[i
     return 0, []
 
 
-def _border(part: slice, block: int, first: int, step: int) -> int:
+def _border(part: slice, block: int, first: int, step: int, before: int) -> int:
     """Return the border of blocks, in whole steps, that is nearest to the middle of a slice; 0 if none."""
     middle = (part.start + part.stop) / 2
-    border = (first + round((middle - first) / block) * block) // step * step
+    border = (first + round((middle - first) / block) * block + before) // step * step - before
     return border if part.start < border < part.stop else 0
 
 
 def _cells(src: Any, lattice: RasterGrid, step: int, slices: Slices, resampling: Resampling) -> Floats:
     """Return the cells of a window, ``step`` x ``step`` of them as one; rows from the north."""
-    tall, wide = ([part for part in _whole_and_rest(part, step) if part] for part in slices)
+    first = lattice.before(step)
+    tall, wide = (_steps(part, step, before) for part, before in zip(slices, first, strict=True))
     if len(tall) == len(wide) == 1:
         return _part(src, lattice, step, tall[0], wide[0], resampling)
     return np.block([[_part(src, lattice, step, rows, cols, resampling) for cols in wide] for rows in tall])
 
 
-def _whole_and_rest(part: slice, step: int) -> tuple[slice | None, slice | None]:
-    """Return the whole steps of a slice, and the last step if it has fewer cells, at the end of the file."""
-    end = part.stop - (part.stop - part.start) % step
-    whole, rest = slice(part.start, end), slice(end, part.stop)
-    return (whole if whole.stop > whole.start else None), (rest if rest.stop > rest.start else None)
+def _steps(part: slice, step: int, before: int) -> list[slice]:
+    """Return the complete steps of a slice, and those with fewer cells at the ends of the file."""
+    start = min(part.stop, -(-(part.start + before) // step) * step - before)
+    stop = max(start, (part.stop + before) // step * step - before)
+    edges = part.start, start, stop, part.stop
+    return [slice(a, b) for a, b in itertools.pairwise(edges) if a < b]
 
 
 def _part(

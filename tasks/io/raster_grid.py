@@ -13,6 +13,10 @@ from flexroad.catalog.crs import bounds_in, scales, transformer
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Bounds, Grid
 from flexroad.tasks.types import Bools, Floats
 
+SHIFT = 0.28713
+"""Added to positions in cells before they are rounded down: a lattice with a common offset, such as half a
+cell, would be rounded differently from file to file."""
+
 
 @dataclass(frozen=True)
 class RasterGrid:
@@ -109,32 +113,53 @@ class RasterGrid:
             x, y = transformer(grid.crs, self.crs).transform(x, y)
         return x, y
 
-    def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
-        """Return the slices grown to steps that are counted from the file's corner.
+    def before(self, step: int) -> tuple[int, int]:
+        """Return the numbers of rows and columns between the start of the first step and this lattice.
 
-        Cells are then read together in the same way in every window.
+        Steps are counted from the origin of the coordinates, so that cells are read together in the same way
+        in every window and in all files of one lattice.
         """
-        grown = (slice(part.start // step * step, -(-part.stop // step) * step) for part in (rows, cols))
+        row, col = SHIFT - self.north / self.dy, SHIFT + self.west / self.dx
+        return math.floor(row) % step, math.floor(col) % step
+
+    def whole_steps(self, step: int, rows: slice, cols: slice) -> tuple[slice, slice]:
+        """Return the slices grown to complete steps, as far as the lattice has cells."""
+        grown = (
+            slice(
+                max(0, (part.start + first) // step * step - first),
+                min(count, -(-(part.stop + first) // step) * step - first),
+            )
+            for part, first, count in zip(
+                (rows, cols), self.before(step), (self.height, self.width), strict=True
+            )
+        )
         tall, wide = grown
-        return slice(tall.start, min(tall.stop, self.height)), slice(wide.start, min(wide.stop, self.width))
+        return tall, wide
 
     def coarser(self, step: int) -> RasterGrid:
-        """Return the lattice of cells read together; a last step with fewer cells counts as complete."""
-        width, height = -(-self.width // step), -(-self.height // step)
+        """Return the lattice of cells read together; steps with fewer cells count as complete."""
+        above, left = self.before(step)
         return replace(
-            self, dx=self.dx * step, dy=self.dy * step, width=width, height=height, northward=False
+            self,
+            west=self.west - left * self.dx,
+            north=self.north + above * self.dy,
+            dx=self.dx * step,
+            dy=self.dy * step,
+            width=-(-(self.width + left) // step),
+            height=-(-(self.height + above) // step),
+            northward=False,
         )
 
     def continues(self, other: RasterGrid) -> bool:
-        """Return whether two lattices in the same other CRS are parts of one lattice."""
-        if not self.crs or (self.crs, self.northward) != (other.crs, other.northward):
+        """Return whether two lattices are parts of one: the corners of the other are corners of cells."""
+        if (self.crs, self.northward) != (other.crs, other.northward):
             return False
-        if not (
-            math.isclose(self.dx, other.dx, rel_tol=1e-9) and math.isclose(self.dy, other.dy, rel_tol=1e-9)
-        ):
-            return False
-        col, row = (other.west - self.west) / self.dx, (self.north - other.north) / self.dy
-        return max(abs(col - round(col)), abs(row - round(row))) < LATTICE_TOLERANCE
+        west, south, east, north = other.bounds
+        left, right = (west - self.west) / self.dx, (east - self.west) / self.dx
+        top, bottom = (self.north - north) / self.dy, (self.north - south) / self.dy
+        off = max(abs(edge - round(edge)) for edge in (left, right, top, bottom))
+        count = round(right) - round(left), round(bottom) - round(top)
+        return off < LATTICE_TOLERANCE and count == (other.width, other.height)
 
     def cells_in(self, other: RasterGrid) -> tuple[slice, slice]:
         """Return the (row, col) slices of this lattice in another one that it continues; may be negative."""

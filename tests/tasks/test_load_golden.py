@@ -10,8 +10,8 @@ from flexroad.tasks.segment import mask
 from tests.make_rasters import UTM, write
 
 PINNED = {
-    "versions": (3, 1),
-    "dsm": (1391, 120.005974, 52.134174),
+    "versions": (4, 1),
+    "dsm": (1391, 120.006118, 52.134236),
     "dtm": (699, 118.97161, 19.40491),
     "road": (756, 626481),
     "outside": (108, 101912),

@@ -1,0 +1,174 @@
+"""Files of one layer laid on a grid together, so that no cell at a file's border lacks its neighbours.
+
+Interpolation takes the cells around a place, and at the border of a file some of them are in the next file.
+Files of one lattice are joined. Beside files of other lattices a file is extended by the cells that
+interpolation needs, with heights interpolated in those files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+
+from flexroad.catalog.crs import transformer
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.io.raster import EXACT, RasterWindow, fill_from, joined, resample_to, same_lattice
+from flexroad.tasks.io.raster_grid import RasterGrid
+from flexroad.tasks.types import Bools, Floats
+
+
+class Coverage:
+    """Whether files in a grid's CRS have a value in each of its cells, so that no further file is needed."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._missing = np.ones(grid.shape, np.bool_)
+        self._unchecked: list[RasterWindow] = []
+        self._most_cells = 0.0
+
+    def completed_by(self, patch: RasterWindow) -> bool:
+        """Add a file; return whether all cells have a value now. Files in another CRS do not count."""
+        if patch.lattice.crs:
+            return False
+        grid = self._grid
+        west, south, east, north = patch.lattice.bounds
+        width = min(east, grid.bounds[2]) - max(west, grid.bounds[0])
+        height = min(north, grid.bounds[3]) - max(south, grid.bounds[1])
+        self._most_cells += max(width, 0.0) * max(height, 0.0) / grid.cell**2
+        self._unchecked.append(patch)
+        # Cells are compared only if the areas of the files suffice.
+        if self._most_cells < 0.999 * self._missing.size:
+            return False
+        while self._unchecked:
+            self._missing &= ~_covered(self._unchecked.pop(), grid)
+        return not self._missing.any()
+
+
+def lay_classes(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
+    """Return the parts of files of classes on a grid's cells; see `lay_heights`."""
+    return _filled(sorted(patches, key=_is_warped), grid, Resampling.nearest)
+
+
+def lay_heights(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
+    """Return the parts of files of heights on a grid's cells, ``(H, W)``; NaN where none has a value.
+
+    Where files overlap, the first one with a value is used, those in the grid's CRS before others, which lose
+    by the transformation.
+    """
+    ordered = sorted(patches, key=_is_warped)
+    fitting = [patch for patch in ordered if patch.lattice.fits(grid)]
+    loose = [patch for patch in ordered if not patch.lattice.fits(grid)]
+    groups = same_lattice(loose)
+    if not loose or (len(groups) == 1 and not fitting):
+        return _filled(fitting or joined(loose), grid, Resampling.bilinear)
+    if fitting:
+        groups.insert(0, fitting)
+    values = np.full(grid.shape, np.nan)
+    laid = _resampled_together(groups, grid)
+    of_group = {id(patch): heights for group, heights in zip(groups, laid, strict=True) for patch in group}
+    for patch in ordered:
+        np.copyto(values, of_group[id(patch)], where=np.isnan(values) & _covered(patch, grid))
+    return values
+
+
+def _covered(patch: RasterWindow, grid: Grid) -> Bools:
+    """Return the cells of a grid whose centres lie in cells of a file with a value, ``(H, W)``."""
+    return ~np.isnan(resample_to(patch, grid, Resampling.nearest))
+
+
+def _is_warped(patch: RasterWindow) -> bool:
+    return bool(patch.lattice.crs)
+
+
+def _filled(parts: Sequence[RasterWindow], grid: Grid, resampling: Resampling) -> Floats:
+    values = np.full(grid.shape, np.nan)
+    for part in parts:
+        fill_from(part, grid, values, resampling)
+    return values
+
+
+def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) -> list[Floats]:
+    """Return each group of files of one lattice on a grid's cells, interpolated with the other groups."""
+    sheets = [_on_grid(group, grid) if group[0].lattice.fits(grid) else joined(group)[0] for group in groups]
+    # The mean of a step with fewer cells is off its centre: heights of other files go before.
+    known = [_complete_steps(sheet) for sheet in sheets]
+    # The coarsest first: its cells beyond its border are farthest from the borders of the others, and these
+    # then interpolate up to their own borders.
+    for number in sorted(range(len(sheets)), key=lambda number: -_cell_m2(sheets[number].lattice, grid)):
+        if not sheets[number].lattice.fits(grid):
+            others = [*known[:number], *known[number + 1 :]]
+            known[number] = _extended(known[number], sheets[number], others, grid)
+    return [resample_to(sheet, grid, Resampling.bilinear) for sheet in known]
+
+
+def _on_grid(group: Sequence[RasterWindow], grid: Grid) -> RasterWindow:
+    """Return the files whose cells coincide with a grid's as one window of it."""
+    values = _filled(group, grid, Resampling.bilinear)
+    lattice = RasterGrid(grid.west, grid.north, grid.cell, grid.cell, grid.width, grid.height)
+    return replace(group[0], values=values, lattice=lattice)
+
+
+def _complete_steps(patch: RasterWindow) -> RasterWindow:
+    """Return a window of which the cells read together from fewer cells of the file have no value."""
+    if patch.share is None:
+        return patch
+    return replace(patch, values=np.where(patch.share < 1 - EXACT, np.nan, patch.values))
+
+
+def _cell_m2(lattice: RasterGrid, grid: Grid) -> float:
+    """Return the area of a cell of a lattice, in cells of a grid."""
+    across, along = lattice.cell_of(grid)
+    return lattice.dx / across * lattice.dy / along
+
+
+def _extended(
+    known: RasterWindow, sheet: RasterWindow, others: Sequence[RasterWindow], grid: Grid
+) -> RasterWindow:
+    """Return a sheet with the cells around it, and those without a value, interpolated in other sheets.
+
+    Parameters
+    ----------
+    known : RasterWindow
+        The sheet, with NaN where heights of others are to be preferred.
+    """
+    lattice = sheet.lattice
+    across, along = lattice.cell_of(grid)
+    reach = 1 + math.ceil(max(across / lattice.dx, along / lattice.dy))
+    wide = lattice.cut(slice(-reach, lattice.height + reach), slice(-reach, lattice.width + reach))
+    values = np.pad(known.values, reach, constant_values=np.nan)
+    for other in others:
+        rows, cols = np.nonzero(np.isnan(values))
+        x, y = wide.west + (cols + 0.5) * wide.dx, wide.north - (rows + 0.5) * wide.dy
+        if lattice.crs != other.lattice.crs:
+            x, y = transformer(lattice.crs or grid.crs, other.lattice.crs or grid.crs).transform(x, y)
+        values[rows, cols] = _heights_at(other, x, y)
+    own = np.pad(sheet.values, reach, constant_values=np.nan)
+    return replace(sheet, values=np.where(np.isnan(values), own, values), lattice=wide)
+
+
+def _heights_at(sheet: RasterWindow, x: NDArray[np.floating], y: NDArray[np.floating]) -> Floats:
+    """Return bilinear heights at places, ``(n,)``; NaN where the cell there has no value.
+
+    As in `resample_to`, cells without a value have no weight.
+    """
+    lattice = sheet.lattice
+    col, row = (x - lattice.west) / lattice.dx, (lattice.north - y) / lattice.dy
+    padded = np.pad(sheet.values, 1, constant_values=np.nan)
+    inside = (col >= 0) & (col < lattice.width) & (row >= 0) & (row < lattice.height)
+    col, row = np.where(inside, col, 0.0), np.where(inside, row, 0.0)
+    inside &= ~np.isnan(sheet.values[row.astype(np.intp), col.astype(np.intp)])
+    left, top = np.floor(col + 0.5).astype(np.intp), np.floor(row + 0.5).astype(np.intp)
+    right, below = col + 0.5 - left, row + 0.5 - top
+    total, weights = np.zeros(len(x)), np.zeros(len(x))
+    for down in (0, 1):
+        for over in (0, 1):
+            height = padded[top + down, left + over]
+            weight = np.where(down, below, 1 - below) * np.where(over, right, 1 - right) * ~np.isnan(height)
+            total += weight * np.nan_to_num(height)
+            weights += weight
+    return np.where(inside, total / np.where(inside, weights, 1.0), np.nan)
