@@ -19,6 +19,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES
 from flexroad.pipeline.graph.layers import fitting_config
 from flexroad.pipeline.prepare.options import MIN_COVER_HELP
 
@@ -31,14 +32,14 @@ Output = Annotated[
         "--output",
         metavar="FILE",
         help="Catalog to write: .parquet, .json or .geojson.",
-        rich_help_panel=options.OUTPUTS,
+        rich_help_panel=OUTPUTS,
     ),
 ]
 
 
 def _files(meaning: str, metavar: str = "PATTERN") -> Any:
     """Return an option that names input files."""
-    return typer.Option(metavar=metavar, help=meaning, rich_help_panel=options.INPUTS)
+    return typer.Option(metavar=metavar, help=meaning, rich_help_panel=INPUTS)
 
 
 RoadMask = Annotated[str | None, _files("Files of the road mask or land cover.")]
@@ -53,7 +54,7 @@ Reproject = Annotated[
     typer.Option(
         "--reproject",
         help="Warp rasters in another CRS or in feet when they are read.",
-        rich_help_panel=options.INPUTS,
+        rich_help_panel=INPUTS,
     ),
 ]
 Date = Annotated[
@@ -61,11 +62,11 @@ Date = Annotated[
     typer.Option(
         metavar="YYYY-MM-DD",
         help="Date of the survey; default: that of the files.",
-        rich_help_panel=options.INPUTS,
+        rich_help_panel=INPUTS,
     ),
 ]
 TileSize = Annotated[
-    float, typer.Option(metavar="METRES", help="Size of a tile in m.", rich_help_panel=options.TILES)
+    float, typer.Option(metavar="METRES", help="Size of a tile in m.", rich_help_panel=TILES)
 ]
 MinCover = Annotated[
     float,
@@ -74,7 +75,7 @@ MinCover = Annotated[
         max=1,
         metavar="SHARE",
         help=MIN_COVER_HELP,
-        rich_help_panel=options.TILES,
+        rich_help_panel=TILES,
     ),
 ]
 Strict = Annotated[
@@ -82,7 +83,7 @@ Strict = Annotated[
     typer.Option(
         "--strict",
         help="Write no catalog if a file cannot be used; default: leave it out, with exit code 1.",
-        rich_help_panel=options.OUTPUTS,
+        rich_help_panel=OUTPUTS,
     ),
 ]
 Layout = Annotated[str, _files("Configuration whose `dataset` gives the file names.", "NAME|FILE")]
@@ -109,14 +110,14 @@ def catalog_rasters(
         typer.Option(
             metavar="CRS",
             help="CRS of the tiles, with --reproject; default: the DSM's.",
-            rich_help_panel=options.TILES,
+            rich_help_panel=TILES,
         ),
     ] = None,
     height_unit: Annotated[
         Literal["metre", "foot", "us-foot"] | None,
         typer.Option(
             help="Unit of heights if a file has none; default: metre, or that of the plan.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     date: Date = None,
@@ -283,7 +284,7 @@ def catalog_check(
         typer.Option(
             metavar="NAME|FILE",
             help="Configuration of the run; default: the one that fits the layers.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     allow: options.Allow = None,

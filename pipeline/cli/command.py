@@ -9,7 +9,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from flexroad.pipeline.cli.options import HEADINGS
+from flexroad.pipeline.config.options import HEADINGS
 
 OTHERS = "Options"
 RANGES = (

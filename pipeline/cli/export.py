@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,6 +17,7 @@ from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.lifecycle import INTERRUPTED, signals_interrupt
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export.driver import check_formats
@@ -27,6 +29,7 @@ app = group()
 
 
 @app.command(cls=Command)
+@options.with_options
 def export(
     path: options.Run,
     formats: Annotated[
@@ -36,30 +39,23 @@ def export(
             metavar="NAME",
             help="Formats, separated by commas: 3dtiles, landxml, cityjson, obj, heightfield, step, 3dm, "
             "crg, xodr, lines, mosaic, pmtiles.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="FOLDER", help="Output folder.", rich_help_panel=options.OUTPUTS
-        ),
-    ],
-    compress: Annotated[
-        bool, typer.Option("--gzip", help="Compress LandXML.", rich_help_panel=options.OUTPUTS)
-    ] = False,
+    output: options.OutputFolder,
+    *,
     vertical: Annotated[
         str | None,
         typer.Option(
             metavar="CRS",
             help="Vertical CRS of the run's heights, for 3dtiles.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     geoid: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Geoid of the heights (.gtx, .tif), instead.", rich_help_panel=options.INPUTS
+            metavar="FILE", help="Geoid of the heights (.gtx, .tif), instead.", rich_help_panel=INPUTS
         ),
     ] = None,
     height_offset: Annotated[
@@ -67,51 +63,10 @@ def export(
         typer.Option(
             metavar="METRES",
             help="Height of the vertical datum above the ellipsoid, instead.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
-    nodes: Annotated[
-        Literal["power", "unreal"],
-        typer.Option(
-            help="Sizes of heightfield. power: 2^n + 1 nodes a side; unreal: those of Unreal Engine.",
-            rich_help_panel=options.OUTPUTS,
-        ),
-    ] = "power",
-    resolution: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01,
-            metavar="METRES",
-            help="Cell size of mosaic and pmtiles; default: that of the run.",
-            rich_help_panel=options.OUTPUTS,
-        ),
-    ] = None,
-    drape: Annotated[
-        bool,
-        typer.Option(
-            "--drape",
-            help="Put the orthophoto on the meshes of 3dtiles and obj.",
-            rich_help_panel=options.OUTPUTS,
-        ),
-    ] = False,
-    roads: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
-            rich_help_panel=options.INPUTS,
-        ),
-    ] = None,
-    roads_layer: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layer of --roads, if it has several.", rich_help_panel=options.INPUTS
-        ),
-    ] = None,
-    left_hand: Annotated[
-        bool,
-        typer.Option("--left-hand", help="Traffic keeps left, for xodr.", rich_help_panel=options.INPUTS),
-    ] = False,
+    chosen: Options,
     tile: options.TileIds = None,
     bbox: options.Box = None,
     area: options.Area = None,
@@ -124,11 +79,9 @@ def export(
 
     The same command goes on after an interruption. FOLDER/export.json says what was written.
     """
-    datum = _datum(vertical, geoid, height_offset)
-    if roads_layer and not roads:
+    chosen = replace(chosen, datum=_datum(vertical, geoid, height_offset))
+    if chosen.roads_layer and not chosen.roads:
         raise ConfigError("--roads-layer needs --roads; of the catalog, the layer is known")
-    lines = None if roads is None else str(roads)
-    chosen = Options(datum, compress, resolution, nodes, drape, lines, roads_layer, left_hand)
     folder = parse_location(output)
     names = [name.strip() for name in formats.split(",") if name.strip()]
     check_formats(names, chosen)

@@ -1,35 +1,25 @@
-"""Options that several commands share, and the headings under which help pages list options."""
+"""Options that several commands share, and options that are made of the fields of dataclasses."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
-INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
-METHOD, VALIDATION = "Method", "Split into training and validation"
-GROUND, RASTERS, RECONSTRUCTION = "Ground", "Rasters", "Reconstruction"
-WORK, ALARMS = "Parallel work", "Alarms and monitoring"
-HEADINGS = (
-    INPUTS,
-    METHOD,
-    VALIDATION,
-    RECONSTRUCTION,
-    GROUND,
-    RASTERS,
-    TILES,
-    OUTPUTS,
-    WORK,
-    ALARMS,
-)
-"""In the order of a help page."""
-
+from flexroad.pipeline.config.options import ALARMS, INPUTS, OUTPUTS, TILES, WORK
 
 ON_FAILURE = "FLEXROAD_ON_FAILURE"
 """Environment variable for `--on-failure`: options are visible in the list of processes, it is not."""
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run, or its address (s3://...).")]
+OutputFolder = Annotated[
+    Path, typer.Option("-o", "--output", metavar="FOLDER", help="Output folder.", rich_help_panel=OUTPUTS)
+]
 CatalogFile = Annotated[Path, typer.Argument(metavar="CATALOG", help="Catalog of tiles.")]
 Allow = Annotated[
     list[str] | None,
@@ -134,3 +124,58 @@ WorkerSettings = Annotated[
         rich_help_panel=WORK,
     ),
 ]
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command take the fields of its dataclasses as options, and receive the dataclasses.
+
+    Options are the fields made by `pipeline.config.options.option`; of a parameter that is
+    ``Annotated[Kind, "name", ...]``, only those of these names.
+    """
+    parameters: list[inspect.Parameter] = []
+    taken: dict[str, tuple[Any, dict[str, inspect.Parameter]]] = {}
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        annotation = parameter.annotation
+        kind, *names = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
+        if is_dataclass(kind):
+            own = {name: option for name, option in _options(kind) if not names or name in names}
+            taken[parameter.name] = kind, own
+            parameters += own.values()
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def wrapper(**values: Any) -> None:
+        for parameter, (kind, own) in taken.items():
+            given = {name: values.pop(option.name) for name, option in own.items()}
+            inverted = {name: not given[name] for name, option in own.items() if option.name != name}
+            values[parameter] = kind(**{**given, **inverted})
+        command(**values)
+
+    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    # Otherwise Typer reads the signature of the wrapped function.
+    del wrapper.__wrapped__
+    return wrapper
+
+
+def _options(kind: Any) -> Iterator[tuple[str, inspect.Parameter]]:
+    """Yield the fields that are options with their parameters, named ``no_...`` if they are inverted."""
+    kinds = get_type_hints(kind)
+    for field in fields(kind):
+        if not field.metadata:
+            continue
+        more, name, default = dict(field.metadata), field.name, field.default
+        word = more.pop("name", name.removesuffix("_m").replace("_", "-"))
+        if default is True:
+            name, word, default = f"no_{name}", f"no-{word}", False
+        option = typer.Option(f"--{word}", rich_help_panel=more.pop("heading"), **more)
+        yield (
+            field.name,
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if default is MISSING else default,
+                annotation=Annotated[kinds[field.name], option],
+            ),
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,25 +17,11 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.next_step import after_catalog
-from flexroad.pipeline.cli.prepare_options import (
-    Density,
-    Fill,
-    NoDop,
-    NoRefine,
-    Offset,
-    Out,
-    Radius,
-    Seed,
-    Slope,
-    Up,
-    Void,
-    with_common,
-)
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.options import GROUND, RASTERS, RECONSTRUCTION, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, Executor, SerialExecutor
 from flexroad.pipeline.prepare import mesh, odm, photos, points
-from flexroad.pipeline.prepare import mesh as meshes
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.pipeline.prepare.output import check_replaced, disk_errors
 from flexroad.pipeline.prepare.raster_writer import PreparedDataset
@@ -47,16 +34,35 @@ from flexroad.tasks.errors import TaskError
 app = group("prepare", "Make rasters and a catalog of points, meshes or photographs.")
 
 
-def _points_options(
-    slope: float | None, radius: float | None, fill: float | None, void: float | None, **more: Any
-) -> Options:
-    """Return the options for making rasters of points; None keeps a default."""
-    given = _given(slope=slope, radius_m=radius)
-    if more.get("ground") == "morphological":
-        more["morphological"] = morphological.Options(**given)
-    else:
-        more["filter"] = ground_filter.Options(**given)
-    return Options(**_given(fill_m=fill, void_m=void, **more))
+@dataclass(frozen=True)
+class _RasterOptions:
+    """How points become rasters, as far as all commands have it; None keeps the default of the method."""
+
+    slope: float | None = option(
+        None,
+        GROUND,
+        "Ground filter: steepest slope of the ground; 0.35 is 35 %, the slope filter's default.",
+        "NUMBER",
+        min=0,
+    )
+    radius_m: float | None = option(
+        None, GROUND, "Ground filter: search radius in m, half the widest roof.", "METRES", min=1
+    )
+    fill_m: float | None = option(
+        None, RASTERS, "Fill voids of the DSM up to this width in m.", "METRES", min=0
+    )
+    void_m: float | None = option(
+        None, RASTERS, "Fill voids of the DTM up to this width in m.", "METRES", min=0
+    )
+
+    def of(self, **more: Any) -> Options:
+        """Return the options for making rasters, with more of them; None keeps a default."""
+        given = _given(slope=self.slope, radius_m=self.radius_m)
+        if more.get("ground") == "morphological":
+            more["morphological"] = morphological.Options(**given)
+        else:
+            more["filter"] = ground_filter.Options(**given)
+        return Options(**_given(fill_m=self.fill_m, void_m=self.void_m, **more))
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -102,69 +108,63 @@ def _run(out: Path, make: Callable[[], PreparedDataset]) -> None:
 
 
 @app.command("points", cls=Command)
-@with_common
+@options.with_options
 def prepare_points(
-    common: PrepareOptions,
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE", help="LAS, LAZ or COPC files, or folders of them.")
     ],
-    output: Out,
+    output: options.OutputFolder,
+    *,
     ground: Annotated[
         Literal["auto", "classes", "filter", "morphological"],
         typer.Option(
-            rich_help_panel=options.GROUND,
+            rich_help_panel=GROUND,
             help="How ground is identified; auto: by classes if all files have them, else by filter.",
         ),
     ] = "auto",
     ground_class: Annotated[
         list[int] | None,
-        typer.Option(metavar="N", rich_help_panel=options.GROUND, help="Classes of ground; default: 2."),
+        typer.Option(metavar="N", rich_help_panel=GROUND, help="Classes of ground; default: 2."),
     ] = None,
     bridge_class: Annotated[
         list[int] | None,
         typer.Option(
             metavar="N",
-            rich_help_panel=options.GROUND,
+            rich_help_panel=GROUND,
             help="Classes of bridge decks; default: those of --class-scheme.",
         ),
     ] = None,
     class_scheme: Annotated[
         Literal["asprs", "ahn"],
         typer.Option(
-            rich_help_panel=options.GROUND,
+            rich_help_panel=GROUND,
             help="Meaning of the classes: bridges are 17 in asprs, 26 in the Dutch AHN.",
         ),
     ] = "asprs",
     dtm: Annotated[
         Literal["tin", "mean"] | None,
         typer.Option(
-            rich_help_panel=options.RASTERS, help="DTM: linear between ground points, or their mean per cell."
+            rich_help_panel=RASTERS, help="DTM: linear between ground points, or their mean per cell."
         ),
     ] = None,
-    slope: Slope = None,
-    radius: Radius = None,
+    rasters: _RasterOptions,
     despike: Annotated[
         float | None,
         typer.Option(
             min=0.1,
             metavar="METRES",
-            rich_help_panel=options.GROUND,
+            rich_help_panel=GROUND,
             help="Drop single points that are this much above all around (m).",
         ),
     ] = None,
-    fill: Fill = None,
-    void: Void = None,
     workers: options.Workers = None,
+    common: PrepareOptions,
 ) -> None:
     """Make rasters of laser scans and other point clouds.
 
     They are DSM, DTM, bridge decks and orthophoto.
     """
-    options = _points_options(
-        slope,
-        radius,
-        fill,
-        void,
+    options = rasters.of(
         despike_m=despike,
         dtm=dtm,
         ground=ground if ground == "morphological" else None,
@@ -178,57 +178,45 @@ def prepare_points(
 
 
 @app.command("mesh", cls=Command)
-@with_common
+@options.with_options
 def prepare_mesh(
-    common: PrepareOptions,
-    mesh: Annotated[
+    file: Annotated[
         Path, typer.Argument(metavar="MESH", help="OBJ, PLY or glTF with textures or coloured vertices.")
     ],
-    output: Out,
-    up: Up = None,
-    offset: Offset = None,
-    density: Density = 25.0,
-    seed: Seed = 0,
-    no_dop: NoDop = False,
-    no_refine: NoRefine = False,
-    slope: Slope = None,
-    radius: Radius = None,
-    fill: Fill = None,
-    void: Void = None,
+    output: options.OutputFolder,
+    mesh_options: mesh.MeshOptions,
+    rasters: _RasterOptions,
+    *,
     workers: options.Workers = None,
+    common: PrepareOptions,
 ) -> None:
     """Make rasters of a textured mesh, as in the paper.
 
     They are made from sampled points, and from its texture seen from above.
     """
-    mesh_options = meshes.MeshOptions(up, offset, density, seed, dop=not no_dop, refine=not no_refine)
-    options = _points_options(slope, radius, fill, void, ground="filter")
+    options = rasters.of(ground="filter")
     _run(
         output,
-        lambda: meshes.prepare_mesh(mesh, output, common, mesh_options, options, _executor(workers), _log),
+        lambda: mesh.prepare_mesh(file, output, common, mesh_options, options, _executor(workers), _log),
     )
 
 
 @app.command("odm", cls=Command)
-@with_common
+@options.with_options
 def prepare_odm(
-    common: PrepareOptions,
     project: Annotated[Path, typer.Argument(metavar="PROJECT", help="Project folder of OpenDroneMap.")],
-    output: Out,
-    density: Density = 25.0,
-    seed: Seed = 0,
-    slope: Slope = None,
-    radius: Radius = None,
-    fill: Fill = None,
-    void: Void = None,
+    output: options.OutputFolder,
+    mesh_options: Annotated[mesh.MeshOptions, "density", "seed"],
+    rasters: _RasterOptions,
+    *,
     workers: options.Workers = None,
+    common: PrepareOptions,
 ) -> None:
     """Take or make the rasters of an OpenDroneMap project.
 
     Its own rasters are taken, else they are made of its textured mesh, else of its points.
     """
-    mesh_options = mesh.MeshOptions(density=density, seed=seed)
-    options = _points_options(slope, radius, fill, void, ground="filter")
+    options = rasters.of(ground="filter")
     _run(
         output,
         lambda: odm.prepare_odm(project, output, common, mesh_options, options, _executor(workers), _log),
@@ -236,34 +224,22 @@ def prepare_odm(
 
 
 @app.command("photos", cls=Command)
-@with_common
+@options.with_options
 def prepare_photos(
-    common: PrepareOptions,
     images: Annotated[
         list[Path],
         typer.Argument(metavar="IMAGE", help="Overlapping photographs with GNSS tags, or folders."),
     ],
-    output: Out,
-    control: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            rich_help_panel=options.INPUTS,
-            help="Ground control, CSV: image,x_px,y_px,easting,northing,height.",
-        ),
-    ] = None,
-    control_crs: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CRS", rich_help_panel=options.INPUTS, help="CRS of the control; default: the rasters'."
-        ),
-    ] = None,
+    output: options.OutputFolder,
+    photos_options: photos.PhotosOptions,
+    rasters: _RasterOptions,
+    *,
     image_size: Annotated[
         int | None,
         typer.Option(
             min=320,
             metavar="N",
-            rich_help_panel=options.RECONSTRUCTION,
+            rich_help_panel=RECONSTRUCTION,
             help="Longest side of images for feature detection, in pixels.",
         ),
     ] = None,
@@ -272,34 +248,28 @@ def prepare_photos(
         typer.Option(
             min=320,
             metavar="N",
-            rich_help_panel=options.RECONSTRUCTION,
+            rich_help_panel=RECONSTRUCTION,
             help="Longest side of images for dense stereo, in pixels.",
         ),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", rich_help_panel=options.RECONSTRUCTION, help="Random seed."),
+        typer.Option(min=0, metavar="N", rich_help_panel=RECONSTRUCTION, help="Random seed."),
     ] = None,
-    no_refine: NoRefine = False,
-    slope: Slope = None,
-    radius: Radius = None,
-    fill: Fill = None,
-    void: Void = None,
     workers: options.Workers = None,
+    common: PrepareOptions,
 ) -> None:
     """Reconstruct an area from overlapping photographs.
 
     The steps are cameras, dense stereo, a Poisson mesh, and rasters as with `mesh`.
     """
-    photos_options = photos.PhotosOptions(
-        control,
-        control_crs,
-        sfm.Options(**_given(image_size=image_size, seed=seed)),
-        mvs_cpu.Options(**_given(size=stereo_size)),
-        mvs_gpu.Options(**_given(size=stereo_size)),
-        refine=not no_refine,
+    photos_options = replace(
+        photos_options,
+        sfm=sfm.Options(**_given(image_size=image_size, seed=seed)),
+        stereo=mvs_cpu.Options(**_given(size=stereo_size)),
+        patchmatch=mvs_gpu.Options(**_given(size=stereo_size)),
     )
-    options = _points_options(slope, radius, fill, void, ground="filter")
+    options = rasters.of(ground="filter")
     _run(
         output,
         lambda: photos.prepare_photos(

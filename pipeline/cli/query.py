@@ -13,6 +13,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.results.points import Ground
 from flexroad.pipeline.results.query import along_lines, at_points, beyond_survey, outside, required_crs
@@ -32,7 +33,7 @@ def query(
             metavar="FILE",
             help="Points: CSV (easting, northing in m), GeoPackage or GeoJSON; - reads a CSV from standard "
             "input.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     line: Annotated[
@@ -40,21 +41,19 @@ def query(
         typer.Option(
             metavar="FILE|'X Y, X Y'",
             help="Profile along the lines of a vector file, or along a line through these points.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     step: Annotated[
         float,
-        typer.Option(
-            min=0.001, metavar="METRES", help="Step along a line (m).", rich_help_panel=options.INPUTS
-        ),
+        typer.Option(min=0.001, metavar="METRES", help="Step along a line (m).", rich_help_panel=INPUTS),
     ] = 1.0,
     crs: Annotated[
         str | None,
         typer.Option(
             metavar="CRS",
             help="CRS of the points or the line, if it is another one; first east, then north.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     lonlat: Annotated[
@@ -62,7 +61,7 @@ def query(
         typer.Option(
             "--lonlat",
             help="Coordinates are longitude, latitude in degrees: --crs EPSG:4326.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = False,
     layer: Annotated[
@@ -70,7 +69,7 @@ def query(
         typer.Option(
             metavar="NAME",
             help="Layer of a vector file; needed if it has several.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     variant: Annotated[
@@ -84,7 +83,7 @@ def query(
             "--output",
             metavar="FILE",
             help="Write a .csv or .gpkg instead of printing CSV.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ] = None,
     allow: options.Allow = None,

@@ -12,6 +12,7 @@ from flexroad.catalog.storage.paths import parse_location, read
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo, echo_document
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report import write_report
 from flexroad.pipeline.reproduce.figures import write_figures
@@ -23,9 +24,7 @@ app = group()
 
 Output = Annotated[
     Path,
-    typer.Option(
-        "-o", "--output", metavar="FOLDER", help="Folder to write.", rich_help_panel=options.OUTPUTS
-    ),
+    typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write.", rich_help_panel=OUTPUTS),
 ]
 
 
@@ -34,9 +33,7 @@ def report(
     path: options.Run,
     form: Annotated[
         Literal["md", "csv", "html"],
-        typer.Option(
-            "--format", help="html: one page with a map and pictures.", rich_help_panel=options.OUTPUTS
-        ),
+        typer.Option("--format", help="html: one page with a map and pictures.", rich_help_panel=OUTPUTS),
     ] = "md",
     compared: Annotated[
         Path | None,
@@ -44,7 +41,7 @@ def report(
             "--compare",
             metavar="RUN",
             help="html: compare with another run over the same tiles.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     viewer: Annotated[
@@ -52,7 +49,7 @@ def report(
         typer.Option(
             metavar="FOLDER",
             help="html: link tiles to this 3D viewer; default: RUN/viewer if it exists.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     allow: options.Allow = None,
@@ -78,7 +75,7 @@ def tables(
     true: Annotated[
         Path | None,
         typer.Option(
-            metavar="RUN", help="The same tiles, run with the true road mask.", rich_help_panel=options.INPUTS
+            metavar="RUN", help="The same tiles, run with the true road mask.", rich_help_panel=INPUTS
         ),
     ] = None,
     dsc3d: Annotated[
@@ -86,7 +83,7 @@ def tables(
         typer.Option(
             metavar="RUN",
             help="A run for the rows of DSC3D: of its scenes or of synthetic ones.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     dsc3d_true: Annotated[
@@ -95,7 +92,7 @@ def tables(
             "--dsc3d-true",
             metavar="RUN",
             help="The same scenes, run with the true reference.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     literal: Annotated[
@@ -103,7 +100,7 @@ def tables(
         typer.Option(
             metavar="RUN",
             help="The same tiles, or some, run with --config literal: a second column.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = None,
     allow: options.Allow = None,

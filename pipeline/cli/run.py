@@ -23,6 +23,7 @@ from flexroad.pipeline.cli.lifecycle import Outcome, RunCommand, format_summary,
 from flexroad.pipeline.cli.limits import remedy
 from flexroad.pipeline.cli.stdio import echo, echo_document, ignore_write_errors
 from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, TILES, WORK
 from flexroad.pipeline.errors import ClusterLost, ConfigError
 from flexroad.pipeline.execute.dask import check_address
 from flexroad.pipeline.run.collection import write_states
@@ -53,7 +54,7 @@ Scheduler = Annotated[
     typer.Option(
         metavar="ADDRESS",
         help="A running Dask scheduler: tcp://host:8786, tls://host:8786.",
-        rich_help_panel=options.WORK,
+        rich_help_panel=WORK,
         callback=_address,
     ),
 ]
@@ -64,14 +65,14 @@ StageName = Literal["load", "segment", "ecsrc", "fit", "sample", "evaluate", "as
 @ignore_write_errors()
 def run(
     catalog: Annotated[
-        Path, typer.Option(metavar="CATALOG", help="Catalog of tiles.", rich_help_panel=options.INPUTS)
+        Path, typer.Option(metavar="CATALOG", help="Catalog of tiles.", rich_help_panel=INPUTS)
     ],
     out: Annotated[
         Path,
         typer.Option(
             metavar="RUN",
             help="Folder of the run; an existing run is resumed.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ],
     config: Annotated[
@@ -79,7 +80,7 @@ def run(
         typer.Option(
             metavar="NAME|FILE",
             help="Configuration: a shipped name, such as production, or a YAML file.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = "production",
     settings: options.Settings = None,
@@ -89,7 +90,7 @@ def run(
         typer.Option(
             "--checksum",
             help="Detect changed sources by content, not by size and time.",
-            rich_help_panel=options.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = False,
     store: Annotated[
@@ -97,7 +98,7 @@ def run(
         typer.Option(
             metavar="FOLDER",
             help="Folder of stage results that several runs share.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ] = None,
     verify: options.Verify = False,
@@ -158,17 +159,17 @@ def rerun(
     path: options.Run,
     tile: Annotated[
         list[str] | None,
-        typer.Option(metavar="ID", help="These tiles: --tile ID ID ...", rich_help_panel=options.TILES),
+        typer.Option(metavar="ID", help="These tiles: --tile ID ID ...", rich_help_panel=TILES),
     ] = None,
     failed: Annotated[
-        bool, typer.Option("--failed", help="The tiles that failed.", rich_help_panel=options.TILES)
+        bool, typer.Option("--failed", help="The tiles that failed.", rich_help_panel=TILES)
     ] = False,
     from_stage: Annotated[
         StageName | None,
         typer.Option(
             "--from",
             help="Recompute this stage and all later ones; export: only write the products again.",
-            rich_help_panel=options.TILES,
+            rich_help_panel=TILES,
         ),
     ] = None,
     settings: options.WorkerSettings = None,

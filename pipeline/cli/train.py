@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +19,7 @@ from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.loading import load_config
+from flexroad.pipeline.config.options import INPUTS, METHOD, OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.report.training import summary, verdict, write_model
 from flexroad.pipeline.training import train as training
@@ -27,15 +29,10 @@ app = group()
 
 
 @app.command(cls=Command)
+@shared.with_options
 def train(
     catalog: shared.CatalogFile,
-    labels: Annotated[
-        Literal["mask", "vector"],
-        typer.Option(
-            help="mask: the catalog's reference road or road mask; vector: its vector roads.",
-            rich_help_panel=shared.INPUTS,
-        ),
-    ],
+    options: training.TrainOptions,
     output: Annotated[
         Path,
         typer.Option(
@@ -43,7 +40,7 @@ def train(
             "--output",
             metavar="MODEL",
             help="Model file; the report is written beside it.",
-            rich_help_panel=shared.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ],
     config: Annotated[
@@ -51,52 +48,16 @@ def train(
         typer.Option(
             metavar="NAME|FILE",
             help="Configuration with the options of load and segment.",
-            rich_help_panel=shared.INPUTS,
+            rich_help_panel=INPUTS,
         ),
     ] = "paper",
-    validation: Annotated[
-        float,
-        typer.Option(
-            min=0.05,
-            max=0.9,
-            metavar="SHARE",
-            help="Share of the tiles for validation.",
-            rich_help_panel=shared.VALIDATION,
-        ),
-    ] = 0.3,
-    gap_m: Annotated[
-        float,
-        typer.Option(
-            "--gap-m",
-            min=0,
-            metavar="METRES",
-            help="Distance of training cells from validation tiles (m).",
-            rich_help_panel=shared.VALIDATION,
-        ),
-    ] = 50.0,
-    ignore_m: Annotated[
-        float,
-        typer.Option(
-            "--ignore-m",
-            min=0,
-            metavar="METRES",
-            help="Distance of training cells from edges of labels (m).",
-            rich_help_panel=shared.VALIDATION,
-        ),
-    ] = 1.0,
-    seed: Annotated[
-        int,
-        typer.Option(
-            min=0, metavar="N", help="Seed of the split and of the training.", rich_help_panel=shared.METHOD
-        ),
-    ] = 0,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
             help="Option of the training (epochs=100) or the configuration (load.halo_m=0); repeatable.",
-            rich_help_panel=shared.METHOD,
+            rich_help_panel=METHOD,
         ),
     ] = None,
     allow: shared.Allow = None,
@@ -108,7 +69,7 @@ def train(
     # The options of a training have no stage before a dot.
     changes = [text for text in settings or () if "." in text.partition("=")[0]]
     own = [text for text in settings or () if text not in changes]
-    options = training.TrainOptions(labels, validation, gap_m, ignore_m, seed, _settings(own))
+    options = replace(options, settings=_settings(own))
     tiles, loaded_config = Catalog.read(catalog, allow or ()), load_config(config, changes)
     check_allowed(tiles)
     output.parent.mkdir(parents=True, exist_ok=True)

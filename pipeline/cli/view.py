@@ -14,6 +14,7 @@ from flexroad.catalog.text import count
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.stdio import echo
+from flexroad.pipeline.config.options import OUTPUTS
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import DaskExecutor, SerialExecutor
 from flexroad.pipeline.export.viewer import server, write_viewer
@@ -36,7 +37,7 @@ def view(
             "--output",
             metavar="FOLDER",
             help="Output folder; default: viewer in the run's folder.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ] = None,
     photo_px: Annotated[
@@ -46,7 +47,7 @@ def view(
             max=8192,
             metavar="N",
             help="Largest width and height of a tile's photo.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ] = 1024,
     serve: Annotated[
@@ -54,14 +55,12 @@ def view(
         typer.Option(
             "--serve",
             help="Then serve the folder on this computer alone, until Ctrl-C.",
-            rich_help_panel=options.OUTPUTS,
+            rich_help_panel=OUTPUTS,
         ),
     ] = False,
     port: Annotated[
         int,
-        typer.Option(
-            min=0, max=65535, metavar="N", help="Port of --serve; 0: any.", rich_help_panel=options.OUTPUTS
-        ),
+        typer.Option(min=0, max=65535, metavar="N", help="Port of --serve; 0: any.", rich_help_panel=OUTPUTS),
     ] = 0,
     tile: options.TileIds = None,
     bbox: options.Box = None,

@@ -15,6 +15,7 @@ from flexroad.catalog.area import Area
 from flexroad.catalog.ellipsoidal import Datum
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import Location, stat
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import (
     COMPUTED_AGAIN,
@@ -42,20 +43,28 @@ class Options:
 
     datum: Datum | None = None
     """How heights become heights above the ellipsoid; needed by formats with WGS 84."""
-    compress: bool = False
+    compress: bool = option(False, OUTPUTS, "Compress LandXML.", name="gzip")
     """Whether text formats of the complete run are compressed with gzip."""
-    resolution_m: float | None = None
-    """Cell size of rasters over the run (m); None: that of the run."""
-    nodes: Literal["power", "unreal"] = "power"
+    nodes: Literal["power", "unreal"] = option(
+        "power",
+        OUTPUTS,
+        "Sizes of heightfield. power: 2^n + 1 nodes a side; unreal: those of Unreal Engine.",
+    )
     """Family of sizes of height fields, of `tasks.export.heightfield.SIZES`."""
-    drape: bool = False
-    """Whether meshes of 3D Tiles and OBJ have the orthophoto, also if those of the run have none."""
-    roads: str | None = None
-    """File of centre lines for formats along roads; None for the roads of the run's catalog."""
-    roads_layer: str | None = None
-    """Layer of that file; needed if it has several."""
-    left_hand: bool = False
-    """Whether traffic keeps left."""
+    resolution_m: float | None = option(
+        None, OUTPUTS, "Cell size of mosaic and pmtiles; default: that of the run.", "METRES", min=0.01
+    )
+    """Cell size of rasters over the run (m)."""
+    drape: bool = option(False, OUTPUTS, "Put the orthophoto on the meshes of 3dtiles and obj.")
+    """Also if the meshes of the run have none."""
+    roads: str | None = option(
+        None,
+        INPUTS,
+        "Centre lines for crg, xodr and lines; default: the roads of the run's catalog.",
+        "FILE",
+    )
+    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if it has several.", "NAME")
+    left_hand: bool = option(False, INPUTS, "Traffic keeps left, for xodr.")
     formats: frozenset[str] = frozenset()
     """Names of the formats that are written together: some refer to files of other formats."""
 

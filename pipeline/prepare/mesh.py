@@ -12,6 +12,7 @@ import numpy as np
 from flexroad.catalog import Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.to_metres import MetricTransform
+from flexroad.pipeline.config.options import INPUTS, RASTERS, option
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.blockwise import write_blocks
 from flexroad.pipeline.prepare.limits import check_disk, prepared_grid
@@ -45,17 +46,17 @@ POINTS = to_rasters.Options(ground="filter")
 class MeshOptions:
     """The options that only ``prepare mesh`` has."""
 
-    up: Literal["y", "z"] | None = None
-    """The file's upward axis; by default y in glTF and z elsewhere."""
-    offset: Offset | None = None
-    """Easting, northing and height of the mesh's origin; by default read from the sidecar file."""
-    density: float = 25.0
-    """Sampled points per m2 of surface."""
-    seed: int = 0
-    """Random seed of the sampling."""
-    dop: bool = True
-    """Whether an orthophoto is drawn."""
-    refine: bool = True
+    up: Literal["y", "z"] | None = option(
+        None, INPUTS, "The mesh's upward axis; default: y in glTF, z elsewhere."
+    )
+    offset: Offset | None = option(
+        None, INPUTS, "Position of the mesh's origin; default: from its sidecar file.", "E N H"
+    )
+    """Easting, northing and height (m)."""
+    density: float = option(25.0, RASTERS, "Sampled points per m2 of the mesh's surface.", "NUMBER", min=0.1)
+    seed: int = option(0, RASTERS, "Random seed of the sampling.", "N", min=0)
+    dop: bool = option(True, RASTERS, "Make no orthophoto.")
+    refine: bool = option(True, RASTERS, "Do not refine the DTM by ECSRC.")
     """Whether the DTM is refined by ECSRC, as in the paper."""
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from flexroad.catalog.limits import MIN_COVER
+from flexroad.pipeline.config.options import INPUTS, OUTPUTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
 
 MIN_COVER_HELP = "Leave out tiles with a DSM height in less than this share of their cells; 0 keeps all."
@@ -19,63 +20,32 @@ def written(paths: Iterable[Path]) -> datetime:
     return datetime.fromtimestamp(max(path.stat().st_mtime for path in paths), UTC)
 
 
-def _option(heading: str, help: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
-    """Return what help pages say of a field's option: heading, meaning, word for a value, limits.
-
-    The option has the name of the field without its unit, if `name` does not give another.
-    """
-    return {"heading": heading, "help": help, "metavar": metavar, **more}
-
-
 @dataclass(frozen=True)
 class PrepareOptions:
     """The options shared by all commands; the command line makes its options of these fields."""
 
-    cell_m: float = field(
-        default=1.0, metadata=_option("Rasters", "Cell of the heights in m.", "METRES", min=0.01)
+    cell_m: float = option(1.0, RASTERS, "Cell of the heights in m.", "METRES", min=0.01)
+    dop_cell_m: float = option(0.5, RASTERS, "Pixel of the orthophoto in m.", "METRES", min=0.01)
+    crs: str | None = option(None, INPUTS, "CRS of inputs without one, e.g. EPSG:2994.", "CRS")
+    to_crs: str | None = option(None, RASTERS, "CRS of the rasters; default: the input's, in metres.", "CRS")
+    height_unit: Literal["metre", "foot", "us-foot"] | None = option(
+        None, INPUTS, "Unit of heights if the CRS has none; default: that of the plan."
     )
-    dop_cell_m: float = field(
-        default=0.5, metadata=_option("Rasters", "Pixel of the orthophoto in m.", "METRES", min=0.01)
-    )
-    crs: str | None = field(
-        default=None, metadata=_option("Inputs", "CRS of inputs without one, e.g. EPSG:2994.", "CRS")
-    )
-    to_crs: str | None = field(
-        default=None,
-        metadata=_option("Rasters", "CRS of the rasters; default: the input's, in metres.", "CRS"),
-    )
-    height_unit: Literal["metre", "foot", "us-foot"] | None = field(
-        default=None,
-        metadata=_option("Inputs", "Unit of heights if the CRS has none; default: that of the plan."),
-    )
-    roads: Path | None = field(
-        default=None,
-        metadata=_option("Inputs", "Roads: polygons, a raster or a mesh, for the mask; or lines.", "FILE"),
+    roads: Path | None = option(
+        None, INPUTS, "Roads: polygons, a raster or a mesh, for the mask; or lines.", "FILE"
     )
     """A mesh is projected vertically; lines make no mask."""
-    roads_layer: str | None = field(
-        default=None, metadata=_option("Inputs", "Layer of --roads, if the file has several.", "NAME")
-    )
-    roads_where: str | None = field(
-        default=None, metadata=_option("Inputs", "SQL condition on --roads: \"class = 'road'\".", "SQL")
-    )
-    tile_size_m: float = field(
-        default=250, metadata=_option("Rasters", "Side of a tile in m; a smaller area is one tile.", "METRES")
-    )
-    min_cover: float = field(
-        default=MIN_COVER, metadata=_option("Rasters", MIN_COVER_HELP, "SHARE", min=0, max=1)
-    )
-    date: datetime | None = field(
-        default=None,
-        metadata=_option("Inputs", "Date of the survey; default: that of the files.", "YYYY-MM-DD"),
+    roads_layer: str | None = option(None, INPUTS, "Layer of --roads, if the file has several.", "NAME")
+    roads_where: str | None = option(None, INPUTS, "SQL condition on --roads: \"class = 'road'\".", "SQL")
+    tile_size_m: float = option(250, RASTERS, "Side of a tile in m; a smaller area is one tile.", "METRES")
+    min_cover: float = option(MIN_COVER, RASTERS, MIN_COVER_HELP, "SHARE", min=0, max=1)
+    date: datetime | None = option(
+        None, INPUTS, "Date of the survey; default: that of the files.", "YYYY-MM-DD"
     )
     assumed_date: datetime | None = None
     """Date, marked as assumed, if neither the option nor the files give one; not on the command line."""
-    dataset: str | None = field(
-        default=None,
-        metadata=_option(
-            "Outputs", "Name of the data in reports; default: the input's name.", "NAME", name="name"
-        ),
+    dataset: str | None = option(
+        None, OUTPUTS, "Name of the data in reports; default: the input's name.", "NAME", name="name"
     )
 
     @property

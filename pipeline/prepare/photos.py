@@ -16,6 +16,7 @@ import numpy as np
 
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import some
+from flexroad.pipeline.config.options import INPUTS, RASTERS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.prepare.mesh import MeshOptions, publish_mesh
@@ -48,16 +49,17 @@ MERGED_AT_ONCE = 5_000_000
 class PhotosOptions:
     """The options that only ``prepare photos`` has."""
 
-    control: Path | None = None
-    """Ground control points, CSV: image, x_px, y_px, easting, northing, height and optionally name."""
-    control_crs: str | None = None
-    """CRS of the control points; by default that of the rasters."""
+    control: Path | None = option(
+        None, INPUTS, "Ground control, CSV: image,x_px,y_px,easting,northing,height.", "FILE"
+    )
+    """A column ``name`` is optional."""
+    control_crs: str | None = option(None, INPUTS, "CRS of the control; default: the rasters'.", "CRS")
     sfm: sfm.Options = field(default_factory=sfm.Options)
     stereo: mvs_cpu.Options = field(default_factory=mvs_cpu.Options)
     """Dense stereo on the CPU."""
     patchmatch: mvs_gpu.Options = field(default_factory=mvs_gpu.Options)
     """Dense stereo on a GPU."""
-    refine: bool = True
+    refine: bool = option(True, RASTERS, "Do not refine the DTM by ECSRC.")
     """Whether the DTM is refined by ECSRC, as in the paper."""
 
 

@@ -7,7 +7,7 @@ of the model alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +20,7 @@ from flexroad.catalog import Bounds, Catalog, Grid, Tile
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, printable, shown
 from flexroad.pipeline.config.models import Config
+from flexroad.pipeline.config.options import INPUTS, METHOD, VALIDATION, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.training.spatial_split import Block, Split, inside, split, split_tile
 from flexroad.tasks import load
@@ -43,14 +44,30 @@ Log = Callable[[str], None]
 class TrainOptions:
     """Options of ``flexroad train``."""
 
-    labels: Labels
-    validation: float = 0.3
-    """Fraction of the tiles used for validation."""
-    gap_m: float = 50.0
-    """Training cells are at least this far from the validation tiles (m)."""
-    ignore_m: float = 1.0
-    """Training cells are farther than this from an edge of the labels (m), which are never exact."""
-    seed: int = 0
+    labels: Labels = option(
+        MISSING, INPUTS, "mask: the catalog's reference road or road mask; vector: its vector roads."
+    )
+    validation: float = option(
+        0.3, VALIDATION, "Share of the tiles for validation.", "SHARE", min=0.05, max=0.9
+    )
+    gap_m: float = option(
+        50.0,
+        VALIDATION,
+        "Distance of training cells from validation tiles (m).",
+        "METRES",
+        min=0,
+        name="gap-m",
+    )
+    ignore_m: float = option(
+        1.0,
+        VALIDATION,
+        "Distance of training cells from edges of labels (m).",
+        "METRES",
+        min=0,
+        name="ignore-m",
+    )
+    """Edges of labels are never exact."""
+    seed: int = option(0, METHOD, "Seed of the split and of the training.", "N", min=0)
     settings: Mapping[str, Any] | None = None
     """Options of the head's training, by name; None for the defaults."""
 

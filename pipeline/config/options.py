@@ -1,0 +1,40 @@
+"""Fields of dataclasses that are options of commands, and the headings of help pages that list options."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Any
+
+INPUTS, OUTPUTS, TILES = "Inputs", "Outputs", "Tiles"
+METHOD, VALIDATION = "Method", "Split into training and validation"
+GROUND, RASTERS, RECONSTRUCTION = "Ground", "Rasters", "Reconstruction"
+WORK, ALARMS = "Parallel work", "Alarms and monitoring"
+HEADINGS = (
+    INPUTS,
+    METHOD,
+    VALIDATION,
+    RECONSTRUCTION,
+    GROUND,
+    RASTERS,
+    TILES,
+    OUTPUTS,
+    WORK,
+    ALARMS,
+)
+"""In the order of a help page."""
+
+
+def option(default: Any, heading: str, help: str, metavar: str | None = None, **more: Any) -> Any:
+    """Return a field of a dataclass, of which `pipeline.cli.options.with_options` makes an option.
+
+    Parameters
+    ----------
+    default
+        Of the field; `dataclasses.MISSING` if it is required. A field that is True by default becomes a flag
+        ``--no-...``, whose help says what is left out.
+    heading, help, metavar : str
+        Of the help page: where the option stands, its meaning, and the word for its value.
+    **more
+        Limits, ``min`` and ``max``; ``name``, if it is not that of the field without its unit.
+    """
+    return field(default=default, metadata={"heading": heading, "help": help, "metavar": metavar, **more})
