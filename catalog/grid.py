@@ -28,6 +28,11 @@ def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
     return min(a[2], b[2]) - max(a[0], b[0]) > tolerance and min(a[3], b[3]) - max(a[1], b[1]) > tolerance
 
 
+def is_whole(number: float) -> bool:
+    """Return whether a number is an integer, at least 1, except for rounding."""
+    return round(number) >= 1 and math.isclose(round(number), number, rel_tol=1e-9)
+
+
 @dataclass(frozen=True, slots=True)
 class Grid:
     """A north-up lattice of square cells.
@@ -192,7 +197,7 @@ class Grid:
         if not 0 < size_m < math.inf:
             raise CatalogError(f"a tile needs a size above 0 m, not {size_m:g} m")
         n = round(size_m / self.cell)
-        if size_m != int(size_m) or not math.isclose(n * self.cell, size_m, rel_tol=1e-9):
+        if size_m != int(size_m) or not is_whole(size_m / self.cell):
             raise CatalogError(
                 f"a tile of {size_m} m is not a whole number of metres and of {self.cell} m cells"
             )

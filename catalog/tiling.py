@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, same, scales, short
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid
+from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, zoned
 from flexroad.catalog.limits import MIN_COVER
@@ -33,6 +33,8 @@ MAX_CELL_RATIO = 50
 """DSM files whose cells are larger than most height files' by more than this factor are left out."""
 CELLS = (1.0, 2.0, 2.5, 5.0)
 """Sizes of the cells of tiles whose DSM is reprojected (m), and these times powers of ten."""
+MAX_TILE_M = 2000
+"""Largest size of a tile that is proposed (m)."""
 
 
 @dataclass(frozen=True)
@@ -258,6 +260,7 @@ def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]
     """Return the grids of the tiles that the DSM files touch, by id, with the most frequent cell size."""
     cells = Counter(p.file.cell for p in dsm if p.file.crs == crs)
     cell = cells.most_common(1)[0][0] if cells else _cell_m(dsm[0], crs)
+    _check_cell(next((p.file.name for p in dsm if p.file.cell == cell), dsm[0].file.name), cell, size_m)
     grids: dict[str, Grid] = {}
     for file, bounds in dsm:
         if file.crs == crs and file.cell == cell:
@@ -266,6 +269,28 @@ def _cut(dsm: Sequence[_PlacedFile], crs: str, size_m: float) -> dict[str, Grid]
             extent = Grid.covering(crs, bounds, cell)
         grids.update(extent.tiles(size_m))
     return dict(sorted(grids.items()))
+
+
+def _check_cell(name: str, cell: float, size_m: float) -> None:
+    """Raise an error if a tile of whole metres has no whole number of the cells of its DSM."""
+    if not 0 < size_m < math.inf or size_m != int(size_m) or is_whole(size_m / cell):
+        return
+    rounded = _nearest_cell(cell)
+    fault = f"a tile of {size_m:g} m has no whole number of the cells of {cell:g} m of {name}"
+    sizes = (size for size in range(int(size_m) + 1, MAX_TILE_M) if is_whole(size / cell))
+    larger = next(sizes, None)
+    if math.isclose(cell, rounded, rel_tol=0.01) or larger is None:
+        new = Path(name).stem + "_new.tif"
+        remedy = f"round them: gdalwarp -tr {rounded:g} {rounded:g} -tap -r bilinear {name} {new}"
+    else:
+        remedy = f"use --tile-size {larger}"
+    raise CatalogError(f"{fault}; {remedy}")
+
+
+def _nearest_cell(true_m: float) -> float:
+    """Return the nearest of `CELLS` (m)."""
+    power = 10.0 ** math.floor(math.log10(true_m))
+    return min((size * power for size in (*CELLS, 10.0)), key=lambda size: abs(math.log(size / true_m)))
 
 
 def _cell_m(placed: _PlacedFile, crs: str) -> float:
@@ -279,8 +304,7 @@ def _cell_m(placed: _PlacedFile, crs: str) -> float:
     is_metric = is_projected(file.crs) and plan_unit(file.crs)[1] == 1
     if is_metric and math.isclose(true_m, file.cell, rel_tol=0.01):
         return file.cell
-    power = 10.0 ** math.floor(math.log10(true_m))
-    return min((size * power for size in (*CELLS, 10.0)), key=lambda size: abs(math.log(size / true_m)))
+    return _nearest_cell(true_m)
 
 
 def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, _NearFiles]:

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import rasterio
 from rasterio.errors import CRSError, RasterioError
 
-from flexroad.catalog.headers.refused import Refused, head, require_beside
+from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
 from flexroad.catalog.storage.paths import Location, gdal_name, sidecars
 from flexroad.catalog.trust import AllowedFolders
 
@@ -296,7 +296,7 @@ def _driver(path: Path) -> str:
         return "VRT"
     # Marks of other formats may stand anywhere in a text.
     if not text or text.startswith(b"{") or NOT_TEXT.search(data):
-        raise Refused(UNKNOWN)
+        raise Refused(UNKNOWN + archive_note(data))
     return "AAIGrid" if ASCII_GRID.match(text) else "XYZ"
 
 

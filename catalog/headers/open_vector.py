@@ -18,10 +18,13 @@ from typing import Any
 from urllib.parse import quote
 from xml.parsers import expat
 
-from flexroad.catalog.headers.refused import Refused, head, require_beside
+from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
+from flexroad.catalog.lazy import lazy
+
+pyogrio = lazy("pyogrio")
 
 UNKNOWN = (
-    "is not a vector file: it is no GeoPackage, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
+    "is not a vector file: it is no GeoPackage, SpatiaLite, FlatGeobuf, Shapefile, GeoJSON or OSM file; "
     "convert it with ogr2ogr, e.g. ogr2ogr NEW.gpkg FILE"
 )
 SQLITE = b"SQLite format 3\0"
@@ -34,6 +37,13 @@ OTHER_THAN_OSM = re.compile(
 )
 WITH = re.compile(r"\bwith\b", re.IGNORECASE)
 """Word with which recursive queries begin; SQLite does not require the word RECURSIVE."""
+VIRTUAL = re.compile(r"\bvirtual\b", re.IGNORECASE)
+INDEX = re.compile(
+    r"""CREATE VIRTUAL TABLE\s+("[^"]*"|'[^']*'|\w+)\s+USING\s+"""
+    r"(rtree|VirtualSpatialIndex|VirtualElementary|VirtualKNN2?)\s*(\(|$)",
+    re.IGNORECASE,
+)
+"""Virtual tables of SpatiaLite that are made of the file's own tables."""
 MAX_CRS_BYTES = 65536
 """Longest text of a CRS in GeoJSON."""
 ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
@@ -65,22 +75,47 @@ def vector_name(path: Path) -> str:
     elif data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
         _require_own_parts(path, (path.with_name(path.name + end) for end in SQLITE_PARTS))
         _require_queries_that_end(path)
+    elif data.startswith(SQLITE) and _is_spatialite(path):
+        _require_own_parts(path, (path.with_name(path.name + end) for end in SQLITE_PARTS))
+        _require_queries_that_end(path)
+        _require_own_tables(path)
+        # The prefix selects the driver, whatever the file's name ends in.
+        return f"SQLITE:{path}"
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
-        raise Refused(UNKNOWN)
+        raise Refused(UNKNOWN + archive_note(data))
     return str(path)
+
+
+def _objects(path: Path, condition: str) -> list[tuple[str, str]]:
+    """Return names and statements of tables and views of an SQLite file; none if it is damaged."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
+            return file.execute(f"SELECT name, sql FROM sqlite_master WHERE {condition}").fetchall()
+    except sqlite3.Error:
+        # GDAL reports what is wrong.
+        return []
+
+
+def _is_spatialite(path: Path) -> bool:
+    """Return whether an SQLite file has the tables of SpatiaLite, and GDAL can read it."""
+    tables = "name IN ('geometry_columns', 'spatial_ref_sys')"
+    return len(_objects(path, tables)) == 2 and "SQLite" in pyogrio.list_drivers()
+
+
+def _require_own_tables(path: Path) -> None:
+    """Raise an error if an SQLite file has a table that may be made of another file."""
+    for name, statement in _objects(path, "sql LIKE '%virtual%'"):
+        if VIRTUAL.search(statement) and not INDEX.match(statement):
+            raise Refused(
+                f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
+            )
 
 
 def _require_queries_that_end(path: Path) -> None:
     """Raise an error if a GeoPackage has a view that repeats itself: its rows may have no end."""
-    try:
-        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as file:
-            views = file.execute("SELECT name, sql FROM sqlite_master WHERE sql LIKE '%view%'").fetchall()
-    except sqlite3.Error:
-        # GDAL reports what is wrong.
-        return
-    for name, query in views:
+    for name, query in _objects(path, "sql LIKE '%view%'"):
         if WITH.search(str(query)):
             raise Refused(
                 f"has the view {name!r} with a query WITH, which may never end; write its result to a table"

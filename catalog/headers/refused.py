@@ -8,6 +8,8 @@ from pathlib import Path
 
 HEAD_BYTES = 65536
 CHUNK_BYTES = 2**20
+ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"BZh", b"\xfd7zXZ\0")
+"""First bytes of files of archives."""
 
 
 class Refused(OSError):
@@ -28,6 +30,12 @@ def head(path: Path) -> bytes:
     # Opening a pipe would wait for a writer, if one has just taken the file's place.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as file:
         return file.read(HEAD_BYTES) or b""
+
+
+def archive_note(data: bytes) -> str:
+    """Return the remedy if a file is an archive, by its first bytes, to end a message; else empty."""
+    is_archive = data.startswith(ARCHIVES) or data[257:262] == b"ustar"
+    return "; it is an archive: unpack it first" if is_archive else ""
 
 
 def read_through(path: Path) -> None:

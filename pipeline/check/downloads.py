@@ -31,13 +31,15 @@ MAX_DEPTH = 8
 """Largest depth of folders below the given one."""
 PREVIEW = 256
 """Side of the reduced raster that the range of values is read from (cells)."""
+RUN_FILE = "run.json"
+"""Name of the file of a run's folder; `record.RECORD`, whose module would be slow to import."""
 FEW_VALUES = 40
 """Largest number of distinct values of a mask or land cover."""
 
 SUFFIXES = {
-    "raster": (".tif", ".tiff", ".asc", ".xyz", ".gz", ".vrt", ".jp2"),
+    "raster": (".tif", ".tiff", ".asc", ".xyz", ".txt", ".gz", ".vrt", ".jp2"),
     "cloud": (".las", ".laz"),
-    "vector": (".gpkg", ".shp", ".geojson", ".fgb", ".osm", ".pbf"),
+    "vector": (".gpkg", ".sqlite", ".shp", ".geojson", ".fgb", ".osm", ".pbf"),
     "mesh": (".obj", ".ply", ".gltf", ".glb"),
     "photo": (".jpg", ".jpeg"),
     "archive": (".zip", ".7z", ".tar", ".tgz", ".rar"),
@@ -114,20 +116,25 @@ def look(folder: Path) -> tuple[list[Download], bool]:
     for number, path in enumerate(_files(folder)):
         if number == MAX_FILES:
             return found, True
-        if kind := kinds.get(path.suffix.lower()):
-            found.append(_looked(path, folder, kind))
+        kind = kinds.get(path.suffix.lower())
+        if kind and (download := _looked(path, folder, kind)):
+            found.append(download)
     return found, False
 
 
 def _files(folder: Path) -> Iterator[Path]:
     for parent, folders, names in os.walk(folder):
+        if RUN_FILE in names:
+            # A run and its products.
+            folders.clear()
+            continue
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         if len(Path(parent).relative_to(folder).parts) >= MAX_DEPTH:
             folders.clear()
         yield from (Path(parent, name) for name in sorted(names) if not name.startswith("."))
 
 
-def _looked(path: Path, folder: Path, kind: str) -> Download:
+def _looked(path: Path, folder: Path, kind: str) -> Download | None:
     if kind == "raster":
         return _raster(path, folder)
     if kind == "cloud":
@@ -147,13 +154,16 @@ def _named(path: Path, folder: Path) -> str:
     return "raster"
 
 
-def _raster(path: Path, folder: Path) -> Download:
+def _raster(path: Path, folder: Path) -> Download | None:
     try:
         with quiet(), open_raster(path) as raster:
             bands, dtype, size = raster.count, raster.dtypes[0], f"{raster.width} x {raster.height}"
             crs = in_plan(raster.crs.to_wkt()) if raster.crs else None
             values = _values(raster)
     except (*ERRORS, CatalogError) as error:
+        if path.suffix.lower() == ".txt":
+            # A text to read.
+            return None
         return Download(path, "raster", question=f"it cannot be read as a raster: {error}")
     kind = _named(path, folder)
     about = f"{count(bands, 'band')} {dtype}, {size}, {values[0]}, {short(crs) if crs else 'no CRS'}"
@@ -186,7 +196,7 @@ def _values(raster: Any) -> tuple[str, str]:
     """Return the range of the first band's values, and the values if they are few whole numbers."""
     shape = (min(raster.height, PREVIEW), min(raster.width, PREVIEW))
     cells = read_valid(raster, out_shape=shape).compressed()
-    cells = cells[np.isfinite(cells)]
+    cells = cells[np.isfinite(cells)] * raster.scales[0] + raster.offsets[0]
     if not cells.size:
         return "only nodata", ""
     distinct = np.unique(cells)

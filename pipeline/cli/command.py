@@ -80,7 +80,8 @@ class Command(TyperCommand):
         out: list[str] = []
         option = ""
         for word in words:
-            if word.startswith("-") and not word[1:].isdigit():
+            # Ids of tiles may begin with a minus, as numbers do.
+            if word.startswith("-") and not word[1:2].isdigit():
                 option = word if word in repeatable else ""
             elif option and out[-1] != option:
                 out.append(option)

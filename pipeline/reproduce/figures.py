@@ -138,8 +138,11 @@ def sweep(chains: Mapping[str, Chain], full: str, options: tuple[str, ...]) -> d
     Returns
     -------
     dict
-        Label by variant, ordered by the options' values.
+        Label by variant, ordered by the options' values; empty if the methods of the full pipeline lack one
+        of the options.
     """
+    if not all(hasattr(chains[full][stage], name) for stage, _, name in (o.partition(".") for o in options)):
+        return {}
     values = {
         variant: tuple(_value(chain, option) for option in options)
         for variant, chain in chains.items()

@@ -1,6 +1,7 @@
 """Folders of rasters in several CRSs and units, cut into tiles of one CRS."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -133,3 +134,30 @@ def test_tiles_beside_a_turned_dsm_are_left_out(tmp_path):
         x, y = to_source.transform(*np.meshgrid(tile.grid.eastings, tile.grid.northings))
         inside = (x > 900_000) & (x < 901_000) & (y < 5_700_000) & (y > 5_699_000)
         assert (inside.mean() >= 0.25) == (tile.id in kept)
+
+
+@pytest.mark.parametrize(
+    ("cell", "size", "remedy"),
+    [
+        (0.04999, 30, "round them: gdalwarp -tr 0.05 0.05 -tap -r bilinear dsm.tif dsm_new.tif"),
+        (1.0004, 250, "round them: gdalwarp -tr 1 1 -tap -r bilinear dsm.tif dsm_new.tif"),
+        (0.3, 250, "use --tile-size 252"),
+        (4.0, 250, "use --tile-size 252"),
+    ],
+)
+def test_cells_that_divide_no_tile_are_named_with_file_and_remedy(tmp_path, cell, size, remedy):
+    write(tmp_path / "dsm.tif", np.ones((300, 300), np.float32), 400_000, 5_700_000, cell=cell)
+    with pytest.raises(CatalogError) as caught:
+        index(tmp_path, {"dsm": "dsm.tif"}, tile_size_m=size)
+    assert str(caught.value) == (
+        f"a tile of {size} m has no whole number of the cells of {cell:g} m of dsm.tif; {remedy}"
+    )
+
+
+@pytest.mark.parametrize(("layer", "name"), [("dsm", "dsm.zip"), ("roads", "roads.zip")])
+def test_archive_is_refused_with_the_remedy(tmp_path, layer, name):
+    write(tmp_path / "dsm.tif", FLAT, 700_000, 5_700_250)
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.write(tmp_path / "dsm.tif", "dsm.tif")
+    with pytest.raises(CatalogError, match="it is an archive: unpack it first"):
+        index(tmp_path, {"dsm": "dsm.tif", layer: "*.zip"})

@@ -196,3 +196,51 @@ def test_view_without_end_raises_one_line(tmp_path, queries, match):
     with pytest.raises(CatalogError, match=match) as error:
         opened(with_view(tmp_path / "a#b.gpkg", *queries), None)
     assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def spatialite(tmp_path):
+    """Return a SpatiaLite file of one road, as registers of the Netherlands come."""
+    path = tmp_path / "roads.sqlite"
+    roads = geopandas.GeoDataFrame({"w": [4.0]}, geometry=[LineString([(0, 0), (9, 9)])], crs=UTM)
+    roads.to_file(path, driver="SQLite", engine="pyogrio", SPATIALITE="YES", SPATIAL_INDEX="YES")
+    return path
+
+
+def test_spatialite_is_read(spatialite):
+    assert opened(spatialite, None).extents
+    read = pyogrio.read_dataframe(vector_name(spatialite))
+    assert (read.w.item(), read.crs.to_epsg()) == (4.0, 25832)
+
+
+def test_other_sqlite_files_are_refused(tmp_path):
+    path = tmp_path / "roads.sqlite"
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("CREATE TABLE roads (w REAL)")
+    with pytest.raises(Refused, match="it is no GeoPackage, SpatiaLite"):
+        vector_name(path)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE VIRTUAL TABLE other USING VirtualShape('/etc/secret', 'UTF-8', 25832)",
+        "create/**/virtual/**/table other USING VirtualOGR('/vsicurl/http://host/a')",
+        "CREATE VIRTUAL TABLE other USING VirtualText('using rtree(', 'UTF-8')",
+    ],
+)
+def test_spatialite_with_a_table_of_another_file_is_refused(spatialite, statement):
+    with contextlib.closing(sqlite3.connect(spatialite)) as file:
+        file.execute("PRAGMA writable_schema = ON")
+        file.execute("INSERT INTO sqlite_master VALUES ('table', 'other', 'other', 0, ?)", (statement,))
+        file.commit()
+    with pytest.raises(Refused, match="virtual table 'other', which may be made of another file"):
+        vector_name(spatialite)
+
+
+def test_spatialite_with_a_view_that_repeats_itself_is_refused(spatialite):
+    with contextlib.closing(sqlite3.connect(spatialite)) as file:
+        file.execute("CREATE VIEW v AS WITH r AS (SELECT 1 AS n UNION ALL SELECT n FROM r) SELECT * FROM r")
+        file.commit()
+    with pytest.raises(Refused, match="the view 'v' with a query WITH"):
+        vector_name(spatialite)

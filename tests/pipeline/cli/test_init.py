@@ -8,7 +8,9 @@ from rasterio.warp import transform
 from shapely import LineString, box
 
 from flexroad.catalog import Catalog
-from tests.make_rasters import write
+from flexroad.pipeline.check import downloads as downloads_module
+from flexroad.pipeline.run.record import RECORD
+from tests.make_rasters import write, write_xyz
 from tests.make_roads import write as write_roads
 
 WEST, NORTH = 400_020.0, 5_700_060.0
@@ -126,3 +128,31 @@ def test_init_dsm_in_feet_asks_for_the_crs_of_the_tiles(downloads, flexroad):
 def test_init_empty_folder_is_one_line(tmp_path, flexroad):
     (line,) = flexroad("init", tmp_path).expected(2).err.splitlines()
     assert line.startswith(f"error: {tmp_path} has no rasters")
+
+
+def test_init_text_files_with_heights_are_rasters_and_others_are_not_shown(flexroad, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "downloads"
+    for name in ("dom", "dgm"):
+        write_xyz(folder / name / "a.txt", np.full((60, 60), 100.0), WEST, NORTH)
+    (folder / "readme.txt").write_text("Heights of the survey, in metres.\n")
+    said = flexroad("init", folder).expected(0).out
+    assert "surface models (DSM): 1" in said
+    assert "terrain models (DTM): 1" in said
+    assert "readme" not in said
+    (catalog,) = (line for line in said.splitlines() if line.startswith("flexroad catalog rasters"))
+    flexroad(*shlex.split(catalog)[1:], "--tile-size", 60, "--crs", "EPSG:25832").expected(0)
+
+
+def test_init_leaves_out_the_products_of_a_run(downloads, flexroad):
+    assert downloads_module.RUN_FILE == RECORD
+    before = flexroad("init", downloads).expected(0).out
+    write(downloads / "run/tiles/1/dsm.tif", np.full((60, 60), 100, np.float32), WEST, NORTH)
+    (downloads / "run/run.json").write_text("{}")
+    assert flexroad("init", downloads).expected(0).out == before
+
+
+def test_init_shows_scaled_integers_in_metres(downloads, flexroad):
+    heights = np.full((60, 60), 2050, np.int16)
+    write(downloads / "DOM/a_1.tif", heights, WEST, NORTH, scale=(0.01, 100.0))
+    assert "DOM/a_1.tif: 1 band int16, 60 x 60, values 120.5 to 120.5" in flexroad("init", downloads).out

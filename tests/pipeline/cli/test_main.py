@@ -68,6 +68,12 @@ def test_parse_repeatable_option_takes_several_values():
     assert (rerun["tile"], rerun["path"]) == (["a"], Path("RUN"))
 
 
+def test_parse_tile_ids_may_begin_with_a_minus():
+    """West of a CRS's origin."""
+    run = parsed("run", "--tile", "-500_250", "-750_-250", "0_-250", "--out", "x")
+    assert (run["tile"], run["out"]) == (["-500_250", "-750_-250", "0_-250"], Path("x"))
+
+
 @pytest.mark.slow
 def test_figures_writes_page_and_drawings(finished, tmp_path):
     tile = Catalog.read(finished / "catalog.parquet").tiles[1].id

@@ -245,6 +245,13 @@ def test_trade_off_shows_means_of_metrics_table(run, rows):
     assert [text.get_text() for text in figure.axes[2].texts] == ["1 / 10", "2 / 20"]
 
 
+def test_sweep_of_an_option_that_the_method_lacks_is_empty():
+    chains = load_config("production").chains
+    (full,) = chains
+    assert figures.sweep(chains, full, ("fit.control_points",)) == {}
+    assert figures.sweep(chains, full, ("sample.road_m", "sample.terrain_m")).keys() == {full}
+
+
 # --- dataset ---------------------------------------------------------------------------------------------
 
 
