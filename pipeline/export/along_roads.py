@@ -37,6 +37,7 @@ from flexroad.tasks.roads.along_line import (
     HeightAt,
     HeightGrid,
     Profiles,
+    elevation_error,
     grid_error,
     height_grid,
     profile_error,
@@ -47,8 +48,10 @@ from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
 from flexroad.tasks.types import Floats
 
-VERSION = 2
+VERSION = 3
 """Of the roads themselves: their division, lines and grids."""
+INTERNAL = {"bounds", "lanes_assumed"}
+"""Entries of a road's row that the report does not show."""
 REPORT = "roads.csv"
 NO_ROAD = "no road lies on the tiles"
 SHOWN_M = 10.0
@@ -156,9 +159,21 @@ def write_xodr(
             opendrive.write(file, texts, roads.frame.proj, bounds, source.run.path.name)
 
     write_whole(folder / f"{source.run.path.name}{opendrive.NAME}", key, {}, fill)
-    mean, largest = summary["profiles_mean_mm"], summary["profiles_max_mm"]
-    missed = f"misses the surface by {mean:.0f} mm on average, at most {largest:.0f} mm, without OpenCRG"
-    return with_line(summary, missed if mean is not None else "")
+    summary["notes"] += lane_notes(rows)
+    return with_line(summary, _without_crg(summary))
+
+
+def _without_crg(summary: Mapping[str, Any]) -> str:
+    """Return how far the profiles miss the surface, for the user; empty if that is not known."""
+    if summary["profiles_mean_mm"] is None:
+        return ""
+    errors = [
+        f"{summary[f'{name}_mean_mm']:.0f} mm on average, at most {summary[f'{name}_max_mm']:.0f} mm"
+        for name in ("profiles", "elevation")
+    ]
+    return (
+        f"misses the surface by {errors[0]}, without OpenCRG; by elevation alone (CARLA, SUMO) by {errors[1]}"
+    )
 
 
 def write_units(
@@ -243,12 +258,15 @@ def row(road: int, grid: HeightGrid, height: HeightAt, fitted: Profiles) -> Row:
     """Return a road's row of the report."""
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
-    half = float(line.width.max()) / 2
+    level_mean, level_most = elevation_error(grid, fitted)
+    half, lanes = float(line.width.max()) / 2, opendrive.lane_count(line)
     errors = {
         "crg_median_mm": crg_median,
         "crg_max_mm": crg_max,
         "profiles_mean_mm": mean,
         "profiles_max_mm": most,
+        "elevation_mean_mm": level_mean,
+        "elevation_max_mm": level_most,
         "off_centre_line_mm": line.offset_m,
     }
     return {
@@ -256,6 +274,8 @@ def row(road: int, grid: HeightGrid, height: HeightAt, fitted: Profiles) -> Row:
         "name": line.name,
         "length_m": round(float(line.s[-1]), 3),
         "width_m": round(2 * half, 3),
+        "lanes": lanes,
+        "lanes_assumed": not line.lanes and lanes > (1 if line.oneway else 2),
         **{key: millimetres(value) for key, value in errors.items()},
         "bounds": [
             float(line.x.min()) - half,
@@ -282,13 +302,40 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
     every = [road for row in rows for road in row["roads"]]
     if not every:
         raise ConfigError(f"no road could be written: {rows[0]['problem']}, and so on" if rows else NO_ROAD)
-    write_new(folder / REPORT, _table([{k: v for k, v in road.items() if k != "bounds"} for road in every]))
+    write_new(
+        folder / REPORT, _table([{k: v for k, v in road.items() if k not in INTERNAL} for road in every])
+    )
     return {
         **totals(rows, roads),
         "crg_max_mm": _largest(every, "crg_max_mm"),
         "profiles_mean_mm": _mean(every, "profiles_mean_mm"),
         "profiles_max_mm": _largest(every, "profiles_max_mm"),
+        "elevation_mean_mm": _mean(every, "elevation_mean_mm"),
+        "elevation_max_mm": _largest(every, "elevation_max_mm"),
     }
+
+
+def lane_notes(rows: list[Row]) -> list[str]:
+    """Return notes on roads with lanes of unusual width, and on those divided into lanes by their width."""
+    every = [road for row in rows for road in row["roads"]]
+    assumed = [road for road in every if road["lanes_assumed"]]
+    unusual = [road for road in every if _has_unusual_lanes(road)]
+    notes = []
+    for roads, text in (
+        (assumed, "so wide that its lanes are assumed; give the number of lanes"),
+        (unusual, "with lanes of less than 2 m or more than 6 m; correct width or number of lanes"),
+    ):
+        if roads:
+            widest = max(roads, key=lambda road: float(road["width_m"]))
+            named = f"road {widest['id']}: {widest['width_m']:g} m, {count(widest['lanes'], 'lane')}"
+            notes.append(f"{count(len(roads), 'road')} {text} ({named})")
+    return notes
+
+
+def _has_unusual_lanes(road: Row) -> bool:
+    """Return whether lanes are too wide, or several too narrow."""
+    width = road["width_m"] / road["lanes"]
+    return bool(width > opendrive.WIDEST_M or (road["lanes"] > 1 and width < opendrive.NARROWEST_M))
 
 
 def totals(rows: list[Row], roads: Network) -> dict[str, Any]:

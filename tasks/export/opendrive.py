@@ -25,7 +25,7 @@ from flexroad.tasks.types import Floats
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-VERSION = 1
+VERSION = 2
 NAME = ".xodr"
 MEDIA_TYPE = "application/xml"
 
@@ -39,6 +39,12 @@ west="{west!r}" south="{south!r}" east="{east!r}" north="{north!r}">
   </header>
 """
 FOOTER = "</OpenDRIVE>\n"
+NARROWEST_M, WIDEST_M = 2.0, 6.0
+"""Widths of lanes that roads may have (m): of roads whose number of lanes is not known, it is chosen so."""
+USUAL_M = 4.5
+"""Largest width of the lanes of a road that is divided into more of them (m)."""
+# CARLA's parser raises an error for a lane without a mark.
+NO_MARK = {"sOffset": "0.0", "type": "none", "weight": "standard", "color": "white", "laneChange": "none"}
 SAME_SLOPE = 1e-9
 """Slopes of the width that differ by less belong to one piece."""
 
@@ -86,6 +92,20 @@ def write(file: BinaryIO, roads: Iterable[bytes], proj: str, bounds: Bounds, nam
     file.write(FOOTER.encode())
 
 
+def lane_count(line: ReferenceLine) -> int:
+    """Return the number of lanes: the known one, else two, or one if the road is one-way.
+
+    There are more if these were wider than `WIDEST_M`, and one for both directions if they were narrower than
+    `NARROWEST_M`.
+    """
+    if line.lanes:
+        return line.lanes
+    sides, width = 1 if line.oneway else 2, float(np.median(line.width))
+    if width / sides > WIDEST_M:
+        return sides * math.ceil(width / sides / USUAL_M)
+    return sides if width / sides >= NARROWEST_M else 1
+
+
 def _road(road: Road, left_hand: bool) -> ET.Element:
     ends, lengths = road.line.pieces
     element = ET.Element("road", _attributes(name=printable(road.line.name), length=lengths[-1], id=road.id))
@@ -129,7 +149,7 @@ def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
     A road of several lanes in two directions has half of them on either side. A one-way road has all lanes on
     the side on which traffic goes along the line, and so has a road with one lane for both directions.
     """
-    count = line.lanes or (1 if line.oneway else 2)
+    count = lane_count(line)
     one_sided = line.oneway or count == 1
     left = (count if left_hand else 0) if one_sided else count // 2
     right = count - left
@@ -150,6 +170,7 @@ def _lanes(line: ReferenceLine, left_hand: bool) -> ET.Element:
             lane = ET.SubElement(group, "lane", {**kind, **(both if number else {})})
             for s, a, b in _linear(line, 1 / count) if number else ():
                 ET.SubElement(lane, "width", _attributes(sOffset=s, a=a, b=b, c=0.0, d=0.0))
+            ET.SubElement(lane, "roadMark", NO_MARK)
     return lanes
 
 

@@ -96,7 +96,15 @@ def profiles(grid: HeightGrid, knot_m: float = 5.0) -> Profiles:
 def profile_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
     """Return how far profiles miss the heights of the carriageway: mean, largest (m); NaN if it has none."""
     s = grid.line.s[:, None]
-    fitted = profiles.elevation(s) + grid.v * np.tan(profiles.superelevation(s))
+    return _missed(grid, profiles.elevation(s) + grid.v * np.tan(profiles.superelevation(s)))
+
+
+def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]:
+    """Return the same as `profile_error` for a reader that takes the elevation alone, across a level road."""
+    return _missed(grid, np.broadcast_to(profiles.elevation(grid.line.s[:, None]), grid.heights.shape))
+
+
+def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
     missed = np.abs(fitted - grid.heights)[_carriageway(grid)]
     if not len(missed):
         return np.nan, np.nan

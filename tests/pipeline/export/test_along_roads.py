@@ -99,6 +99,25 @@ def test_lines_lie_on_the_surface_with_its_grade_and_crossfall(city, exported):
     assert set(mine.support) <= {"measured", "dtm", "inferred"}
 
 
+def test_report_has_the_error_by_elevation_alone_and_wide_roads_are_noted(city, tmp_path):
+    columns = {"width_m": [18.0, 16.0], "lanes": [None, 2]}
+    wide = write_lines(tmp_path / "wide.gpkg", city, ACROSS, [(30, 70), (90, 95)], **columns)
+    formats = export(select(city), tmp_path / "out", ["xodr"], Options(roads=str(wide)), SerialExecutor())
+    entry, rows = formats["formats"]["xodr"], table(tmp_path / "out" / "xodr")
+    assert [row["lanes"] for row in rows] == ["4", "2"]
+    assert "lanes_assumed" not in rows[0]
+    for row in rows:
+        assert float(row["elevation_max_mm"]) > float(row["profiles_max_mm"])
+    assert entry["elevation_max_mm"] == max(float(row["elevation_max_mm"]) for row in rows)
+    assert f"by elevation alone (CARLA, SUMO) by {entry['elevation_mean_mm']:.0f} mm" in entry["summary"]
+    assert entry["notes"] == [
+        "1 road so wide that its lanes are assumed; give the number of lanes"
+        f" (road {rows[0]['id']}: 18 m, 4 lanes)",
+        "1 road with lanes of less than 2 m or more than 6 m; correct width or number of lanes"
+        f" (road {rows[1]['id']}: 16 m, 2 lanes)",
+    ]
+
+
 def test_road_ends_where_the_next_tile_is_not_finished(city, exported):
     lane = geopandas.read_file(exported / "lines" / "city_roads.gpkg", layer="roads").geometry[1]
     x, y = shapely.get_coordinates(lane)[-1] - south_west(city)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexroad.tasks.export import opendrive
-from flexroad.tasks.roads.along_line import HeightAt, height_grid, profile_error, profiles
+from flexroad.tasks.roads.along_line import HeightAt, elevation_error, height_grid, profile_error, profiles
 from flexroad.tasks.roads.reference_line import Options as LineOptions
 from flexroad.tasks.roads.reference_line import ReferenceLine, reference_line
 from flexroad.tasks.roads.routes import CentreLine, Route
@@ -94,6 +94,18 @@ def test_write_heights_miss_the_surface_as_reported():
     assert mean_m < max_m < 0.05
 
 
+def test_elevation_error_is_that_of_a_level_cross_section():
+    """A plane with a crossfall of 4% on a road of 6 m: at the edges 0.12 m, on average about half of that."""
+    line = reference(np.array([[0.0, 0.0], [60.0, 0.0]]))
+    grid = height_grid(line, lambda x, y: 150 + 0.02 * x + 0.04 * y)
+    fitted = profiles(grid)
+    mean_m, max_m = elevation_error(grid, fitted)
+    assert max_m == pytest.approx(0.12, abs=1e-6)
+    level = np.abs(0.04 * grid.v[np.abs(grid.v) <= 3.0 + 1e-6])
+    assert mean_m == pytest.approx(level.mean(), abs=1e-6)
+    assert profile_error(grid, fitted)[1] < 1e-6
+
+
 @pytest.mark.parametrize(
     ("known", "left_hand", "left", "right"),
     [
@@ -121,6 +133,37 @@ def test_write_lanes_fill_the_carriageway_around_the_line(known, left_hand, left
             reach[side] = sum(polynomial(lane, "width", s, "sOffset") for lane in lanes)
         assert offset + reach["left"] == pytest.approx(3.0)
         assert offset - reach["right"] == pytest.approx(-3.0)
+
+
+@pytest.mark.parametrize(
+    ("width", "oneway", "left", "right", "lane_m"),
+    [
+        (18.0, False, 2, 2, 4.5),
+        (12.0, False, 1, 1, 6.0),
+        (14.0, False, 2, 2, 3.5),
+        (9.0, True, 0, 2, 4.5),
+        (3.5, False, 0, 1, 3.5),
+        (4.0, False, 1, 1, 2.0),
+    ],
+)
+def test_write_lanes_of_unknown_number_have_a_usual_width(width, oneway, left, right, lane_m):
+    line = reference(oneway=oneway)
+    line = replace(line, width=np.full(len(line.s), width))
+    lanes = {side: only(road(line)).findall(f"lanes/laneSection/{side}/lane") for side in ("left", "right")}
+    assert (len(lanes["left"]), len(lanes["right"])) == (left, right)
+    for lane in lanes["left"] + lanes["right"]:
+        assert polynomial(lane, "width", 50.0, "sOffset") == pytest.approx(lane_m)
+        assert lane.get("direction") == ("both" if (width, oneway) == (3.5, False) else None)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+def test_write_each_lane_has_a_mark_of_no_type_after_its_width(lanes):
+    """CARLA's parser raises an error for a lane without one."""
+    found = only(road(reference(lanes=lanes))).findall("lanes/laneSection/*/lane")
+    assert len(found) == lanes + 1
+    for lane in found:
+        assert [mark.attrib["type"] for mark in lane.findall("roadMark")] == ["none"]
+        assert lane[-1].tag == "roadMark"
 
 
 def test_write_one_lane_for_both_directions_says_so():
