@@ -135,10 +135,11 @@ def branch_piece(branch: Branch, place: Place) -> Piece:
     sheet = relief.sheet(ground, max(2 * ground.error_m, level.pixel_m))
     uri = f"{MESHES}/{branch.id.removeprefix(PREFIX)}{glb.NAME}"
     placed, local = tiles3d.sheet_placed(uri, sheet.points, place.conversion)
-    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY))
+    photo = any(row["photo"] for row in branch.parts)
+    data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
     error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
-    row = row_of(branch.id, branch.cell, placed, error_m) | {"vertical_m": ground.error_m}
+    row = row_of(branch.id, branch.cell, placed, error_m) | {"vertical_m": ground.error_m, "photo": photo}
     return Piece({uri: data, **files}, row | referred)
 
 
@@ -300,7 +301,7 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     side = LEVELS[0].side_m
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
-    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture}
+    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture, "photo": bool(texture)}
     return Piece({uri: _glb(tile, own, place, texture), **files}, row | referred)
 
 
@@ -311,7 +312,7 @@ def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | Non
         data = read(file)
         tile.check_unchanged()
         return data
-    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, tile.surface)
+    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, tile.surface, tile.id)
 
 
 def _without_photo(ids: Sequence[str]) -> str:

@@ -70,7 +70,7 @@ class AnswerTable:
             out.write(text)
 
     def write_geopackage(self, path: Path) -> None:
-        """Write the table as a GeoPackage of points in the CRS of the run.
+        """Write the table as a GeoPackage of points in the CRS of the run, 3D where they have a height.
 
         Raises
         ------
@@ -82,6 +82,8 @@ class AnswerTable:
         known = np.isfinite(self.easting) & np.isfinite(self.northing)
         shapes = np.full(len(known), None, dtype=object)
         shapes[known] = shapely.points(self.easting[known], self.northing[known])
+        high = known & np.isfinite(self.answer.height)
+        shapes[high] = shapely.points(self.easting[high], self.northing[high], self.answer.height[high])
         frame = geopandas.GeoDataFrame(self.table, geometry=shapes, crs=self.crs)
         with ScratchFolder() as folder:
             file = Path(folder, "query.gpkg")

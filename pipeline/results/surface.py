@@ -399,8 +399,14 @@ def open_surface(path: str | Path) -> Surface:
 
 
 def placed(raster: xr.Dataset, crs: str, transform: Affine | None = None) -> xr.Dataset:
-    """Return a raster with a CRS and, if it is given, a transform, as rioxarray reads them."""
+    """Return a raster with a CRS and, if it is given, a transform, as rioxarray reads them.
+
+    The nodata of heights is NaN, of which programs that get them as GeoTIFF would not know otherwise.
+    """
     result: xr.Dataset = rioxarray.raster_dataset.RasterDataset(raster).write_crs(crs)
+    for name, layer in result.data_vars.items():
+        if np.issubdtype(layer.dtype, np.floating):
+            result[name] = layer.rio.write_nodata(np.nan, encoded=True)
     return result if transform is None else result.rio.write_transform(transform)
 
 

@@ -108,7 +108,7 @@ def products(
         for name in graph.export.formats:
             nodes = graph.variants[variant]
             if name == "glb":
-                encoded = _glb(nodes, evaluate, origin, texture)
+                encoded = _glb(graph.tile.id, nodes, evaluate, origin, texture)
             elif name == "ply":
                 encoded = _ply(nodes, evaluate)
             elif name == "cog":
@@ -122,19 +122,20 @@ def products(
 
 
 def _glb(
+    tile_id: str,
     nodes: dict[str, str],
     evaluate: Callable[[str], Any],
     origin: tuple[float, float],
     texture: glb.Texture | None,
 ) -> dict[Kind, bytes]:
     mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
-    return {GLB: glb.encode(mesh, (*origin, 0.0), texture, surface)}
+    return {GLB: glb.encode(mesh, (*origin, 0.0), texture, surface, tile_id)}
 
 
 def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
-    mesh = evaluate(nodes["sample"])
+    mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
     support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
-    return {PLY: ply.encode(mesh, support)}
+    return {PLY: ply.encode(mesh, support, surface)}
 
 
 def _cog(

@@ -2,7 +2,8 @@
 
 glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
 and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
-An orthophoto is embedded as one JPEG image that both nodes share.
+An orthophoto is embedded as one JPEG image that both nodes share. It is shown as it is, without a light
+(``KHR_materials_unlit``): the sun of the flight is in it, and that of a viewer would darken it again.
 
 The file is put together here: trimesh takes four times as long for the same arrays, most of it to compare
 them with each other, and as long as a complete tile to be imported.
@@ -28,7 +29,7 @@ from flexroad.tasks.types import Floats, Mesh, Orthophoto, Surface
 
 Image = lazy("PIL.Image")
 
-VERSION = 3
+VERSION = 4
 NAME = ".glb"
 MEDIA_TYPE = "model/gltf-binary"
 
@@ -42,6 +43,7 @@ SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 """Linear filters and CLAMP_TO_EDGE, in glTF's codes: a border takes no colour of the opposite one."""
 UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5123, 5125, 5126
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+UNLIT = "KHR_materials_unlit"
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 """Twelve of the sixteen figures of a matrix by columns; the place follows."""
 
@@ -82,6 +84,7 @@ def encode(
     run_origin: tuple[float, float, float],
     texture: Texture | None = None,
     surface: Surface | None = None,
+    name: str = "tile",
 ) -> bytes:
     """Return a mesh as GLB.
 
@@ -96,30 +99,31 @@ def encode(
         faces do not depend on it.
     surface : Surface, optional
         That of the mesh, for the normals on the border of the tile (`mesh_normals`).
+    name : str
+        Name of the node of the tile, as its id.
 
     Returns
     -------
     bytes
-        Node ``tile``, translated by the tile's origin minus the run's, with child nodes ``road`` and
-        ``terrain`` (a class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs
-        give equal bytes.
+        A node translated by the tile's origin minus the run's, with child nodes ``road`` and ``terrain`` (a
+        class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh, surface)
     uv = texture_coordinates(mesh, texture.bounds) if texture else None
     file = _File()
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()
-    tile = file.add("nodes", {"name": "tile", "children": [], "matrix": [*IDENTITY, *shift, 1.0]})
+    tile = file.add("nodes", {"name": name, "children": [], "matrix": [*IDENTITY, *shift, 1.0]})
     image = file.add_image(texture.jpeg) if texture else None
-    for name, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
+    for kind, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
         if faces.any():
             used, corners = part(mesh, faces)
             vertices = _Vertices(mesh.vertices[used], normals[used], None if uv is None else uv[used])
-            node = file.add_mesh(vertices, corners, _material(name, colour, image))
+            node = file.add_mesh(vertices, corners, _material(kind, colour, image, image is not None))
             file.tree["nodes"][tile]["children"].append(node)
     return file.encoded(tile, _georeference(mesh, run_origin))
 
 
-def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> bytes:
+def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes, photo: bool) -> bytes:
     """Return a coarse copy of meshes with its image as GLB.
 
     Parameters
@@ -132,6 +136,8 @@ def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> b
         West, south, east and north of the image's outer edges (m, in the CRS of the sheet).
     image : bytes
         The image seen from above, JPEG.
+    photo : bool
+        Whether the image is made of photos, which are shown without a light.
 
     Returns
     -------
@@ -143,7 +149,7 @@ def encode_sheet(sheet: Sheet, local: Floats, bounds: Bounds, image: bytes) -> b
     west, south, east, north = bounds
     uv = (sheet.points[sheet.top, :2] - (west, south)) / (east - west, north - south)
     file = _File()
-    material = _material("ground", (), file.add_image(image))
+    material = _material("ground", (), file.add_image(image), photo)
     node = file.add_mesh(_Vertices(local, top[sheet.top], uv), sheet.faces, material)
     return file.encoded(node)
 
@@ -163,14 +169,14 @@ def _georeference(mesh: Mesh, run_origin: tuple[float, float, float]) -> dict[st
     }
 
 
-def _material(name: str, colour: tuple[int, ...], texture: int | None) -> dict[str, Any]:
+def _material(name: str, colour: tuple[int, ...], texture: int | None, unlit: bool) -> dict[str, Any]:
     """Return the look of a part: an image, or a colour in linear light, 0 to 255."""
     look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.95}
     if texture is None:
         look["baseColorFactor"] = [value / 255 for value in colour]
     else:
         look |= {"roughnessFactor": 1.0, "baseColorTexture": {"index": texture}}
-    return {"name": name, "pbrMetallicRoughness": look}
+    return {"name": name, "pbrMetallicRoughness": look} | ({"extensions": {UNLIT: {}}} if unlit else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +239,8 @@ class _File:
         scene = {"nodes": [root]} | ({"extras": extras} if extras else {})
         head = {"asset": {"version": "2.0", "generator": "FlexRoad"}, "scene": 0, "scenes": [scene]}
         tree = head | self.tree | {"buffers": [{"byteLength": self.size}]}
+        if any("extensions" in material for material in self.tree["materials"]):
+            tree["extensionsUsed"] = [UNLIT]
         text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         chunks = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", self.size, b"BIN\0")]

@@ -28,7 +28,7 @@ from flexroad.tasks.types import Floats, RoadMask, Surface
 
 Image = lazy("PIL.Image")
 
-VERSION = 3
+VERSION = 4
 NAME_PNG = "_heightfield.png"
 NAME_R16 = "_heightfield.r16"
 NAME_HOLES = "_holes.png"
@@ -223,6 +223,14 @@ def encode_sidecar(field: HeightField, crs: str, vertical: str | None = None) ->
     across, along = field.spacing_m
     span = field.high - field.low
     low, high = float(field.filled.min()), float(field.filled.max())
+    unreal = {
+        "unreal": {
+            "scale": [100 * across, 100 * along, 100 * span / UNREAL_RANGE_M],
+            # An Unreal landscape has the height of its origin at the value 32768.
+            "origin_z_cm": 100 * (field.low + 32768 * field.step_m),
+            "axes": "x east, y south, z up; the first node is in the north-west",
+        }
+    }
     return Georeference(crs, (west, south, field.low), vertical).sidecar(
         "row 0 on the northern edge, column 0 on the western edge; nodes on the edges; metres",
         bounds=list(field.bounds),
@@ -235,15 +243,10 @@ def encode_sidecar(field: HeightField, crs: str, vertical: str | None = None) ->
         precision_m=field.step_m / 2,
         nodes_without_height=int(np.isnan(field.heights).sum()),
         holes=f"{HOLE} in the mask of holes; the height of the nearest node with one in the field",
-        unreal={
-            "scale": [100 * across, 100 * along, 100 * span / UNREAL_RANGE_M],
-            # An Unreal landscape has the height of its origin at the value 32768.
-            "origin_z_cm": 100 * (field.low + 32768 * field.step_m),
-            "axes": "x east, y south, z up; the first node is in the north-west",
-        },
         mujoco={
             "size": [(east - west) / 2, (north - south) / 2, max(high - low, FLAT_M), FLAT_M],
             "pos": [(east - west) / 2, (north - south) / 2, low - field.low],
             "axes": "x east, y north, z up; positions are relative to origin",
         },
+        **(unreal if rows in SIZES["unreal"] else {}),
     )

@@ -1,7 +1,8 @@
 """The paper's final mesh as binary PLY, with class and support per face: for CloudCompare, QGIS and scripts.
 
 Coordinates are absolute and float64. trimesh and VTK write float32 vertices, whose resolution is 0.5 m at a
-northing of 5.6 million; therefore the file is written here.
+northing of 5.6 million; therefore the file is written here. VTK also reads them as float32. Vertices have
+normals, and class and support, too: CloudCompare takes scalars of vertices alone.
 """
 
 from __future__ import annotations
@@ -9,16 +10,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.quality.support import Support
-from flexroad.tasks.types import Mesh
+from flexroad.tasks.types import Mesh, Surface
 
-VERSION = 2
+VERSION = 3
 NAME = ".ply"
 MEDIA_TYPE = "application/octet-stream"
 
 ROAD, GROUND = 11, 2
 """Classes of faces: the ASPRS codes of LAS files for road surface and ground."""
 
+VERTEX = np.dtype([("place", "<f8", (3,)), ("normal", "<f4", (3,)), ("class", "u1"), ("support", "u1")])
 FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", (3,)), ("class", "u1"), ("support", "u1")])
 
 HEADER = """\
@@ -32,6 +35,11 @@ element vertex {vertices}
 property double x
 property double y
 property double z
+property float nx
+property float ny
+property float nz
+property uchar class
+property uchar support
 element face {faces}
 property list uchar int vertex_indices
 property uchar class
@@ -40,11 +48,17 @@ end_header
 """
 
 
-def encode(mesh: Mesh, support: NDArray[np.uint8]) -> bytes:
+def encode(mesh: Mesh, support: NDArray[np.uint8], surface: Surface | None = None) -> bytes:
     """Return a mesh as PLY with the support of each face (`tasks.quality.support.Support`, ``(F,)``).
 
-    Vertices are (easting, northing, height) in metres. Header comments give the CRS and, as ``origin``, the
-    tile's whole-metre origin, which programs that compute in float32 can subtract.
+    Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is, and has the
+    highest code of support of its faces: the least certain one. Header comments give the CRS and, as
+    ``origin``, the tile's whole-metre origin, which programs that compute in float32 can subtract.
+
+    Parameters
+    ----------
+    surface : Surface, optional
+        That of the mesh, for the normals on the border of the tile (`mesh_normals`).
     """
     header = HEADER.format(
         crs=" ".join(mesh.crs.split()),  # WKT may hold line breaks, which would end the comment
@@ -60,6 +74,12 @@ def encode(mesh: Mesh, support: NDArray[np.uint8]) -> bytes:
     faces["vertices"] = mesh.faces
     faces["class"] = np.where(mesh.road, ROAD, GROUND)
     faces["support"] = support
-    vertices = (mesh.vertices + np.asarray(mesh.origin, np.float64)).astype("<f8")
+    vertices = np.zeros(len(mesh.vertices), VERTEX)
+    vertices["place"] = mesh.vertices + np.asarray(mesh.origin, np.float64)
+    vertices["normal"] = mesh_normals(mesh, surface)
+    vertices["class"] = GROUND
+    vertices["class"][mesh.faces[mesh.road]] = ROAD
+    for kind in sorted(Support):
+        vertices["support"][mesh.faces[support == kind]] = kind
     # PLY headers are ASCII; names in WKT need not be.
     return header.encode("ascii", "backslashreplace") + vertices.tobytes() + faces.tobytes()

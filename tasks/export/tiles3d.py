@@ -19,7 +19,7 @@ from flexroad.catalog.ellipsoidal import Ellipsoidal, geocentric
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.types import Floats
 
-VERSION = 2
+VERSION = 3
 NAME = ".json"
 MEDIA_TYPE = "application/json"
 ASSET = {"version": "1.1", "generator": "FlexRoad"}

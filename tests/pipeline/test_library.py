@@ -293,6 +293,15 @@ def test_surface_to_xarray_has_height_and_road(surface):
         surface.to_xarray(0)
 
 
+def test_to_xarray_of_surface_and_run_has_nodata(surface, city, tmp_path):
+    for raster in (surface.to_xarray(), flexroad.open_run(city / "runs" / "city").to_xarray()):
+        assert np.isnan(raster.height.rio.nodata)
+        raster.height.rio.to_raster(tmp_path / "height.tif")
+        with rasterio.open(tmp_path / "height.tif") as file:
+            assert np.isnan(file.nodata)
+        assert "_FillValue" not in raster.height.attrs  # xarray refuses to write such an attribute
+
+
 def test_surface_saved_and_opened_is_equal(surface, tmp_path):
     surface.save(tmp_path / "road.npz")
     again = flexroad.open_surface(tmp_path / "road.npz")

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pyproj
 import pytest
+import shapely
 from shapely import LineString, MultiLineString, MultiPoint, Point
 
 from flexroad import open_run
@@ -155,6 +156,7 @@ def test_query_writes_geopackage_in_crs_of_the_run(run, flexroad, tmp_path):
     assert_truth(table[:2])
     np.testing.assert_allclose(table.geometry[:2].get_coordinates(), POINTS, atol=1e-3)
     assert table.geometry.isna().tolist() == [False, False, True]
+    np.testing.assert_array_equal(shapely.get_z(table.geometry[:2].to_numpy()), table.height_m[:2])
     flexroad("query", run, "--points", points, "-o", tmp_path / "answer.csv").expected(0)
     assert_truth(pd.read_csv(tmp_path / "answer.csv")[:2])
 

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from PIL import Image
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
+from flexroad.pipeline.export.height_fields import Lattice
 from flexroad.pipeline.export.source import Options, select
 from tests import validators
 
@@ -27,6 +29,12 @@ def fields(town, tmp_path_factory):
 
 def places(folder):
     return {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
+
+
+def test_settings_of_unreal_are_given_for_its_sizes_alone(fields):
+    for place in places(fields).values():
+        assert place["size"] == [65, 65]
+        assert "unreal" not in place
 
 
 def test_nodes_on_borders_of_neighbours_have_the_same_value(fields):
@@ -57,8 +65,18 @@ def test_limits_are_whole_metres_around_the_heights_of_all_tiles(town, fields):
 
 def test_fields_of_unreal_have_its_sizes_and_the_same_heights(town, tmp_path):
     export(select(town.path), tmp_path, ["heightfield"], Options(nodes="unreal"), SerialExecutor())
-    for file, place in places(tmp_path / "heightfield").items():
+    found = places(tmp_path / "heightfield")
+    # Column from the west and row from the north; the tile in the north-east is not finished.
+    west, _, _, north = np.array([place["bounds"] for place in found.values()]).T
+    names = [
+        f"heightfield_x{round((x - west.min()) / 60)}_y{round((north.max() - y) / 60)}"
+        for x, y in zip(west, north, strict=True)
+    ]
+    assert [file.stem for file in found] == names
+    assert len(set(names)) == 3
+    for file, place in found.items():
         assert place["size"] == [127, 127]
+        assert file.with_name(file.name.replace("heightfield", "holes")).with_suffix(".png").exists()
         values = np.asarray(Image.open(file.with_suffix(".png")), float)
         west, south, east, north = place["bounds"]
         heights, _ = town.at(np.linspace(west, east, 127), np.linspace(north, south, 127)[:, None])
@@ -107,3 +125,14 @@ def test_tile_without_heights_is_named(town, tmp_path, monkeypatch):
     monkeypatch.setattr("flexroad.pipeline.run.finished.FinishedTile.surface", Nothing())
     with pytest.raises(ConfigError, match=f"tile {source.tiles[0].id}: the surface has no height"):
         export(source, tmp_path, ["heightfield"], Options(), SerialExecutor())
+
+
+def test_tiles_without_a_common_lattice_have_none(town):
+    first, *others = town.tiles
+    for grid in (
+        replace(first.grid, west=first.grid.west + 7),
+        replace(first.grid, width=first.grid.width + 60),
+        others[0].grid,
+    ):
+        assert Lattice.of([*others, replace(first, grid=grid)]) is None
+    assert Lattice.of(town.tiles).place(first) == (0, 1)

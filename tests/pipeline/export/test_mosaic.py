@@ -177,7 +177,8 @@ def test_files_of_an_export_that_was_killed_are_removed(town, tmp_path):
         (left / "height").write_bytes(b"draft")
     (of_killed / LOCK).touch()
     export(select(town.path), tmp_path, ["mosaic"], Options(), SerialExecutor())
-    assert sorted(file.name for file in (tmp_path / "mosaic").iterdir()) == [f"{name}.tif" for name in NAMES]
+    found = {file.name for file in (tmp_path / "mosaic").iterdir()}
+    assert found == {f"{name}.tif" for name in NAMES} | {"height.qml", "road.qml", "support.qml"}
 
 
 def sumo_heights(folder, raster, x, y):
@@ -232,3 +233,9 @@ def test_sumo_gives_the_nodes_of_a_network_the_heights_of_the_mosaic(town, tmp_p
     )
     assert np.isnan(heights).all()
     assert said.count("Could not get height data") == 2
+
+
+def test_rasters_have_styles_for_qgis_beside_them(written):
+    assert sorted(path.name for path in written.glob("*.qml")) == ["height.qml", "road.qml", "support.qml"]
+    assert b'type="hillshade"' in (written / "height.qml").read_bytes()
+    assert b'label="Hidden ground' in (written / "support.qml").read_bytes()

@@ -77,6 +77,31 @@ def test_encode_vertices_are_local_and_tile_node_moves_them():
     assert max(np.abs([*a["min"], *a["max"]]).max() for a in positions) <= 10.0
 
 
+def test_encode_tile_node_has_the_given_name():
+    nodes = gltf_json(glb.encode(hills(), RUN_ORIGIN, name="295500_5629250"))["nodes"]
+    assert [node["name"] for node in nodes if "children" in node] == ["295500_5629250"]
+
+
+def test_encode_photos_are_unlit_and_plain_colours_are_not():
+    """A lit photo is darker the lower the sun of the viewer."""
+    photo = glb.texture(colour_by_place(0.5), 85)
+    lit, unlit = (gltf_json(glb.encode(hills(), RUN_ORIGIN, texture)) for texture in (None, photo))
+    assert "extensionsUsed" not in lit
+    assert unlit["extensionsUsed"] == ["KHR_materials_unlit"]
+    for material in unlit["materials"]:
+        assert material["extensions"] == {"KHR_materials_unlit": {}}
+    assert not any("extensions" in material for material in lit["materials"])
+
+
+@pytest.mark.parametrize("photo", [False, True])
+def test_encode_sheet_is_unlit_if_it_has_photos(photo):
+    tree = gltf_json(coarse(b"", photo)[0])
+    assert tree.get("extensionsUsed") == (["KHR_materials_unlit"] if photo else None)
+    assert [material.get("extensions") for material in tree["materials"]] == [
+        {"KHR_materials_unlit": {}} if photo else None
+    ]
+
+
 def test_encode_extras_have_georeference():
     extras = gltf_json(glb.encode(hills(), RUN_ORIGIN))["scenes"][0]["extras"]
     assert extras["crs"] == "EPSG:25832"
@@ -256,12 +281,12 @@ def test_encode_drops_vertices_without_faces():
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
 
 
-def coarse(jpeg: bytes) -> tuple[bytes, Sheet]:
+def coarse(jpeg: bytes, photo: bool = False) -> tuple[bytes, Sheet]:
     """Return the GLB of a slope of 3 x 2 cells of 10 m with a skirt of 4 m."""
     heights = np.add.outer(np.arange(3.0), 2 * np.arange(4.0))
     made = sheet(Relief((100.0, 200.0, 130.0, 220.0), heights, np.ones((2, 3), bool), 0.5), 4.0)
     local = made.points - (100, 200, 0)
-    return glb.encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg), made
+    return glb.encode_sheet(made, local, (100.0, 200.0, 130.0, 220.0), jpeg, photo), made
 
 
 def test_encode_sheet_skirt_has_normals_and_colours_of_the_edge():

@@ -22,7 +22,7 @@ def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Return header lines, vertices and faces, parsed by the PLY specification."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
-    kinds = {"double": "<f8", "uchar": "u1", "int": "<i4"}
+    kinds = {"double": "<f8", "float": "<f4", "uchar": "u1", "int": "<i4"}
     counts, fields, element = {}, {}, ""
     for words in (line.split() for line in lines):
         if words[0] == "element":
@@ -47,6 +47,19 @@ def test_encode_coordinates_are_absolute_and_exact():
     np.testing.assert_array_equal(faces["vertex_indices"], mesh.faces)
     np.testing.assert_array_equal(faces["class"], [2, 11, 2])
     np.testing.assert_array_equal(faces["support"], SUPPORT)
+
+
+def test_encode_vertices_have_normals_class_and_support():
+    _, vertices, _ = parse(ply.encode(roof(), SUPPORT))
+    # The faces are (0, 1, 2), (0, 2, 3), which is road, and (3, 2, 4), with support 1, 2 and 3.
+    np.testing.assert_array_equal(vertices["class"], [11, 2, 11, 11, 2])
+    np.testing.assert_array_equal(vertices["support"], [2, 1, 3, 3, 3])
+    normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    # Vertex 1 is a corner of the first face alone.
+    a, b, c = roof().vertices[:3]
+    face = np.cross(b - a, c - a)
+    np.testing.assert_allclose(normals[1], face / np.linalg.norm(face), atol=1e-6)
 
 
 def test_encode_header_has_crs_and_origin():
