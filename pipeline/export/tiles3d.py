@@ -105,7 +105,7 @@ class Branch:
     @property
     def fingerprint(self) -> str:
         """Name of the mesh by what it is made of."""
-        made_of = [(row["record"], row["digest"], row["error_m"]) for row in self.parts]
+        made_of = [(row["record"], row["digest"], row["error_m"], row["photo"]) for row in self.parts]
         return sha256(f"{self.level} {made_of}".encode()).hexdigest()
 
 
@@ -139,11 +139,11 @@ def branch_piece(branch: Branch, place: Place) -> Piece:
     data = glb.encode_sheet(sheet, local, image.bounds, glb.jpeg(image.complete(), QUALITY), photo)
     error_m = max(ground.error_m, SHARP * level.pixel_m, *(row["error_m"] for row in branch.parts))
     files, referred = record(branch.id, ground, image)
-    row = row_of(branch.id, branch.cell, placed, error_m) | {"vertical_m": ground.error_m, "photo": photo}
+    row = row_of(branch.id, branch.cell, placed, error_m, photo) | {"vertical_m": ground.error_m}
     return Piece({uri: data, **files}, row | referred)
 
 
-def row_of(name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: float) -> Row:
+def row_of(name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: float, photo: bool) -> Row:
     """Return the row of a tile or coarse mesh, without its record."""
     return {
         "id": name,
@@ -152,6 +152,7 @@ def row_of(name: str, cell: tuple[int, int], placed: tiles3d.Placed, error_m: fl
         "transform": placed.transform,
         "region": placed.region,
         "error_m": error_m,
+        "photo": photo,
     }
 
 
@@ -301,7 +302,7 @@ def leaf_piece(leaf: TileItem, place: Place, drape: bool) -> Piece:
     side = LEVELS[0].side_m
     west, south, east, north = grid.bounds
     cell = math.floor((west + east) / 2 / side), math.floor((south + north) / 2 / side)
-    row = row_of(tile.id, cell, placed, 0.0) | {"bare": draped and not texture, "photo": bool(texture)}
+    row = row_of(tile.id, cell, placed, 0.0, bool(texture)) | {"bare": draped and not texture}
     return Piece({uri: _glb(tile, own, place, texture), **files}, row | referred)
 
 

@@ -215,6 +215,13 @@ def test_meshes_of_a_run_with_photos_are_unchanged_and_coarse_ones_have_them(sur
             assert file.read_bytes() == (draped[1] / "coarse" / file.name).read_bytes()
 
 
+def test_photos_are_unlit_and_plain_colours_are_not(survey, plain, draped):
+    files = sorted(draped[1].rglob("*.glb"))
+    unlit = {file.name for file in files if b"KHR_materials_unlit" in file.read_bytes()}
+    assert unlit == {file.name for file in files} - {f"{survey.tiles[WITHOUT].id}.glb"}
+    assert not any(b"KHR_materials_unlit" in file.read_bytes() for file in plain.rglob("*.glb"))
+
+
 def test_drape_without_any_photo_is_refused_before_anything_is_written(survey, tmp_path):
     bare = Catalog((survey.tiles[WITHOUT],))
     run = finished(bare, tmp_path / "bare")
@@ -278,7 +285,7 @@ def far_and_near(folder, place):
         box = (west, south, west + 250, south + 250)
         where = placed(f"tiles/t{number}.glb", box, (90.0, 110.0), place.origin, place.conversion)
         cell = int(west // 1000), int(south // 1000)
-        yield Node(coarse.row_of(f"t{number}", cell, where, 0.0) | referred)
+        yield Node(coarse.row_of(f"t{number}", cell, where, 0.0, False) | referred)
 
 
 def test_blocks_have_nested_levels_where_there_is_more_than_one_tile(tmp_path):
