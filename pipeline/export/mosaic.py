@@ -30,7 +30,7 @@ from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
 from flexroad.pipeline.export.source import Options, Source
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.export import cog, qgis_style
+from flexroad.tasks.export import cog
 from flexroad.tasks.types import Floats
 
 rasterio = lazy("rasterio")
@@ -104,8 +104,8 @@ def write_mosaics(
             target = folder / f"{layer.name}.tif"
             with atomic_file(target) as local, _gdal(target, **limits):
                 _finish(drafts / layer.name, local, layer)
-            if style := qgis_style.encode(layer.bands[0]) if len(layer.bands) == 1 else b"":
-                write(folder / f"{layer.name}{qgis_style.NAME}", style)
+            if style := cog.encode_style(layer.bands[0]) if len(layer.bands) == 1 else b"":
+                write(folder / f"{layer.name}{cog.NAME_STYLE}", style)
 
 
 @contextmanager

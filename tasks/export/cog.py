@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,16 @@ VERSION = 4
 NAME_HEIGHT = "_height.tif"
 NAME_ROAD = "_road.tif"
 NAME_SUPPORT = "_support.tif"
+NAME_STYLE = ".qml"
 MEDIA_TYPE = "image/tiff; application=geotiff; profile=cloud-optimized"
 BLOCK = 512
 """Largest width and height of the blocks of a file (cells)."""
 BLOCK_MULTIPLE = 16
 """TIFF wants blocks whose width and height are multiples of this (cells)."""
+STYLE_DOCTYPE = b"<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+HILLSHADE = {"type": "hillshade", "azimuth": "315", "angle": "45", "zfactor": "1", "multidirection": "0"}
+RENDERER = {"band": "1", "opacity": "1", "alphaBand": "-1"}
+"""Attributes of QGIS's renderers of rasters."""
 LEVEL = 4
 """Level of deflate, 1 to 9: above it, heights get 2% smaller in up to twice the time."""
 
@@ -117,6 +123,30 @@ def encode_support(support: NDArray[np.uint8], grid: Grid) -> bytes:
         If the array does not have the grid's shape.
     """
     return _encode(support, grid, grid.crs, SUPPORT, overview_resampling="mode")
+
+
+def encode_style(band: Band) -> bytes:
+    """Return the look of a raster of one band in QGIS, which reads it from a file of the same name beside it.
+
+    Classes have their names and colours, of which the raster has the colours alone. Heights are a hillshade.
+    """
+    style = ET.Element("qgis", {"version": "3.28.0", "styleCategories": "Symbology"})
+    pipe = ET.SubElement(style, "pipe")
+    kind = {"type": "paletted"} if band.classes else HILLSHADE
+    renderer = ET.SubElement(pipe, "rasterrenderer", kind | RENDERER)
+    if band.classes:
+        palette = ET.SubElement(renderer, "colorPalette")
+        for entry in band.classes:
+            if entry.value != band.nodata:
+                colour = "#{:02x}{:02x}{:02x}".format(*entry.colour)
+                ET.SubElement(
+                    palette,
+                    "paletteEntry",
+                    {"value": f"{entry.value:d}", "color": colour, "alpha": "255", "label": entry.meaning},
+                )
+    ET.indent(style, " ")
+    text: bytes = ET.tostring(style, "utf-8")
+    return STYLE_DOCTYPE + text + b"\n"
 
 
 def _encode(values: NDArray[Any], grid: Grid, crs: str, band: Band, **options: Any) -> bytes:

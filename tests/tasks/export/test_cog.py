@@ -1,3 +1,5 @@
+from xml.etree import ElementTree as ET
+
 import numpy as np
 import pytest
 import rasterio
@@ -105,3 +107,21 @@ def test_encode_block_is_as_large_as_a_small_raster(size, block, tmp_path):
     assert cog_validate(file, strict=True) == (True, [], [])
     with rasterio.open(file) as raster:
         assert raster.block_shapes == [(block, block)]
+
+
+@pytest.mark.parametrize("band", [cog.ROAD, cog.SUPPORT], ids=["road", "support"])
+def test_encode_style_classes_have_the_names_and_colours_of_the_raster(band):
+    renderer = ET.fromstring(cog.encode_style(band)).find("pipe/rasterrenderer")
+    assert (renderer.attrib["type"], renderer.attrib["band"]) == ("paletted", "1")
+    entries = [
+        (int(entry.attrib["value"]), entry.attrib["label"], bytes.fromhex(entry.attrib["color"][1:]))
+        for entry in renderer.iter("paletteEntry")
+    ]
+    # Nodata is transparent.
+    assert entries == [(c.value, c.meaning, bytes(c.colour)) for c in band.classes if c.value != band.nodata]
+
+
+def test_encode_style_heights_are_hillshade():
+    renderer = ET.fromstring(cog.encode_style(cog.HEIGHT)).find("pipe/rasterrenderer")
+    assert renderer.attrib["type"] == "hillshade"
+    assert len(renderer) == 0
