@@ -30,8 +30,7 @@ import rasterio
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.benchmark.scenes import write_scenes
-from flexroad.pipeline.benchmark.truth import CATALOG
+from flexroad.pipeline.benchmark.scenes import TRUE_CATALOG, write_scenes
 from flexroad.pipeline.cli.main import main as flexroad
 from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES
@@ -104,7 +103,7 @@ def show(rows: pd.DataFrame) -> None:
 
 def benchmark(tiles: int, scratch: Path) -> None:
     """Compare on synthetic tiles: all road, road below crowns, and road below any high object."""
-    catalog = Catalog.read(write_scenes(scratch, tiles, SEED, preset="gerod").with_name(CATALOG))
+    catalog = Catalog.read(write_scenes(scratch, tiles, SEED, preset="gerod").with_name(TRUE_CATALOG))
     scenes = {name: place for name, *place in gerod.survey(tiles, SEED)}
     rows, hidden = [], []
     for tile in catalog.tiles:

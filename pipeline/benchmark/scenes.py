@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import shapely
 
-from flexroad.catalog import Catalog, Grid, Tile
+from flexroad.catalog import Catalog, Grid, Layer, Tile
 from flexroad.catalog.headers.vectors import opened, with_roads
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.sources import prepared
 from flexroad.catalog.storage.outputs import output_file
-from flexroad.pipeline.benchmark.dsc3d import write_stand_in
-from flexroad.pipeline.benchmark.truth import CATALOG, KNOWN, with_truth
+from flexroad.catalog.storage.paths import write
 from flexroad.pipeline.errors import ConfigError
-from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Jobs
+from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, Jobs, SerialExecutor
+from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
+from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.tasks.io.vectors import vector_date
 from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
+from flexroad.tasks.synthetic.dsc3d import Place
 from flexroad.tasks.synthetic.orthophoto import orthophoto
+from flexroad.tasks.synthetic.photogrammetry import encode, photogrammetry
 
 geopandas = lazy("geopandas")
 
@@ -31,10 +34,17 @@ TILES, SIZE_M = 4, 250
 """Default number and side (m) of the tiles."""
 MADE = datetime(2025, 1, 1, tzinfo=UTC)
 """Date of the data; fixed, so that the same command writes the same files."""
+KNOWN = "known"
+"""Folder of the true layers."""
+TRUE_CATALOG = "catalog_true.parquet"
+"""The second catalog: the same layers, with the true heights and roads as reference."""
+TRUE_LAYERS = ("reference", "reference_road")
+STAND_IN = "synthetic photogrammetry, stand-in for DSC3D, seed {}"
+"""Name of the data of the preset dsc3d."""
 
 
 @dataclass(frozen=True)
-class SceneJob:
+class _SceneJob:
     """One tile to write."""
 
     folder: str
@@ -100,8 +110,8 @@ def write_scenes(
         tiles_written = prepared.with_neighbours(written)
         catalog = Catalog(_with_roads(folder / "roads.gpkg", jobs, tiles_written))
         if preset:
-            true = tuple(with_truth(tile, KNOWN, tile.dataset) for tile in catalog.tiles)
-            Catalog(true).write(folder / CATALOG)
+            true = tuple(_with_truth(tile, KNOWN, tile.dataset) for tile in catalog.tiles)
+            Catalog(true).write(folder / TRUE_CATALOG)
         catalog.write(path)
     except OSError as error:
         raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
@@ -110,11 +120,11 @@ def write_scenes(
 
 def _jobs(
     folder: Path, tiles: int | None, seed: int, size_m: int | None, dop: bool, preset: str | None
-) -> list[SceneJob]:
+) -> list[_SceneJob]:
     if preset is None:
         name, options = f"synthetic, seed {seed}", SceneOptions()
         return [
-            SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop, extended_dtm=False)
+            _SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop, extended_dtm=False)
             for tile_id, grid in block(tiles or TILES, size_m or SIZE_M)
         ]
     if preset not in PRESETS:
@@ -124,12 +134,12 @@ def _jobs(
         raise ConfigError(f"--tile-size {size_m}: tiles of {preset} have {own_m} m; leave --tile-size out")
     name = f"synthetic benchmark {preset}, seed {seed}"
     return [
-        SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop, extended_dtm=True)
+        _SceneJob(str(folder), tile_id, grid, seed, stratum, options, name, dop, extended_dtm=True)
         for tile_id, grid, stratum, options in gerod.survey(tiles or gerod.TILES, seed)
     ]
 
 
-def _write_scene(job: SceneJob) -> Tile | str:
+def _write_scene(job: _SceneJob) -> Tile | str:
     arguments = (job.grid, job.seed, job.stratum, job.options)
     scene = make_scene(*arguments)
     layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
@@ -141,7 +151,7 @@ def _write_scene(job: SceneJob) -> Tile | str:
     return prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
 
 
-def _with_roads(path: Path, jobs: Sequence[SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
+def _with_roads(path: Path, jobs: Sequence[_SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
     """Write the centre lines of all scenes to one file; return the tiles with it as layer ``roads``."""
     output_file(path).unlink(missing_ok=True)
     # Neighbouring tiles share streets; equal lines are written once.
@@ -169,5 +179,100 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _failure(job: SceneJob, reason: str) -> Tile | str:
+def _failure(job: _SceneJob, reason: str) -> Tile | str:
     return f"scene {job.tile_id}: {reason}"
+
+
+def _with_truth(tile: Tile, folder: str, dataset: str) -> Tile:
+    """Return a tile with the truth as reference, whose layers are in a folder relative to the tile's root."""
+    layers = tuple(
+        Layer(layer.name, (f"{folder}/{layer.name}/{tile.id}.tif",)) if layer.name in TRUE_LAYERS else layer
+        for layer in tile.layers
+    )
+    return replace(tile, layers=layers, dataset=dataset)
+
+
+@dataclass(frozen=True)
+class _StandInJob:
+    """One scene to write."""
+
+    folder: str
+    place: Place
+    seed: int
+
+
+def write_stand_in(folder: Path, scenes: int | None, seed: int, executor: Executor | None = None) -> Path:
+    """Write the stand-in for DSC3D; return the path of the catalog with the paper's reference.
+
+    The folder of a scene contains ``mesh.glb``, its true layers (``known/<layer>/<scene>.tif``), and the
+    rasters and catalog that ``prepare mesh`` writes. In the folder above are the catalogs of all scenes.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder.
+    scenes : int, optional
+        Number of scenes; all five if None.
+    seed : int
+        Seed of the world.
+    executor : Executor, optional
+        Executor of the scenes; this process if None.
+
+    Raises
+    ------
+    ConfigError
+        If ``scenes`` is too large, a scene fails, or the folder cannot be written.
+    """
+    available = len(dsc3d.SITES)
+    if scenes is not None and scenes > available:
+        raise ConfigError(
+            f"--tiles {scenes}: dsc3d has {available} scenes; leave --tiles out for all of them"
+        )
+    places = dsc3d.survey(scenes or available, seed)
+    jobs = [_StandInJob(str(folder), place, seed) for place in places]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for error in (executor or SerialExecutor()).map(_write_stand_in, jobs, _stand_in_failure):
+            if error:
+                raise ConfigError(error)
+        tiles = [_stand_in_tile(folder, place) for place in places]
+        true = f"{STAND_IN.format(seed)}; true reference"
+        Catalog(tuple(_with_truth(tile, f"{tile.id}/{KNOWN}", true) for tile in tiles)).write(
+            folder / TRUE_CATALOG
+        )
+        Catalog(tuple(tiles)).write(folder / "catalog.parquet")
+    except OSError as error:
+        raise ConfigError(f"cannot write scenes to {folder}: {error}") from error
+    return folder / "catalog.parquet"
+
+
+def _write_stand_in(job: _StandInJob) -> str:
+    scene = photogrammetry(job.place, job.seed)
+    folder = Path(job.folder) / scene.name
+    truth = scene.truth
+    layers = {
+        "road_mask": truth.road_mask,
+        "reference": truth.reference,
+        "reference_road": truth.reference_road,
+    }
+    name = STAND_IN.format(job.seed)
+    prepared.write_tile(folder / KNOWN, scene.name, truth.grid, layers, truth.stratum, MADE, name)
+    write(folder / "mesh.glb", encode(scene.mesh))
+    roads = folder / KNOWN / "road_mask" / f"{scene.name}.tif"
+    options = PrepareOptions(roads=roads, date=MADE, dataset=name)
+    prepare_mesh(
+        folder / "mesh.glb", folder, options, MeshOptions(), POINTS, SerialExecutor(), lambda _: None
+    )
+    return ""
+
+
+def _stand_in_failure(job: _StandInJob, reason: str) -> str:
+    return f"scene {job.place.site.name}: {reason}"
+
+
+def _stand_in_tile(folder: Path, place: Place) -> Tile:
+    """Return the tile of a scene with paths relative to the folder above."""
+    name = place.site.name
+    (tile,) = Catalog.read(folder / name / "catalog.parquet").tiles
+    tile = tile.renamed(lambda file: f"{name}/{Path(file).name}")
+    return replace(tile, id=name, root=str(folder.resolve()), stratum=place.site.stratum)

@@ -13,10 +13,9 @@ from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.text import printable, shown
 from flexroad.pipeline.config import document
 from flexroad.pipeline.config.cluster import Cluster
-from flexroad.pipeline.config.merge import merge
 from flexroad.pipeline.config.methods import DEFAULTS
 from flexroad.pipeline.config.models import TAG, Config, Export, stage_models
-from flexroad.pipeline.config.settings import Setting, applied
+from flexroad.pipeline.config.settings import Setting, applied, merge
 from flexroad.pipeline.errors import ConfigError
 
 SPLINE = "; the solver is a method of its own: fit: {method: smoothing_spline}"

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from flexroad.catalog import Catalog, Tile
-from flexroad.pipeline.benchmark.dsc3d import write_stand_in
+from flexroad.pipeline.benchmark.scenes import write_stand_in
 from flexroad.tasks import load, sample
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.fit import plane, raster
