@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,12 @@ def overlap(a: Bounds, b: Bounds, tolerance: float = 0.0) -> bool:
 def is_whole(number: float) -> bool:
     """Return whether a number is an integer, at least 1, except for rounding."""
     return round(number) >= 1 and math.isclose(round(number), number, rel_tol=1e-9)
+
+
+def union(areas: Iterable[Bounds]) -> Bounds:
+    """Return the bounds of one or more areas together."""
+    wests, souths, easts, norths = zip(*areas, strict=True)
+    return min(wests), min(souths), max(easts), max(norths)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,9 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.crs import bounds_in, in_plan, is_projected, plan_unit, same, scales, short
+from flexroad.catalog.crs_checks import elsewhere, require_scale
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole
+from flexroad.catalog.grid import FARTHEST, LATTICE_TOLERANCE, Bounds, Grid, is_whole, union
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import RasterFile, require_metric, skip, zoned
 from flexroad.catalog.limits import MIN_COVER
@@ -141,6 +142,9 @@ def cut(
     grid_crs = Counter(file.crs for file in dsm).most_common(1)[0][0]
     if conversion.to_crs:
         grid_crs = in_plan(conversion.to_crs)
+        area = bounds_in(grid_crs, dsm[0].crs, dsm[0].bounds)
+        if np.isfinite(area).all():
+            require_scale(f"--to-crs {conversion.to_crs}", grid_crs, area, "give --to-crs {zone}")
     else:
         require_metric(next(file for file in dsm if file.crs == grid_crs), "--reproject")
     placed, left_out = {}, list[str]()
@@ -156,6 +160,9 @@ def cut(
     if not any(file.crs == grid_crs for file in dsm):
         notes.append(f"the tiles have cells of {next(iter(grids.values())).cell:g} m")
     near = {name: _near(grids, files) for name, files in placed.items()}
+    for name, by_tile in near.items():
+        if not any(tile.files for tile in by_tile.values()):
+            raise CatalogError(_far(name, placed[name], grids))
     # Of the complete layer, so that all tiles describe it in the same way.
     bare = {name: None if all(p.file.has_crs for p in files) else crs for name, files in placed.items()}
     others = {name: any(not same(p.file.crs, grid_crs) for p in files) for name, files in placed.items()}
@@ -327,6 +334,15 @@ def _near(grids: Mapping[str, Grid], files: Sequence[_PlacedFile]) -> dict[str, 
         on_tile = [placed.file for placed in compress(nearby, core)]
         near[tile_id] = _NearFiles(nearby, on_tile, shared[begin:end][core])
     return near
+
+
+def _far(name: str, files: Sequence[_PlacedFile], grids: Mapping[str, Grid]) -> str:
+    """Return that a layer reaches no tile, and where both lie."""
+    first = files[0].file
+    bounds = union(placed.file.bounds for placed in files if placed.file.crs == first.crs)
+    target, ground = next(iter(grids.values())).crs, union(grid.bounds for grid in grids.values())
+    names = some([placed.file.name for placed in files])
+    return f"{name} reaches no tile: {names} {elsewhere(first.crs, bounds, target, ground, REACH_M)}"
 
 
 def _covered(

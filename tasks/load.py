@@ -20,6 +20,7 @@ from flexroad.catalog.tile import HEIGHTS
 from flexroad.tasks import options
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note, survey_difference
+from flexroad.tasks.io.height_offset import offset_note
 from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
 from flexroad.tasks.types import Bools, Floats, Source, TileData
@@ -105,8 +106,9 @@ def load(tile: Tile, options: Options) -> TileData:
         mosaics["dsm"].check_valid(tile, options.min_valid)
         mosaics["dtm"].check_valid(tile, 0.0)
     offset_dsm, remarks = _offset(tile, options)
-    if swapped := below_ground_note(mosaics["dsm"].values, mosaics["dtm"].values):
-        remarks = [*remarks, swapped]
+    models = mosaics["dsm"].values, mosaics["dtm"].values
+    if suspect := offset_note(*models) or below_ground_note(*models):
+        remarks = [*remarks, suspect]
     return TileData(
         tile_id=tile.id,
         grid=grid,

@@ -9,11 +9,14 @@ import numpy as np
 from rasterio.enums import Resampling
 
 from flexroad.catalog.crs import height_unit, in_plan, is_geographic, is_projected, plan_unit, same, short
+from flexroad.catalog.crs_checks import require_scale
+from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.dsm_and_dtm import below_ground_note
+from flexroad.tasks.io.height_offset import offset_note
 from flexroad.tasks.io.height_units import UNITS, absurd_note, remove_absurd
 from flexroad.tasks.io.raster import RasterWindow, misalignment, resample_to
 from flexroad.tasks.io.raster_grid import RasterGrid
@@ -67,6 +70,7 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
         name: _patch(name, array) for name, array in (("dsm", dsm), ("dtm", dtm), ("road_mask", road_mask))
     }
     core = _grid(patches["dsm"])
+    _check_scale(core)
     grid = core.buffered(options.halo_m)
     notes: list[str | None] = [_absurd(patches[name]) for name in ("dsm", "dtm")]
     notes += [_misfit(patches[name], core) for name in ("dtm", "road_mask")]
@@ -75,7 +79,8 @@ def load_arrays(dsm: xr.DataArray, dtm: xr.DataArray, road_mask: xr.DataArray, o
     _check_valid("dsm", heights["dsm"][window], options.min_valid)
     _check_valid("dtm", heights["dtm"][window], 0.0)
     road = np.nan_to_num(_onto(patches["road_mask"], grid, Resampling.nearest)) != 0
-    notes += [below_ground_note(heights["dsm"], heights["dtm"])]
+    models = heights["dsm"], heights["dtm"]
+    notes += [offset_note(*models) or below_ground_note(*models)]
     notes += [] if road[window].any() else [WITHOUT_ROAD]
     return TileData(
         TILE_ID,
@@ -128,6 +133,15 @@ def _crs(name: str, array: xr.DataArray) -> str:
     if not is_projected(crs) or not math.isclose(metres, 1.0):
         raise TaskError(f"{name} is in {short(crs)}, whose coordinates are in {unit}; {remedy}")
     return crs
+
+
+def _check_scale(grid: Grid) -> None:
+    """Raise an error if a metre of the CRS is none on the ground."""
+    remedy = "reproject it to metres, e.g. dsm.rio.reproject('{zone}')"
+    try:
+        require_scale("dsm", grid.crs, grid.bounds, remedy)
+    except CatalogError as error:
+        raise TaskError(str(error)) from error
 
 
 def _check_unit(name: str, array: xr.DataArray, crs: str) -> None:

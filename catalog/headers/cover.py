@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from flexroad.catalog.crs import same, transformer
+from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
@@ -58,7 +59,8 @@ def height_share(
         try:
             # Neighbouring tiles lie on the same files.
             with quiet(), kept_raster(path, allowed) as raster:
-                if not _add(known, grid, raster, raster.crs.to_wkt() if raster.crs else crs):
+                own_crs = crs_of(raster.crs.to_wkt() if raster.crs else None, crs, raster.bounds)
+                if not _add(known, grid, raster, own_crs):
                     return None
         except (*ERRORS, CatalogError):
             return None

@@ -25,6 +25,7 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 
 from flexroad.catalog.crs import bounds_in, height_unit, in_plan, plan_unit, short, utm_of
+from flexroad.catalog.crs_checks import angle_fault, crs_of, require_scale
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
@@ -64,7 +65,7 @@ class RasterFile:
     crs: str
     """Horizontal CRS: ``EPSG:25832``, or WKT where there is no code."""
     has_crs: bool
-    """False if the file has no CRS and the caller's is used."""
+    """False if the file has no CRS, or none that can be its own, and the caller's is used."""
     bounds: Bounds
     cell: float
     """Cell size, rounded to 1e-6 (units of the CRS)."""
@@ -336,12 +337,15 @@ def _open(root: Path, path: Path, crs: str | None, allowed: AllowedFolders, heig
         raise _Skip(f"it {fault}")
     if transform.b or transform.d:
         raise _Skip("a rotated raster; turn it north up with gdalwarp")
-    plan, crs_unit = _system(wkt, crs)
+    has_crs = bool(wkt) and crs_of(wkt, crs, bounds) == wkt
+    plan, crs_unit = _system(wkt if has_crs else "", crs)
+    if angles := angle_fault(plan, bounds):
+        raise _Skip(f"it {angles}; give its CRS with --crs, or declare it with gdal_edit.py -a_srs")
     west, south, east, north = bounds
     return RasterFile(
         name=_name(root, path),
         crs=plan,
-        has_crs=bool(wkt),
+        has_crs=has_crs,
         # GDAL swaps south and north of XYZ files that are sorted from south to north.
         bounds=(west, min(south, north), east, max(south, north)),
         cell=_cell(transform),
@@ -397,7 +401,7 @@ def zoned(date: datetime) -> datetime:
 
 
 def require_metric(file: RasterFile, option: str = "") -> None:
-    """Check that a file's horizontal CRS is in metres.
+    """Check that a file's horizontal CRS is in metres, which are metres on the ground.
 
     Parameters
     ----------
@@ -411,14 +415,15 @@ def require_metric(file: RasterFile, option: str = "") -> None:
         If it is not; the message names the command that reprojects the file.
     """
     unit, metres = plan_unit(file.crs)
+    instead = f", or use {option} --to-crs {{zone}}" if option else ""
+    remedy = f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {{zone}}{instead}"
     if unit in ("metre", "meter") and metres == 1.0:
+        require_scale(file.name, file.crs, file.bounds, remedy)
         return
     units = unit.replace("foot", "feet") if "foot" in unit else f"{unit}s"
     zone = utm_of(bounds_in("EPSG:4326", file.crs, file.bounds))
-    instead = f", or use {option} --to-crs {zone}" if option else ""
     raise CatalogError(
-        f"{file.name} is in {short(file.crs)}, whose unit is {units}; "
-        f"reproject to a metric CRS first, e.g. gdalwarp -t_srs {zone}{instead}"
+        f"{file.name} is in {short(file.crs)}, whose unit is {units}; {remedy.format(zone=zone)}"
     )
 
 

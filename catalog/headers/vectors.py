@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexroad.catalog.crs import bounds_in
+from flexroad.catalog.crs import bounds_in, transformer
+from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
@@ -26,6 +29,8 @@ MARGIN_M = 1.0
 """Extents are larger than the features' bounds by this much (m): those of a straight road are empty."""
 EVERYWHERE: Bounds = (-1e9, -1e9, 1e9, 1e9)
 """Extent of a file that may have features anywhere (m)."""
+NOWHERE: Bounds = (math.inf, math.inf, 0.0, 0.0)
+"""Extent of a file that reaches nothing: it has no features, or they have no place in the tiles' CRS."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class VectorFile:
     path: Path
     """Absolute."""
     has_crs: bool
-    """False if the file has no CRS and the caller's is used."""
+    """False if the file has no CRS, or none that can be its own, and the caller's is used."""
     extents: tuple[tuple[str, Bounds], ...] | None
     """CRS and bounds of each layer with features, or None if the format does not store them."""
     sublayer: str | None = None
@@ -125,18 +130,36 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
         )
     if not infos:
         raise CatalogError(f"--roads {path} is not a vector file: it has no layer with geometries")
-    has_crs = all(info["crs"] for info in infos)
-    if not has_crs and crs is None:
-        raise CatalogError(
-            f"--roads {path} has no CRS; give it with --crs, or add it to the file with ogr2ogr -a_srs"
-        )
+    systems = [_system(path, info, crs) for info in infos]
+    has_crs = [info["crs"] for info in infos] == systems
     # An empty layer has no bounds.
     extents = tuple(
-        (info["crs"] or str(crs), tuple(info["total_bounds"]))
-        for info in infos
+        (system, tuple(info["total_bounds"]))
+        for info, system in zip(infos, systems, strict=True)
         if info["total_bounds"] is not None
     )
     return VectorFile(path.resolve(), has_crs, None if no_bounds else extents, sublayer)
+
+
+def _system(path: Path, info: Mapping[str, Any], given: str | None) -> str:
+    """Return the CRS of an opened layer; see `crs_of`."""
+    bounds = bounds_of(info)
+    system = crs_of(info["crs"], given, bounds)
+    if system is None:
+        raise CatalogError(
+            f"--roads {path} has no CRS; give it with --crs, or add it to the file with ogr2ogr -a_srs"
+        )
+    if angles := angle_fault(system, bounds):
+        raise CatalogError(
+            f"--roads {path} {angles}; give its CRS with --crs, or add it to the file with ogr2ogr -a_srs"
+        )
+    return system
+
+
+def bounds_of(info: Mapping[str, Any]) -> Bounds:
+    """Return the bounds of an opened layer (pyogrio's), NaN if they are unknown or it has no feature."""
+    bounds = info["total_bounds"]
+    return (math.nan,) * 4 if bounds is None else tuple(bounds)
 
 
 def with_roads(
@@ -161,7 +184,7 @@ def with_roads(
     extents = {target: np.array([_extent(file, target) for file in files]) for target in systems}
     near = np.array([_near(tile, extents[tile.grid.crs]) for tile in tiles])
     far = [
-        f"--roads {file.path} reaches no tile; check its CRS and its extent"
+        f"--roads {file.path} {_far(file, tiles)}"
         for number, file in enumerate(files)
         if not near[:, number].any()
     ]
@@ -176,19 +199,32 @@ def with_roads(
     return with_layer, [f"skipped {line}" for line in far]
 
 
+def _far(file: VectorFile, tiles: Sequence[Tile]) -> str:
+    """Return that a file reaches no tile, and where both lie."""
+    text = "reaches no tile; check its CRS and its extent"
+    if not file.extents:
+        return text
+    target = tiles[0].grid.crs
+    ground = union([tile.grid.bounds for tile in tiles if tile.grid.crs == target])
+    return f"{text}: it {elsewhere(*file.extents[0], target, ground, REACH_M)}"
+
+
 def _extent(file: VectorFile, target: str) -> Bounds:
     """Return the extent of a file in a CRS (m): all of the ground if its bounds are unknown there."""
     if file.extents is None:
         return EVERYWHERE
     placed = [_placed(crs, target, bounds) for crs, bounds in file.extents]
-    # The empty extent of a file without features reaches nothing.
-    wests, souths, easts, norths = zip(*placed, strict=True) if placed else ([np.inf], [np.inf], [0.0], [0.0])
-    return min(wests) - MARGIN_M, min(souths) - MARGIN_M, max(easts) + MARGIN_M, max(norths) + MARGIN_M
+    west, south, east, north = union(placed or [NOWHERE])
+    return west - MARGIN_M, south - MARGIN_M, east + MARGIN_M, north + MARGIN_M
 
 
 def _placed(crs: str, target: str, bounds: Bounds) -> Bounds:
     placed = bounds_in(target, crs, bounds)
-    return placed if np.isfinite(placed).all() else EVERYWHERE
+    if np.isfinite(placed).all():
+        return placed
+    west, south, east, north = bounds
+    corners = transformer(crs, target).transform((west, east, west, east), (south, south, north, north))
+    return EVERYWHERE if np.isfinite(corners).all(axis=0).any() else NOWHERE
 
 
 def _near(tile: Tile, extents: NDArray[np.float64]) -> NDArray[np.bool_]:

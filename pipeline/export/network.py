@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.errors import CatalogError
-from flexroad.catalog.grid import Bounds
+from flexroad.catalog.grid import Bounds, union
 from flexroad.catalog.headers.vectors import opened
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import count
@@ -83,7 +83,7 @@ def _read(source: Source, options: Options) -> CentreLines:
     """Return the centre lines whose boxes touch the tiles."""
     if options.roads is not None:
         layer = _given(Path(options.roads), options.roads_layer, source.crs)
-        places = {layer: _around([tile.grid.bounds for tile in source.tiles])}
+        places = {layer: union([tile.grid.bounds for tile in source.tiles])}
         chosen = rasterise.Options()
     else:
         places = _of_catalog(source)
@@ -130,14 +130,7 @@ def _of_catalog(source: Source) -> dict[Layer, Bounds]:
         raise ConfigError(
             f"the catalog of {source.run.path} has no roads: name a file of centre lines with --roads"
         )
-    return {layer: _around(bounds) for layer, bounds in tiles.items()}
-
-
-def _around(bounds: list[Bounds]) -> Bounds:
-    edges = np.array(bounds)
-    west, south = map(float, edges[:, :2].min(axis=0))
-    east, north = map(float, edges[:, 2:].max(axis=0))
-    return west, south, east, north
+    return {layer: union(bounds) for layer, bounds in tiles.items()}
 
 
 def _clipped(lines: tuple[CentreLine, ...], ground: shapely.Geometry) -> list[CentreLine]:
@@ -162,7 +155,7 @@ def _frame(source: Source) -> LocalFrame:
     """Return the frame around the selected tiles, finished or not: it stays as tiles are finished."""
     left_out = set(source.left_out)
     selected = [tile for tile in source.run.catalog.usable if tile.id in left_out]
-    west, south, east, north = _around([tile.grid.bounds for tile in (*source.tiles, *selected)])
+    west, south, east, north = union([tile.grid.bounds for tile in (*source.tiles, *selected)])
     return LocalFrame.around(source.crs, (west + east) / 2, (south + north) / 2)
 
 

@@ -24,6 +24,7 @@ from rasterio.windows import Window
 
 from flexroad.catalog import LAYERS, Catalog, Grid, Layer, Tile
 from flexroad.catalog.crs import compound
+from flexroad.catalog.crs_checks import require_scale
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.rasters import opened, zoned
 from flexroad.catalog.headers.vectors import VectorFile, with_roads
@@ -90,6 +91,8 @@ class RasterWriter:
     ------
     ConfigError
         If the folder cannot be written.
+    CatalogError
+        If a metre of the CRS is none on the ground.
     """
 
     def __init__(
@@ -100,6 +103,7 @@ class RasterWriter:
         tags: Mapping[str, str],
         vertical: str | None = None,
     ) -> None:
+        require_scale("the rasters", grid.crs, grid.bounds, "give a CRS in metres with --to-crs {zone}")
         self.out = out
         self.grid = grid
         self.photo_grid = Grid.covering(grid.crs, grid.bounds, dop_cell) if dop_cell else None

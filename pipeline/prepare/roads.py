@@ -15,6 +15,7 @@ from rasterio.warp import Resampling, reproject
 
 from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
+from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.open_vector import vector_name
 from flexroad.catalog.headers.valid_cells import read_valid
@@ -224,6 +225,8 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
         ) from error
     if features.crs is None:
         raise ConfigError(f"{path} has no CRS; assign one, e.g. ogr2ogr -a_srs EPSG:25832 NEW.gpkg {path}")
+    if angles := angle_fault(features.crs.to_wkt(), tuple(features.total_bounds)):
+        raise ConfigError(f"--roads {path} {angles}; declare its CRS with ogr2ogr -a_srs")
     if features.empty:
         condition = f" where {where}" if where else ""
         raise ConfigError(f"{path} has no feature{condition} in layer {layer or names[0]!r}")

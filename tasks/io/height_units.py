@@ -21,6 +21,9 @@ SMALLER = {"cm": 100, "mm": 1000}
 
 METRE: Unit = ("metre", 1.0)
 
+CONVERTED = ", as the file says, converted to metres"
+"""End of notes on heights that were not in metres."""
+
 UNITS = {
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
@@ -57,6 +60,19 @@ def remove_absurd(heights: Floats) -> int:
 def absurd_note(layer: str, removed: int) -> str:
     """Return the note on heights that `remove_absurd` removed from a layer."""
     return f"{layer}: {count(removed, 'cell')} outside {LOWEST_M:g}..{HIGHEST_M:g} m taken as nodata"
+
+
+def converted_note(layer: str, patch: RasterWindow) -> str | None:
+    """Return a note that a patch of heights was converted from the unit that its file declares, or None."""
+    unit, metres = _unit(patch)
+    if metres == 1 or patch.unit_assumed:
+        return None
+    return f"{layer}: heights in {unit}{CONVERTED}"
+
+
+def is_conversion(note: str) -> bool:
+    """Return whether a note of a tile is one of `converted_note`."""
+    return note.endswith(CONVERTED)
 
 
 def smaller_unit_fault(patch: RasterWindow) -> str | None:

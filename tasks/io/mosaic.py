@@ -13,13 +13,20 @@ from rasterio.enums import Resampling
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
+from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import FARTHEST, Bounds, overlap
 from flexroad.catalog.headers.kept_rasters import kept_raster
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.catalog.tile import HEIGHTS, TOUCH_M
 from flexroad.tasks.errors import TaskError, Unusable
-from flexroad.tasks.io.height_units import absurd_note, in_metres, smaller_unit_fault, with_unit
+from flexroad.tasks.io.height_units import (
+    absurd_note,
+    converted_note,
+    in_metres,
+    smaller_unit_fault,
+    with_unit,
+)
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights
@@ -201,10 +208,10 @@ def _check_place(tile: Tile, layer: Layer, file: SourceFile, patch: RasterWindow
     if not (file.extent and _shared_m2(file.extent, core.bounds)) or (patch and _is_on(patch, core)):
         return
     found = read_raster(file.path, file.title, header, tile.allowed, kept_raster, tile.missing)
-    crs = in_plan(found.crs or layer.crs or core.crs)
     if found.lattice is None:
         return
     bounds = found.lattice.bounds
+    crs = in_plan(crs_of(found.crs, layer.crs, bounds) or core.crs)
     now = bounds if same(crs, core.crs) else bounds_in(core.crs, crs, bounds)
     if all(abs(a - b) <= core.cell for a, b in zip(now, file.extent, strict=True)):
         return
@@ -239,4 +246,6 @@ def _notes(layer: Layer, patches: Sequence[RasterWindow], grid: Grid) -> list[st
             notes.append(f"{layer.name} {how}: {reason}")
         if patch.unit_assumed:
             notes.append(f"{layer.name}: heights taken to be in {patch.unit}, as the file declares no unit")
+        if layer.name in HEIGHTS and (converted := converted_note(layer.name, patch)):
+            notes.append(converted)
     return list(dict.fromkeys(notes))

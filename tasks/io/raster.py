@@ -30,7 +30,7 @@ from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import header, place
+from flexroad.tasks.io.raster_header import file_crs, place
 from flexroad.tasks.types import Bools, Floats
 
 T = TypeVar("T")
@@ -155,15 +155,14 @@ def read_window(
         slices = lattice.whole_steps(step, *slices)
         reader = readable_cells if damaged else all_cells
         values, unreadable = reader(src, lattice, step, slices, resampling)
-        shown, file_crs = lattice.cut(*slices).coarser(step), header(src).crs or crs
-        unit = src.units[0] or ""
+        shown, unit = lattice.cut(*slices).coarser(step), src.units[0] or ""
         return RasterWindow(
             name,
             str(path),
             values,
             shown,
             unit,
-            file_crs,
+            file_crs(src, crs),
             step=step,
             share=_share(lattice.cut(*slices), step),
             unreadable=unreadable,

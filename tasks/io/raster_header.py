@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 from rasterio.enums import MaskFlags
 
 from flexroad.catalog.crs import bounds_in, in_plan, same, short
+from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.catalog.headers.rasters import georeference_fault
 from flexroad.catalog.headers.valid_cells import alpha_band
@@ -65,6 +66,12 @@ def header(src: Any) -> Header:
     return found
 
 
+def file_crs(src: Any, given: str | None) -> str | None:
+    """Return the CRS of an open raster: its own, else or where that cannot be, the given one (`crs_of`)."""
+    found = header(src)
+    return crs_of(found.crs, given, found.lattice.bounds) if found.lattice else found.crs or given
+
+
 def place(
     src: Any,
     path: Location,
@@ -84,7 +91,7 @@ def place(
     found = header(src)
     if found.fault:
         raise Unusable(f"{name} {found.fault}", str(path))
-    lattice, file_crs = found.lattice, found.crs or crs
+    lattice, own_crs = found.lattice, file_crs(src, crs)
     if lattice is None:
         if src.shape == core.shape:
             return RasterGrid(core.west, core.north, core.cell, core.cell, core.width, core.height)
@@ -93,16 +100,16 @@ def place(
             f"the tile {core.width} x {core.height}; give it a world file",
             str(path),
         )
-    if file_crs is None:
+    if own_crs is None:
         raise Unusable(f"{name} has no CRS; build the catalog again with --crs", str(path))
-    if same(file_crs, grid.crs):
+    if same(own_crs, grid.crs):
         return lattice
-    if not _overlap(bounds_in(grid.crs, file_crs, lattice.bounds), grid.bounds):
+    if not _overlap(bounds_in(grid.crs, own_crs, lattice.bounds), grid.bounds):
         return None
     if reproject:
-        return replace(lattice, crs=in_plan(file_crs))
+        return replace(lattice, crs=in_plan(own_crs))
     raise Unusable(
-        f"{name} is in {short(file_crs)}, the tile in {short(grid.crs)}; "
+        f"{name} is in {short(own_crs)}, the tile in {short(grid.crs)}; "
         f"reproject it, e.g. gdalwarp -t_srs {short(grid.crs)}, or make the catalog with --reproject",
         str(path),
     )

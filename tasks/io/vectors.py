@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from flexroad.catalog.crs import short, transformer
+from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
-from flexroad.catalog.headers.vectors import listed
+from flexroad.catalog.headers.vectors import bounds_of, listed
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
 from flexroad.catalog.storage.scratch import ScratchFolder
@@ -148,7 +149,10 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
                 f"has {count(len(kinds), 'layer')}: {_listed(file, kinds)}; make the catalog with "
                 "--roads-layer, or name one with segment.layer",
             )
-        return tuple(_described(request, name, pyogrio.read_info(file, layer=name)) for name in names)
+        # Only where the file's CRS may be replaced: the bounds of a GeoJSON take a reading of all of it.
+        bounds = bool(request.bare_crs) and set(names) != set(OSM)
+        infos = (pyogrio.read_info(file, layer=name, force_total_bounds=bounds) for name in names)
+        return tuple(_described(request, name, info) for name, info in zip(names, infos, strict=True))
     except ERRORS as error:
         raise _error(request, f"cannot be read as vectors: {reason(error)}") from error
 
@@ -188,7 +192,7 @@ def _copied(path: UPath, version: FileStat) -> _Copy:
 
 
 def _described(request: Query, name: str, info: Any) -> _Layer:
-    crs = info["crs"] or request.bare_crs
+    crs = crs_of(info["crs"], request.bare_crs, bounds_of(info))
     if crs is None:
         remedy = f"give it one, e.g. ogr2ogr -a_srs {short(request.crs)} NEW {request.path.name}"
         raise _error(request, f"carries no CRS; {remedy}")
@@ -214,9 +218,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     try:
         table = _read_square(request, version, layer, square)
         table = table.drop(columns=list(layer.tested))
-        if table.crs is None:
-            table = table.set_crs(layer.crs)
-        table = table.to_crs(request.crs)
+        table = table.set_crs(layer.crs, allow_override=True).to_crs(request.crs)
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
         # A failed transformation also raises RuntimeError.
         hint = "; check segment.where" if request.where else ""

@@ -161,3 +161,46 @@ def test_archive_is_refused_with_the_remedy(tmp_path, layer, name):
         archive.write(tmp_path / "dsm.tif", "dsm.tif")
     with pytest.raises(CatalogError, match="it is an archive: unpack it first"):
         index(tmp_path, {"dsm": "dsm.tif", layer: "*.zip"})
+
+
+def test_dsm_in_web_mercator_is_refused_with_the_options_that_accept_it(tmp_path):
+    """One unit at 51 degrees north is 0.63 m."""
+    write(tmp_path / "dsm.tif", FLAT, 1_113_000, 6_621_000, crs="EPSG:3857")
+    patterns = {"dsm": "dsm.tif"}
+    match = r"^dsm.tif: a metre of EPSG:3857 is 0.629 m .* or use --reproject --to-crs EPSG:32632$"
+    with pytest.raises(CatalogError, match=match):
+        index(tmp_path, patterns)
+    with pytest.raises(CatalogError, match="^--to-crs EPSG:3395: a metre .*; give --to-crs EPSG:32632$"):
+        index(tmp_path, patterns, conversion=Conversion(True, "EPSG:3395"))
+    result = index(tmp_path, patterns, tile_size_m=20, conversion=Conversion(True, "EPSG:32632"))
+    assert {tile.grid.crs for tile in result.tiles} == {"EPSG:32632"}
+
+
+def test_given_crs_that_is_no_metric_one_is_refused(tmp_path):
+    write(tmp_path / "dsm.tif", FLAT, 1_113_000, 6_621_000, crs=None)
+    with pytest.raises(CatalogError, match=r"^dsm.tif: a metre of EPSG:3857 is 0.629 m on the ground"):
+        index(tmp_path, {"dsm": "dsm.tif"}, crs="EPSG:3857")
+    with pytest.raises(CatalogError, match=r"it has the CRS EPSG:4326, but 111\d+ is no longitude"):
+        index(tmp_path, {"dsm": "dsm.tif"}, crs="EPSG:4326")
+
+
+def test_crs_replaces_degrees_that_are_metres_in_catalog_and_load(tmp_path):
+    for name in ("dsm", "dtm"):
+        write(tmp_path / f"{name}.tif", FLAT, crs="EPSG:4326" if name == "dtm" else "EPSG:25832")
+    with pytest.raises(CatalogError, match="it has the CRS EPSG:4326, but 29.* is no longitude"):
+        index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=20)
+    tiles = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=20, crs="EPSG:25832").tiles
+    tile = tiles[1]
+    assert (tile.layer("dsm").crs, tile.layer("dtm").crs) == (None, "EPSG:25832")
+    np.testing.assert_array_equal(load.load(tile, load.Options()).dtm, FLAT[:20, :20])
+    assert not [f for f in expected_failures([tile], load_config("paper"), ()) if "EPSG" in f.text]
+
+
+def test_raster_layer_elsewhere_is_named_with_both_places(tmp_path):
+    write(tmp_path / "dsm.tif", FLAT)
+    write(tmp_path / "mask.tif", FLAT, 32_295_500)
+    with pytest.raises(CatalogError) as error:
+        index(tmp_path, {"dsm": "dsm.tif", "road_mask": "mask.tif"}, tile_size_m=20)
+    assert "road_mask reaches no tile: mask.tif lies at 32295500 " in str(error.value)
+    assert "in EPSG:25832, the tiles at 295500 " in str(error.value)
+    assert str(error.value).endswith("the number of a zone: declare EPSG:4647")

@@ -246,6 +246,7 @@ def rotated(array):
         ("dsm", lambda a: a.drop_vars("spatial_ref"), "dsm has no CRS; write it"),
         ("dtm", lambda a: a.rio.write_crs(4326), "dtm is in EPSG:4326, a geographic CRS in degrees"),
         ("dsm", lambda a: a.rio.write_crs(2264), "dsm is in EPSG:2264, whose coordinates are in US"),
+        ("dsm", lambda a: a.rio.write_crs(3857), "dsm: a metre of EPSG:3857 is 0.708 m on the ground"),
         ("dsm", lambda a: a.rio.write_crs("EPSG:25832+6360"), "heights in US survey foot; multiply"),
         ("dtm", feet, "dtm has heights in ft; multiply it by 0.3048 and set dtm.attrs"),
         ("dtm", lambda a: a.assign_attrs(units="K"), "dtm has units 'K'; give metres"),

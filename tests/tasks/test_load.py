@@ -174,11 +174,26 @@ def test_load_other_lattice_is_interpolated_with_note(tmp_path, dtm):
 
 
 def test_load_swapped_models_gives_note(tmp_path):
-    ground = plane(GRID)
-    write(tmp_path / "dtm.tif", ground + 4, GRID.west, GRID.north)
+    ground, surface = plane(GRID), plane(GRID)
+    surface[: GRID.height // 2] += 4
+    write(tmp_path / "dtm.tif", surface, GRID.west, GRID.north)
     write(tmp_path / "dsm.tif", ground, GRID.west, GRID.north)
     (note,) = load(tile(tmp_path), Options(halo_m=0)).notes
-    assert note.endswith("in 100% of the cells and above it in 0%: are their files swapped?")
+    assert note.endswith("in 50% of the cells and above it in 0%: are their files swapped?")
+
+
+@pytest.mark.parametrize(
+    ("above", "expected"),
+    [
+        (47.0, "the DSM lies 47.0 m above the DTM: ellipsoidal heights?"),
+        (-4.0, "the DSM lies 4.0 m below the DTM: ellipsoidal heights, or are their files swapped?"),
+    ],
+)
+def test_load_constant_offset_gives_note_with_its_number(tmp_path, above, expected):
+    ground = plane(GRID)
+    write(tmp_path / "dtm.tif", ground, GRID.west, GRID.north)
+    write(tmp_path / "dsm.tif", ground + above, GRID.west, GRID.north)
+    assert load(tile(tmp_path), Options(halo_m=0)).notes == (expected,)
 
 
 @pytest.mark.parametrize("cell", [0.25, 0.5, 2.0])

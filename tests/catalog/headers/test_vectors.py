@@ -1,11 +1,14 @@
 """Tiles list the vector files of roads that reach them."""
 
+import json
+
 import numpy as np
 import pytest
 from shapely import LineString, box
 
 from flexroad.catalog import Catalog, CatalogError
 from flexroad.catalog.sources import nrw, rasters
+from flexroad.tasks.io.vectors import Query, read_near
 from tests.make_rasters import write
 from tests.make_roads import write as write_roads
 from tests.make_roads import write_osm
@@ -134,3 +137,65 @@ def test_invalid_roads_file_raises_one_line(survey, make, name, message):
     with pytest.raises(CatalogError, match=message) as caught:
         indexed(survey, name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def bare_geojson(survey):
+    """A GeoJSON with metres of EPSG:25832 and no CRS: GDAL says EPSG:4326."""
+    line = [[295_400, 5_629_300], [295_600, 5_629_300]]
+    geometry = {"type": "LineString", "coordinates": line}
+    feature = {"type": "Feature", "properties": {"width": 8.0}, "geometry": geometry}
+    path = survey / "plain.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    return path
+
+
+def test_metres_in_a_file_in_degrees_are_refused_with_the_remedy(survey, bare_geojson):
+    with pytest.raises(CatalogError) as error:
+        indexed(survey, bare_geojson)
+    assert str(error.value) == (
+        f"--roads {bare_geojson} has the CRS EPSG:4326, but 295600 is no longitude; "
+        "give its CRS with --crs, or add it to the file with ogr2ogr -a_srs"
+    )
+
+
+def test_crs_replaces_degrees_that_are_metres_in_catalog_and_reader(survey, bare_geojson):
+    tiles = indexed(survey, bare_geojson, crs="EPSG:25832")
+    assert named(tiles) == [["plain.geojson"], ["plain.geojson"], []]
+    roads = tiles[0].layer("roads")
+    assert roads.crs == "EPSG:25832"
+    assert roads.extents == ((295_399.0, 5_629_299.0, 295_601.0, 5_629_301.0),)
+    query = Query(bare_geojson, None, None, ("width",), roads.crs, tiles[0].grid.crs)
+    read = read_near(query, tiles[0].grid.bounds)
+    assert read.total_bounds.tolist() == [295_400, 5_629_300, 295_600, 5_629_300]
+    assert read.crs == "EPSG:25832"
+
+
+def test_crs_option_leaves_a_file_in_true_degrees_alone(survey):
+    write_roads(survey / "r.geojson", [LineString([(6.09, 50.78), (6.1, 50.78)])], "EPSG:4326")
+    tiles = indexed(survey, "r.geojson", crs="EPSG:25832")
+    assert tiles[0].layer("roads").crs is None
+    query = Query(survey / "r.geojson", None, None, (), "EPSG:25832", tiles[0].grid.crs)
+    assert len(read_near(query, (0, 0, 1e6, 1e7))) == 1
+
+
+def test_roads_elsewhere_are_named_with_both_places(survey):
+    write_roads(survey / "r.gpkg", [LineString([(32_295_500, 5_629_300), (32_295_600, 5_629_300)])])
+    with pytest.raises(CatalogError) as error:
+        indexed(survey, "r.gpkg")
+    assert str(error.value) == (
+        f"--roads {survey / 'r.gpkg'} reaches no tile; check its CRS and its extent: it lies at "
+        "32295500 5629300 32295600 5629300 in EPSG:25832, the tiles at 295500 5629250 296250 5629500 in "
+        "EPSG:25832; its eastings differ by 32000000, the number of a zone: declare EPSG:4647"
+    )
+
+
+def test_roads_without_a_place_in_the_tiles_crs_are_not_listed_by_every_tile(survey):
+    """Eastings with the zone's number in EPSG:25833 have no position in EPSG:25832."""
+    write_roads(
+        survey / "r.gpkg", [LineString([(33_500_000, 5_600_000), (33_500_100, 5_600_000)])], "EPSG:25833"
+    )
+    with pytest.raises(
+        CatalogError, match="reaches no tile; .* 33500000 5600000 33500100 5600000 in EPSG:25833"
+    ):
+        indexed(survey, "r.gpkg")

@@ -144,11 +144,21 @@ def test_survey_without_any_crs_is_refused(survey):
 
 
 def test_file_whose_place_is_not_in_the_crs_of_the_others_is_left_out(survey):
+    write(survey / "dsm" / BAD, np.ones((SIDE, SIDE), np.float32), 1e8, 9e7, crs="EPSG:25833")
+    result = index(survey, PATTERNS, tile_size_m=SIDE)
+    assert result.left_out == (
+        f"skipped dsm/{BAD} (dsm): in EPSG:25833 it has no position in EPSG:25832, the CRS of the dsm; "
+        "correct its CRS with `gdal_edit.py -a_srs`",
+    )
+    assert len(result.tiles) == 8
+
+
+def test_file_in_degrees_with_metres_is_left_out(survey):
     write(survey / "dsm" / BAD, np.ones((SIDE, SIDE), np.float32), 1e7, 9e7, crs="EPSG:4326")
     result = index(survey, PATTERNS, tile_size_m=SIDE)
     assert result.left_out == (
-        f"skipped dsm/{BAD} (dsm): in EPSG:4326 it has no position in EPSG:25832, the CRS of the dsm; "
-        "correct its CRS with `gdal_edit.py -a_srs`",
+        f"skipped dsm/{BAD} (dsm): it has the CRS EPSG:4326, but 10000032 is no longitude; "
+        "give its CRS with --crs, or declare it with gdal_edit.py -a_srs",
     )
     assert len(result.tiles) == 8
 

@@ -287,13 +287,19 @@ def bad_inputs(folder: Path):
         "contradicted": ([good], {"crs": "EPSG:2994"}, "good.laz is in .*25832, --crs in EPSG:2994; leave"),
         "noise": ([write_cloud(folder / "noise.laz", xyz, 7, crs)], {}, "noise.laz has only noise points"),
         "far": ([write_cloud(folder / "far.laz", distant, 2, crs)], {}, "far.laz has a point at easting 93"),
+        "mercator": (
+            [write_cloud(folder / "web.laz", xyz, kind, "EPSG:3857")], {},
+            r"^the rasters: a metre of EPSG:3857 is 0.7 m .*; give a CRS in metres with --to-crs EPSG:32631$",
+        ),
         "cells": ([good], {"cell_m": 1.0, "dop_cell_m": 0.3}, "--dop-cell 0.3: one must be a multiple"),
         "unit": ([good], {"height_unit": "yard"}, "--height-unit yard: must be one of metre, foot, us-foot"),
         "target": ([good], {"to_crs": "EPSG:4326"}, "--to-crs EPSG:4326 is in degrees"),
     }  # fmt: skip
 
 
-BAD = "missing|empty|cut short|cut las|no crs|mixed|contradicted|noise|far|cells|unit|target".split("|")
+BAD = "missing|empty|cut short|cut las|no crs|mixed|contradicted|noise|far|mercator|cells|unit|target".split(
+    "|"
+)
 
 
 @pytest.mark.parametrize("name", BAD)

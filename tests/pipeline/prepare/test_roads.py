@@ -134,6 +134,10 @@ def test_add_roads_polygons_are_in_catalog_and_rasters_are_not(tmp_path):
         (lambda path: None, None, None, "does not exist"),
         (lambda path: path.write_text("roads"), None, None, "cannot be read"),
         (lambda path: write(path, [box(0, 0, 9, 9)], crs=None), None, None, "no CRS"),
+        (
+            lambda path: write(path, [box(5e5, 5e6, 5e5 + 9, 5e6 + 9)], crs="EPSG:4326"), None, None,
+            "has the CRS EPSG:4326, but 500009 is no longitude; declare its CRS with ogr2ogr -a_srs",
+        ),
         (lambda path: write(path, [box(0, 0, 9, 9)]), "streets", None, "no layer 'streets'"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "id = 7", "no feature where id = 7"),
         (lambda path: write(path, [box(0, 0, 9, 9)]), None, "kind = 'road'", "--roads-where"),

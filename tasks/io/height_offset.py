@@ -1,0 +1,109 @@
+"""A DSM that lies above or below the DTM as a whole: another vertical datum, or another unit of heights."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexroad.tasks.types import Floats
+
+FAR_M = 1.0
+"""Offset from which two vertical references are suspected (m)."""
+SMOOTH_M = 0.2
+"""Change of the difference from a cell to its neighbours, up to which the cell may be open ground (m)."""
+LOWEST = 10.0
+"""Percentile of the difference over smooth cells that stands for the ground: roofs are smooth, too, and a
+tile with less ground than this share is rare."""
+CONSTANT_M = 0.2
+"""Largest spread of an offset that is the same over the tile: relief gives more (m)."""
+OPEN_M = 1.0
+"""Open ground is smooth and within this of the lowest (m)."""
+SMOOTH_SHARE, OPEN_SHARE = 0.05, 0.25
+"""Least share of smooth cells in those with both heights, and of open ones in the smooth."""
+FEET = {1 / 0.3048: "the DSM in feet, the DTM in metres?", 0.3048: "the DTM in feet, the DSM in metres?"}
+"""Ratio of DSM to DTM if one of them is in feet -> which."""
+ABOVE, RATIO = "the DSM lies ", "the heights of the DSM are "
+"""Begin of notes on an offset, and on a ratio."""
+
+
+@dataclass(frozen=True)
+class Offset:
+    """DSM minus DTM over the open cells of a tile (m)."""
+
+    median_m: float
+    spread_m: float
+    """Standard deviation, by the median absolute deviation."""
+
+
+def open_offset(dsm: Floats, dtm: Floats) -> Offset | None:
+    """Return by how much a DSM lies above a DTM (m, same shape) on open ground.
+
+    Open ground is where the difference is the same in neighbouring cells, and low: crowns of trees are rough,
+    and roofs are higher. None if too few cells are so.
+    """
+    above = dsm - dtm
+    known = np.isfinite(above)
+    smooth = known.copy()
+    with np.errstate(invalid="ignore"):
+        beside, below = np.abs(np.diff(above, axis=1)) <= SMOOTH_M, np.abs(np.diff(above, axis=0)) <= SMOOTH_M
+    smooth[:, :-1] &= beside
+    smooth[:, 1:] &= beside
+    smooth[:-1] &= below
+    smooth[1:] &= below
+    cells = above[smooth]
+    if not cells.size or cells.size < SMOOTH_SHARE * np.count_nonzero(known):
+        return None
+    ground = cells[np.abs(cells - np.percentile(cells, LOWEST)) <= OPEN_M]
+    if ground.size < OPEN_SHARE * cells.size:
+        return None
+    median = float(np.median(ground))
+    return Offset(median, 1.4826 * float(np.median(np.abs(ground - median))))
+
+
+def offset_note(dsm: Floats, dtm: Floats) -> str | None:
+    """Return a note if hardly a cell of a DSM is near the DTM (m, same shape), and the offset is constant.
+
+    Or if the heights of one are those of the other in feet; else None.
+    """
+    above = np.abs(dsm - dtm)
+    near, known = np.count_nonzero(above <= FAR_M), np.count_nonzero(np.isfinite(above))
+    if not known or near > LOWEST / 100 * known:
+        return None
+    offset = open_offset(dsm, dtm)
+    for ratio, which in FEET.items():
+        scaled = open_offset(dsm, ratio * dtm)
+        if scaled and abs(scaled.median_m) <= FAR_M and (not offset or scaled.spread_m <= offset.spread_m):
+            return f"{RATIO}{ratio:.2f} times those of the DTM: {which}"
+    if offset is None or abs(offset.median_m) < FAR_M or offset.spread_m > CONSTANT_M:
+        return None
+    if offset.median_m > 0:
+        return f"{ABOVE}{offset.median_m:.1f} m above the DTM: ellipsoidal heights?"
+    return f"{ABOVE}{-offset.median_m:.1f} m below the DTM: ellipsoidal heights, or are their files swapped?"
+
+
+def is_offset(note: str) -> bool:
+    """Return whether a note of a tile is one of `offset_note`."""
+    return note.startswith((ABOVE, RATIO))
+
+
+def on_tiles(notes: Iterable[str], tiles: int) -> list[str]:
+    """Return one line for each cause in notes of tiles by `offset_note`, with the number of tiles.
+
+    Parameters
+    ----------
+    notes : iterable of str
+        One for each tile that has one; of each cause the first is shown.
+    tiles : int
+        Number of tiles looked at.
+    """
+    first: dict[str, str] = {}
+    number = Counter[str]()
+    for note in notes:
+        what, _, cause = note.partition(": ")
+        first.setdefault(cause, what)
+        number[cause] += 1
+    total = f"{tiles} tile{'s' * (tiles != 1)}"
+    return [f"{what} on {number[cause]} of {total}: {cause}" for cause, what in first.items()]
