@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import in_plan, same, short
+from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.headers.cover import height_share
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.plateaus import plateau_notes
@@ -21,6 +21,8 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
+from flexroad.pipeline.check.finding import Finding
+from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import check_layers, lacking, without_photo
@@ -33,15 +35,6 @@ MAX_SHOWN = 5
 """Number of missing files, and of entries that cannot be used, that are named."""
 MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line about a catalog."""
-
-    text: str
-    fault: bool = False
-    """Whether this should be corrected before a run."""
 
 
 def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
@@ -84,7 +77,7 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
 
     The reasons are entries that cannot be used, missing layers and files, rasters in another CRS than their
     tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
-    is read.
+    is read. On some tiles DSM and DTM are compared (`height_findings`).
 
     Parameters
     ----------
@@ -99,10 +92,16 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     if len(faults) > MAX_SHOWN:
         yield Finding(f"{len(faults) - MAX_SHOWN} more entries cannot be used", fault=True)
     usable = [tile for tile in tiles if not tile.fault]
+    named = set[str]()
     for layer, stage, ids in lacking(usable, config):
+        named.update(ids)
         yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")
     yield from _missing(usable, layers)
-    yield from _unfit(usable, config)
+    for reason, ids in _unfit(usable, config).items():
+        named.update(ids)
+        yield _would_fail(ids, usable, reason)
+    if {"dsm", "dtm"} <= set(layers):
+        yield from height_findings(usable, next(iter(config.chains.values()))["load"], named)
     if plain := without_photo(usable, config):
         yield Finding(
             f"{len(plain)} of {count(len(usable), 'tile')} would have no texture: no dop, which "
@@ -148,16 +147,15 @@ def _no_access(path: Location, stat: StatCache) -> str | None:
     return "missing" if stat(path) is None else None
 
 
-def _unfit(tiles: Sequence[Tile], config: Config) -> Iterator[Finding]:
-    """Name the tiles with a raster in another CRS, and those whose DSM has too few heights."""
+def _unfit(tiles: Sequence[Tile], config: Config) -> dict[str, list[str]]:
+    """Return the tiles with a raster in another CRS, and those whose DSM has too few heights, by reason."""
     min_valid = max(chain["load"].min_valid for chain in config.chains.values())
-    known: dict[Location, str | None] = {}
+    known: dict[tuple[Location, str | None], str | None] = {}
     by_reason: dict[str, list[str]] = defaultdict(list)
     for tile in tiles:
         if reason := _other_crs(tile, known) or _few_heights(tile, min_valid):
             by_reason[reason].append(tile.id)
-    for reason, ids in by_reason.items():
-        yield _would_fail(ids, tiles, reason)
+    return by_reason
 
 
 def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[Location, ...]]]:
@@ -167,25 +165,27 @@ def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[
             yield on_tile, tile.paths(on_tile)
 
 
-def _other_crs(tile: Tile, known: dict[Location, str | None]) -> str:
+def _other_crs(tile: Tile, known: dict[tuple[Location, str | None], str | None]) -> str:
     """Return why a tile would fail if a raster on it is in another CRS; ``known`` has those read before."""
     for layer, paths in _on_tile(tile, load.READS):
         for path in () if layer.reproject else paths:
-            if path not in known:
-                known[path] = _crs(path, tile.allowed)
-            crs = known[path] or layer.crs
+            key = path, layer.crs
+            if key not in known:
+                known[key] = _crs(path, layer.crs, tile.allowed)
+            crs = known[key]
             if crs and not same(crs, tile.grid.crs):
                 return f"{layer.name} is in {short(crs)}, not {short(tile.grid.crs)}"
     return ""
 
 
-def _crs(path: Location, allowed: AllowedFolders | None) -> str | None:
-    """Return the horizontal CRS of a raster, None if it has none or cannot be read."""
+def _crs(path: Location, given: str | None, allowed: AllowedFolders | None) -> str | None:
+    """Return the horizontal CRS of a raster, or the given one; None if both are missing or unusable."""
     try:
         with quiet(), open_raster(path, allowed) as raster:
-            return in_plan(raster.crs.to_wkt()) if raster.crs else None
+            crs = crs_of(raster.crs.to_wkt() if raster.crs else None, given, raster.bounds)
+            return in_plan(crs) if crs else None
     except (*ERRORS, CatalogError):
-        return None
+        return given
 
 
 def _few_heights(tile: Tile, min_valid: float) -> str:

@@ -35,6 +35,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import progress, summary
 from flexroad.pipeline.run.summary import Summary
 from flexroad.pipeline.worker.tile import TileResult
+from flexroad.tasks.io.height_offset import is_offset, on_tiles
 
 app = group()
 
@@ -210,6 +211,8 @@ class Shown(Observer):
         self.outcome = outcome
         self.display: ProgressDisplay | None = None
         """Progress of the tiles, from the first one on until the block ends."""
+        self.offsets: list[str] = []
+        """Notes of tiles whose DSM lies off the DTM as a whole."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Shown:
@@ -249,6 +252,7 @@ class Shown(Observer):
 
     def tile(self, result: TileResult) -> None:
         """Add a tile to the progress and to the file for Prometheus."""
+        self.offsets += filter(is_offset, result.notes)
         if self.display:
             self.display(result)
         if self.outcome.textfile is not None:
@@ -272,7 +276,9 @@ def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
     echo(f"{outcome.text}; results in {prepared.run.path}")
     if shown.display and set(shown.display.status) == {"cached"}:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
-    if summary.done and summary.without_roads == summary.done:
+    for line in on_tiles(shown.offsets, summary.tiles):
+        warn(f"{line} `flexroad catalog check` compares them")
+    if summary.done and summary.without_roads == summary.done and not shown.offsets:
         warn(
             "no tile of this run has a road that the filter keeps; if there are roads, check the road source "
             "of the catalog and the options of segment and ecsrc"

@@ -6,8 +6,8 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pandas as pd
@@ -15,9 +15,12 @@ import pandas as pd
 from flexroad.catalog.text import count, printable
 from flexroad.pipeline.report.browser.tiles import STATES, TileTable, short
 from flexroad.pipeline.report.content import Content
+from flexroad.tasks.io.height_offset import is_offset
 from flexroad.tasks.quality.assess import FLAGS, NO_ROAD, Options
 from flexroad.tasks.quality.places import Place
 
+OF_HEIGHTS = ("dropped", NO_ROAD)
+"""Flags that a DSM far from the DTM gives."""
 MOST = 3
 """Kinds of errors that are told; the table of failures has all."""
 
@@ -101,7 +104,9 @@ class Reason:
         return f"{self.flag}: {self.words}{at}; {self.remedy}"
 
 
-def reasons(row: Mapping[str, Any], options: Options, places: Mapping[str, Place]) -> list[Reason]:
+def reasons(
+    row: Mapping[str, Any], options: Options, places: Mapping[str, Place], notes: Sequence[str] = ()
+) -> list[Reason]:
     """Return a tile's flags in words.
 
     Parameters
@@ -112,10 +117,17 @@ def reasons(row: Mapping[str, Any], options: Options, places: Mapping[str, Place
         The thresholds of the flags.
     places : Mapping
         Place of each flag, as far as known (`flexroad.tasks.quality.places.places`).
+    notes : sequence of str
+        Notes on the sources of the tile: a DSM that lies off the DTM as a whole is why roads are dropped.
     """
     given = row.get("flags")
     names = given.split(", ") if isinstance(given, str) and given else []
-    return [_reason(name, row, options, places) for name in names]
+    found = [_reason(name, row, options, places) for name in names]
+    offset = next(filter(is_offset, notes), None)
+    if offset is None:
+        return found
+    what, _, cause = offset.partition(": ")
+    return [replace(one, remedy=f"{what} ({cause})") if one.flag in OF_HEIGHTS else one for one in found]
 
 
 def _reason(name: str, row: Mapping[str, Any], options: Options, places: Mapping[str, Place]) -> Reason:

@@ -189,7 +189,7 @@ def _look(
         name,
         numbers[name],
         f"{'; '.join(parts)}.",
-        reasons(row, options, found.places if found else {}),
+        reasons(row, options, found.places if found else {}, found.notes if found else ()),
         found,
         f"{viewer}#tile={quote(name, safe='')}" if viewer else "",
     )

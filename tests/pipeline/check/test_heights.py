@@ -1,0 +1,109 @@
+"""DSM against DTM before a run: offset, ratio, step between sheets, units; on planes with known heights."""
+
+import numpy as np
+import pytest
+
+from flexroad.catalog import LAYERS, Catalog
+from flexroad.catalog.sources.rasters import index
+from flexroad.pipeline.check import heights
+from flexroad.pipeline.check.catalog import expected_failures
+from flexroad.pipeline.check.heights import height_findings
+from flexroad.pipeline.config.loading import load_config
+from flexroad.tasks.load import Options
+from tests.make_rasters import write
+
+WEST, NORTH = 499_980.0, 5_600_040.0
+PLANE = np.tile(100 + 0.02 * np.arange(120, dtype=np.float32), (60, 1))
+"""Ground of two tiles of 60 m, side by side."""
+EAST = np.arange(120) >= 60
+
+
+def said(folder, dsm, dtm, unit=None):
+    """Return what the check says of a catalog of a DSM and a DTM, either in one file or in two sheets."""
+    for name, values in (("dsm", dsm), ("dtm", dtm)):
+        if isinstance(values, dict):
+            for sheet, (west, part) in values.items():
+                write(folder / name / f"{sheet}.tif", part, WEST + west, NORTH, unit=unit)
+        else:
+            write(folder / name / "all.tif", values.astype(np.float32), WEST, NORTH, unit=unit)
+    tiles = index(folder, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}, tile_size_m=60).tiles
+    assert len(tiles) == 2
+    return found(tiles)
+
+
+def found(tiles):
+    return [finding.text for finding in height_findings(tiles, Options(), ())]
+
+
+@pytest.mark.parametrize(
+    ("dsm", "expected"),
+    [
+        (PLANE + 47, "the DSM lies 47.0 m above the DTM on 2 of 2 tiles: ellipsoidal heights?"),
+        (
+            PLANE - 10,
+            "the DSM lies 10.0 m below the DTM on 2 of 2 tiles: "
+            "ellipsoidal heights, or are their files swapped?",
+        ),
+        (PLANE + 20 * EAST, "the DSM lies 20.0 m above the DTM on 1 of 2 tiles: ellipsoidal heights?"),
+        (
+            PLANE / 0.3048,
+            "the heights of the DSM are 3.28 times those of the DTM on 2 of 2 tiles: "
+            "the DSM in feet, the DTM in metres?",
+        ),
+    ],
+)
+def test_offset_or_ratio_is_one_line_with_its_number(tmp_path, dsm, expected):
+    assert said(tmp_path, dsm, PLANE) == [expected]
+
+
+def test_dsm_on_the_ground_is_clean(tmp_path):
+    assert said(tmp_path, PLANE + 0.1, PLANE) == []
+
+
+def test_step_between_sheets_names_them(tmp_path):
+    sheets = {"west": (0, PLANE[:, :60]), "east": (60, PLANE[:, 60:] + np.float32(0.4))}
+    assert said(tmp_path, PLANE, sheets) == [
+        "DSM minus DTM is -0.40 m on 1 tile (dtm east.tif) and 0.00 m on 1 tile (dtm west.tif): "
+        "files of two vertical references?"
+    ]
+
+
+def test_step_within_a_file_names_the_tiles(tmp_path):
+    assert said(tmp_path, PLANE + 0.4 * EAST, PLANE) == [
+        "DSM minus DTM is 0.00 m on 1 tile (499980_5599980) and 0.40 m on 1 tile (500040_5599980): "
+        "files of two vertical references?"
+    ]
+
+
+def test_heights_in_feet_are_noted_and_a_single_band_in_feet_would_fail(tmp_path):
+    said_of_both = said(tmp_path, PLANE / 0.3048, PLANE / 0.3048, unit="ft")
+    assert said_of_both == [
+        f"{layer}: heights in ft, as the file says, converted to metres: "
+        "if they are in metres, correct the unit"
+        for layer in ("dsm", "dtm")
+    ]
+    write(tmp_path / "dtm" / "all.tif", PLANE, WEST, NORTH)
+    tiles = index(tmp_path, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}, tile_size_m=60).tiles
+    of_one = found(tiles)
+    assert len(of_one) == 2
+    assert of_one[0].startswith(
+        f"{tiles[0].id} would fail: dsm dsm/all.tif has heights in ft, dtm dtm/all.tif in "
+    )
+
+
+def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
+    """A step in one of four sheets is found though two tiles of eight are read."""
+    monkeypatch.setattr(heights, "MOST_TILES", 4)
+    wide = np.tile(PLANE, (1, 4))
+    for number in range(4):
+        part = wide[:, 120 * number : 120 * (number + 1)] + np.float32(0.5 * (number == 2))
+        write(tmp_path / "dtm" / f"{number}.tif", part, 480_000 + 120 * number, NORTH)
+    write(tmp_path / "dsm.tif", wide, 480_000, NORTH)
+    tiles = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm/*.tif"}, tile_size_m=60).tiles
+    assert len(tiles) == 8
+    (line,) = found(tiles)
+    assert line.startswith("DSM minus DTM is -0.50 m on 1 tile (dtm 2.tif) and 0.00 m on 3 tiles (")
+
+
+def test_synthetic_survey_is_clean(survey):
+    assert list(expected_failures(Catalog.read(survey).tiles, load_config("paper"), LAYERS)) == []
