@@ -8,9 +8,10 @@ from datetime import datetime
 from pathlib import Path
 
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.headers.editions import newest_first
 from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.plateaus import plateau_notes
-from flexroad.catalog.headers.rasters import scan
+from flexroad.catalog.headers.rasters import RasterFile, scan
 from flexroad.catalog.headers.vectors import find, with_roads
 from flexroad.catalog.limits import MIN_COVER
 from flexroad.catalog.tile import HEIGHTS, LAYERS
@@ -71,14 +72,17 @@ def index(
         if name in patterns and name != "roads"
     }
     left_out = [line for _, lines in scanned.values() for line in lines]
-    notes = []
+    notes, files = list[str](), dict[str, list[RasterFile]]()
+    for name, (found, _) in scanned.items():
+        files[name], lines = newest_first(root, name, found)
+        notes += lines
     for name in (mask for mask in MASKS if mask in scanned):
-        notes += mask_notes(root, name, [file.name for file in scanned[name][0]], road_values)
+        notes += mask_notes(root, name, [file.name for file in files[name]], road_values)
     for name in (heights for heights in HEIGHTS if heights in scanned):
-        notes += plateau_notes(name, {file.name: root / file.name for file in scanned[name][0]})
+        notes += plateau_notes(name, {file.name: root / file.name for file in files[name]})
     indexed = cut(
         root,
-        {name: files for name, (files, _) in scanned.items()},
+        files,
         road_values=road_values,
         tile_size_m=tile_size_m,
         date=date,

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from flexroad.catalog import Tile
+from flexroad.catalog.headers.refused import head
 from flexroad.catalog.text import count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.pipeline.check.finding import Finding
@@ -60,7 +61,7 @@ def height_findings(
             found.append(_compared(tile, options))
         except TaskError as error:
             # A file that is missing or closed has been named.
-            if not error.file or Path(error.file).is_file():
+            if not error.file or _is_open(Path(error.file)):
                 errors.append(f"{tile.id} would fail: {error}")
     yield from (Finding(text, fault=True) for text in errors[:MOST_ERRORS])
     if len(errors) > MOST_ERRORS:
@@ -71,6 +72,14 @@ def height_findings(
     yield from (Finding(line, fault=True) for line in lines)
     if not lines and (step := _step(found)):
         yield Finding(step, fault=True)
+
+
+def _is_open(path: Path) -> bool:
+    try:
+        head(path)
+    except OSError:
+        return False
+    return True
 
 
 def _sample(tiles: Sequence[Tile]) -> list[Tile]:

@@ -30,7 +30,7 @@ from flexroad.catalog.text import reason
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.tasks.errors import TaskError, Unusable
 from flexroad.tasks.io.raster_grid import RasterGrid
-from flexroad.tasks.io.raster_header import file_crs, place
+from flexroad.tasks.io.raster_header import file_crs, header, place
 from flexroad.tasks.types import Bools, Floats
 
 T = TypeVar("T")
