@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from flexroad.catalog import Tile
-from flexroad.catalog.headers.refused import head
+from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.text import count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.pipeline.check.finding import Finding
@@ -77,7 +77,7 @@ def height_findings(
 def _is_open(path: Path) -> bool:
     try:
         head(path)
-    except OSError:
+    except (OSError, Refused):
         return False
     return True
 
