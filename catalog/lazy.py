@@ -12,7 +12,6 @@ submodule at once.
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
 from typing import Any
 
 
@@ -23,25 +22,17 @@ class LazyModule:
     or deleted in the module itself.
     """
 
-    __slots__ = ("_module", "_name")
+    __slots__ = ("_name",)
     _name: str
-    _module: ModuleType | None
 
     def __init__(self, name: str) -> None:
         object.__setattr__(self, "_name", name)
-        object.__setattr__(self, "_module", None)
-
-    def _loaded(self) -> ModuleType:
-        if self._module is None:
-            object.__setattr__(self, "_module", importlib.import_module(self._name))
-        assert self._module is not None
-        return self._module
 
     def __getattr__(self, name: str) -> Any:
         # Tools that look through the names of a file ask for these; an answer is not worth an import.
         if name.startswith("__") and name != "__version__":
             raise AttributeError(f"{name!r} does not import module {self._name!r}")
-        module = self._loaded()
+        module = importlib.import_module(self._name)
         try:
             return getattr(module, name)
         except AttributeError as error:
@@ -54,10 +45,10 @@ class LazyModule:
                 raise error from None
 
     def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self._loaded(), name, value)
+        setattr(importlib.import_module(self._name), name, value)
 
     def __delattr__(self, name: str) -> None:
-        delattr(self._loaded(), name)
+        delattr(importlib.import_module(self._name), name)
 
     def __reduce__(self) -> tuple[type[LazyModule], tuple[str]]:
         return LazyModule, (self._name,)

@@ -1,6 +1,7 @@
 """The command line, run in this process or in a new one."""
 
 import contextlib
+import faulthandler
 import io
 import os
 import signal
@@ -17,7 +18,7 @@ from flexroad.pipeline.cli.main import main
 
 PROCESS = (sys.executable, "-c", "from flexroad.pipeline.cli.main import main; main()")
 """Command of a new process; the words of a command line follow."""
-FORKED_S = 600
+FORKED_S = 300
 """Longest time of a function in a copy of this process (s)."""
 RAISED = 99
 """Exit code of a copy of this process in which the function raised an error."""
@@ -92,7 +93,8 @@ def forked(function: Callable[[], int]) -> int:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     code = RAISED
     try:
-        signal.alarm(FORKED_S)
+        # Says where the copy stands, for example at a lock that another thread had when the copy was made.
+        faulthandler.dump_traceback_later(FORKED_S, exit=True, file=sys.__stderr__)
         code = int(function())
     except BaseException:
         traceback.print_exc()
