@@ -27,7 +27,7 @@ def echo_document(text: str) -> None:
         echo(line)
 
 
-class LenientStream:
+class _LenientStream:
     """A text stream that ignores write errors; other attributes are those of the wrapped stream."""
 
     def __init__(self, stream: IO[str]) -> None:
@@ -55,7 +55,7 @@ def ignore_write_errors() -> Iterator[None]:
     A full disk of the log must not stop a run.
     """
     with (
-        contextlib.redirect_stdout(sys.stdout and LenientStream(sys.stdout)),
-        contextlib.redirect_stderr(sys.stderr and LenientStream(sys.stderr)),
+        contextlib.redirect_stdout(sys.stdout and _LenientStream(sys.stdout)),
+        contextlib.redirect_stderr(sys.stderr and _LenientStream(sys.stderr)),
     ):
         yield

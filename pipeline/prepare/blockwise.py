@@ -32,7 +32,7 @@ POINT_BYTES, CELL_BYTES, PIXEL_BYTES = 200, 200, 20
 
 
 @dataclass(frozen=True)
-class BlockJob:
+class _BlockJob:
     """The input of one worker call: a block of ground whose rasters are made."""
 
     buckets: PointBuckets
@@ -82,7 +82,7 @@ def write_blocks(
         _write_block(writer, job)
 
 
-def _jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[BlockJob]:
+def _jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> Iterator[_BlockJob]:
     """Yield the blocks whose rasters can depend on points."""
     buckets, reach = bucketed.buckets, reach_m(options, writer.grid.cell)
     # Points sampled from a mesh have no colours: the orthophoto is drawn from its texture.
@@ -90,10 +90,10 @@ def _jobs(writer: RasterWriter, bucketed: BucketedPoints, options: Options) -> I
     for index in buckets.overlapping(writer.grid):
         grid = _block_grid(writer.grid, buckets.edge, index)
         if grid and not bucketed.occupied.isdisjoint(buckets.overlapping(grid, reach)):
-            yield BlockJob(buckets, grid, options, dop_cell, writer.scratch / f"{index[0]}_{index[1]}.npz")
+            yield _BlockJob(buckets, grid, options, dop_cell, writer.scratch / f"{index[0]}_{index[1]}.npz")
 
 
-def _check_memory(jobs: Sequence[BlockJob]) -> None:
+def _check_memory(jobs: Sequence[_BlockJob]) -> None:
     """Check that each block with its rim fits in memory.
 
     Raises
@@ -132,7 +132,7 @@ def _block_grid(whole: Grid, edge: float, index: BlockIndex) -> Grid | None:
     return Grid(whole.crs, west, north, whole.cell, right - left, bottom - top)
 
 
-def _rasterise_block(job: BlockJob) -> BlockJob:
+def _rasterise_block(job: _BlockJob) -> _BlockJob:
     reach = reach_m(job.options, job.grid.cell)
     points = job.buckets.read(job.grid, reach, with_colours=job.dop_cell is not None)
     rasters = rasterise(points, job.grid, job.options, job.dop_cell)
@@ -149,11 +149,11 @@ def _rasterise_block(job: BlockJob) -> BlockJob:
     return job
 
 
-def _fail(job: BlockJob, reason: str) -> BlockJob:
+def _fail(job: _BlockJob, reason: str) -> _BlockJob:
     raise ConfigError(f"block {job.grid.west:.0f}_{job.grid.south:.0f}: {reason}; use fewer workers")
 
 
-def _write_block(writer: RasterWriter, job: BlockJob) -> None:
+def _write_block(writer: RasterWriter, job: _BlockJob) -> None:
     with np.load(job.target) as rasters:
         for layer in ("dsm", "dtm", "road_height", "bridges", GROUND):
             if layer in rasters:

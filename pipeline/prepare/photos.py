@@ -64,7 +64,7 @@ class PhotosOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthJob:
+class _DepthJob:
     """The input of one worker call: a photograph to match with its partners."""
 
     view: View
@@ -261,15 +261,15 @@ def _stereo(
 
 def _jobs(
     result: Reconstruction, folder: Path, options: mvs_cpu.Options, spacing: float
-) -> Iterator[DepthJob]:
+) -> Iterator[_DepthJob]:
     for number, view in enumerate(result.views):
         others = tuple(result.views[other] for other in mvs_cpu.partners(result, number, options))
         if len(others) >= 2:
             sparse = result.points[view.visible]
-            yield DepthJob(view, others, sparse, options, spacing, folder / f"{number}.npz")
+            yield _DepthJob(view, others, sparse, options, spacing, folder / f"{number}.npz")
 
 
-def _match(job: DepthJob) -> Path:
+def _match(job: _DepthJob) -> Path:
     # Photographs are matched in parallel, one thread each; OpenCV does not read the environment.
     cv2.setNumThreads(1)
     cloud = mvs_cpu.photo_cloud(job.view, job.others, job.points, job.options)
@@ -280,5 +280,5 @@ def _match(job: DepthJob) -> Path:
     return job.target
 
 
-def _fail(job: DepthJob, reason: str) -> Path:
+def _fail(job: _DepthJob, reason: str) -> Path:
     raise ConfigError(f"{job.view.path}: {reason}; use fewer workers or a smaller --stereo-size")
