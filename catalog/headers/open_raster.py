@@ -137,21 +137,6 @@ def open_alone(path: Path) -> Any | None:
     return dataset
 
 
-def files_of(path: Path, depth: int = MAX_DEPTH) -> Iterator[Path]:
-    """Yield the files that a raster on disk consists of: itself, its side-car files, and those of a VRT.
-
-    Raises
-    ------
-    Refused, OSError
-        As of `open_raster`; OSError also if a file that a VRT names is missing.
-    """
-    yield path
-    yield from (side for side in _candidates(path) if side.exists())
-    if depth and _driver(path) == "VRT":
-        for name in vrt_sources(path):
-            yield from files_of(Path(name), depth - 1)
-
-
 def has_own_blocks(path: Path, depth: int = MAX_DEPTH) -> bool:
     """Return whether each block of a raster can be read by itself: of a GeoTIFF, or a VRT of GeoTIFFs.
 
@@ -302,7 +287,7 @@ def _driver(path: Path) -> str:
 
 def _side_cars(path: Path) -> list[Path]:
     """Return the side-car files of a raster that GDAL may open; refuse those that lead to other files."""
-    found = [side for side in _candidates(path) if side.exists() or side.is_symlink()]
+    found = [side for side in candidates(path) if side.exists() or side.is_symlink()]
     for side in found:
         try:
             require_beside(side, path)
@@ -326,7 +311,7 @@ def _check_side_car(side: Path) -> None:
         raise Refused("is of Erdas Imagine and may name other files; remove it")
 
 
-def _candidates(path: Path) -> Iterator[Path]:
+def candidates(path: Path) -> Iterator[Path]:
     """Yield the names of side-car files that GDAL looks for."""
     end = path.suffix[1:]
     worlds = {f".{end}w", f".{end[:1]}{end[-1:]}w"} if end else set()

@@ -7,19 +7,28 @@ bytes, and only formats are let through that GDAL cannot take for another one.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import mmap
+import os
 import re
+import shutil
 import sqlite3
 from collections.abc import Iterable
 from contextlib import closing
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+from weakref import finalize
 from xml.parsers import expat
 
 from flexroad.catalog.headers.refused import Refused, archive_note, head, require_beside
+from flexroad.catalog.headers.source_files import SHAPEFILE_PARTS, SQLITE_PARTS, source_stat
 from flexroad.catalog.lazy import lazy
+from flexroad.catalog.storage.paths import FileStat
+from flexroad.catalog.storage.scratch import ScratchFolder
 
 pyogrio = lazy("pyogrio")
 
@@ -29,8 +38,10 @@ UNKNOWN = (
 )
 SQLITE = b"SQLite format 3\0"
 GEOPACKAGES = (b"GPKG", b"GP10", b"GP11")
-SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".sbx", ".idm", ".ind")
-SQLITE_PARTS = ("-wal", "-shm", "-journal")
+WAL_MODE = b"\2\2"
+"""Bytes 18 and 19 of a SQLite file whose changes are first written to a ``-wal`` file."""
+MOST_COPIES = 8
+"""Largest number of copies of GeoPackages that a process keeps."""
 CRS = re.compile(rb"""["'](?:c|\\u00[46]3)(?:r|\\u00[57]2)(?:s|\\u00[57]3)["']\s*""", re.IGNORECASE)
 OTHER_THAN_OSM = re.compile(
     rb"\0|<(?!/?(?:osm|bounds?|node|way|relation|tag|nd|member|note|meta)[\s/>]|\?xml\s)"
@@ -72,15 +83,17 @@ def vector_name(path: Path) -> str:
         return f"GeoJSON:{path}"
     if data.startswith(b"\0\0\x27\x0a"):
         _require_own_parts(path, (path.with_suffix(end) for s in SHAPEFILE_PARTS for end in (s, s.upper())))
-    elif data.startswith(SQLITE) and data[68:72] in GEOPACKAGES:
-        _require_own_parts(path, (path.with_name(path.name + end) for end in SQLITE_PARTS))
-        _require_queries_that_end(path)
-    elif data.startswith(SQLITE) and _is_spatialite(path):
-        _require_own_parts(path, (path.with_name(path.name + end) for end in SQLITE_PARTS))
-        _require_queries_that_end(path)
-        _require_own_tables(path)
-        # The prefix selects the driver, whatever the file's name ends in.
-        return f"SQLITE:{path}"
+    elif data.startswith(SQLITE):
+        path = _complete(path, data)
+        if data[68:72] in GEOPACKAGES:
+            _require_queries_that_end(path)
+        elif _is_spatialite(path):
+            _require_queries_that_end(path)
+            _require_own_tables(path)
+            # The prefix selects the driver, whatever the file's name ends in.
+            return f"SQLITE:{path}"
+        else:
+            raise Refused(UNKNOWN)
     elif not (
         data.startswith(b"fgb\x03") or (data[:1] == b"\0" and data[4:15] == b"\n\tOSMHeader") or _is_osm(text)
     ):
@@ -111,6 +124,39 @@ def _require_own_tables(path: Path) -> None:
             raise Refused(
                 f"has the virtual table {name!r}, which may be made of another file; convert it with ogr2ogr"
             )
+
+
+def _complete(path: Path, data: bytes) -> Path:
+    """Return an SQLite file that has all changes: itself, or a copy if some are not yet written into it."""
+    parts = [path.with_name(path.name + end) for end in SQLITE_PARTS]
+    _require_own_parts(path, [*parts, path.with_name(path.name + "-shm")])
+    if data[18:20] != WAL_MODE and not any(part.exists() for part in parts):
+        return path
+    state = source_stat(path)
+    if state is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    return _copied(path, state).path
+
+
+class _Copy:
+    """A copy of an SQLite file with its unwritten changes, deleted when this object is garbage-collected."""
+
+    def __init__(self, path: Path) -> None:
+        folder = ScratchFolder()
+        finalize(self, folder.cleanup)
+        self.path = Path(folder.name, path.name)
+        for end in (*SQLITE_PARTS, ""):
+            with contextlib.suppress(FileNotFoundError) if end else contextlib.nullcontext():
+                shutil.copyfile(path.with_name(path.name + end), self.path.with_name(path.name + end))
+        # GDAL reports what is wrong. It cannot undo an interrupted change, as it opens files for reading.
+        with contextlib.suppress(sqlite3.Error), closing(sqlite3.connect(self.path)) as file:
+            file.execute("PRAGMA journal_mode=DELETE")
+
+
+@lru_cache(maxsize=MOST_COPIES)
+def _copied(path: Path, state: FileStat) -> _Copy:
+    """Return a copy, as SQLite would write the changes into the file that it reads; cached by its state."""
+    return _Copy(path)
 
 
 def _require_queries_that_end(path: Path) -> None:

@@ -59,7 +59,8 @@ class FileStat:
     size: int
     """Bytes."""
     version: int | str
-    """Changes when the file's content changes: modification time (ns) on disk, ETag in a bucket."""
+    """Changes when the content changes: modification time (ns) on disk, ETag in a bucket; a text on disk
+    if a source has several files (`source_stat`)."""
 
 
 def parse_location(where: str | Location) -> Location:

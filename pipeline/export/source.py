@@ -13,8 +13,9 @@ import numpy as np
 from flexroad.catalog import Bounds, Tile
 from flexroad.catalog.area import Area
 from flexroad.catalog.ellipsoidal import Datum
+from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.paths import Location, stat
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.config.options import INPUTS, OUTPUTS, option
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import (
@@ -92,7 +93,7 @@ def layer_state(tile: Tile, name: str) -> str:
     """Return the files of a tile's layer with their sizes and versions; empty if the tile has none."""
     layer = tile.layer(name)
     reaching = layer.reaching(tile.grid.bounds) if layer else None
-    return str([(str(path), stat(path)) for path in tile.paths(reaching)]) if reaching else ""
+    return str([(str(path), source_stat(path)) for path in tile.paths(reaching)]) if reaching else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from flexroad.catalog import Layer, Tile
-from flexroad.catalog.storage.paths import FileStat, Location, stat
+from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.storage.paths import FileStat, Location
 from flexroad.pipeline.config.models import Chain, Config, Export
 from flexroad.pipeline.graph.borders import STAGE, BorderPattern, has_borders
 from flexroad.pipeline.graph.sources import (
@@ -180,7 +181,7 @@ class Pattern:
         return frozenset(layer for step in self.steps for layer in step.reads)
 
     def graph(
-        self, tile: Tile, checksum: bool = False, stat_file: Stat = stat, recorded: Recorded = ()
+        self, tile: Tile, checksum: bool = False, stat_file: Stat = source_stat, recorded: Recorded = ()
     ) -> TileGraph:
         """Return the graph of one tile.
 

@@ -12,10 +12,11 @@ from typing import Any
 
 from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.borders import Border
-from flexroad.catalog.storage.paths import FileStat, Location, read, stat
+from flexroad.catalog.headers.source_files import files_of, source_stat
+from flexroad.catalog.storage.paths import FileStat, Location, read
 
 Stat = Callable[[Location], FileStat | None]
-"""Returns size and version of a file, None if it does not exist."""
+"""Returns the state of a source (`source_stat`), None if it does not exist."""
 
 Recorded = Sequence[Any]
 """`SourceFiles.entries` of an earlier graph."""
@@ -86,7 +87,7 @@ class SourceFiles:
 
     def models(self, files: Iterable[Path]) -> str:
         """Return the checksums of files that options name, such as a model, as JSON."""
-        return to_json([self._checksum(path, stat(path)) for path in files])
+        return to_json([self._checksum(path, source_stat(path)) for path in files])
 
     @property
     def entries(self) -> list[Entry]:
@@ -147,8 +148,13 @@ def _checksum(path: Location, file: FileStat | None) -> str | None:
 
 @lru_cache(maxsize=65536)
 def _sha256(path: Location, size: int, version: int | str) -> str:
-    """Return the SHA-256 of a file; cached by path, size and version."""
+    """Return the SHA-256 of a file, or of those of its parts; cached by path, size and version."""
     if not isinstance(path, Path):
         return hashlib.sha256(read(path)).hexdigest()
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    # The version of a source of one file is a number.
+    parts = [path] if isinstance(version, int) else files_of(path)
+    sums = []
+    for part in parts:
+        with part.open("rb") as file:
+            sums.append(hashlib.file_digest(file, "sha256").hexdigest())
+    return sums[0] if len(sums) == 1 else hashed(to_json(sums))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from flexroad.catalog import Tile
 from flexroad.catalog.errors import CatalogError
+from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.paths import Location, parse_location, read, stat
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.graph import Pattern, TileGraph, any_file_missing, product_layers
@@ -89,7 +90,7 @@ class FileStates:
     def __init__(self, run: Run) -> None:
         self._folders, self._stat_file = Folders(run.path), run.stat_cache()
         self._layers = run.pattern.reads.union(product_layers(run.pattern.export))
-        self._models = [(str(file), stat(file)) for step in run.pattern.steps for file in step.files]
+        self._models = [(str(file), source_stat(file)) for step in run.pattern.steps for file in step.files]
 
     def __call__(self, tile: Tile) -> bytes:
         """Return a hash of the names, sizes and times of a tile's results, sources and models."""
@@ -160,7 +161,7 @@ class RunPlace:
         """
         graph = self.pattern.graph(tile, self.checksum)
         if graph.fingerprint != snapshot.fingerprint and any_file_missing(graph):
-            graph = self.pattern.graph(tile, self.checksum, stat, self._recorded(tile.id))
+            graph = self.pattern.graph(tile, self.checksum, source_stat, self._recorded(tile.id))
         if graph.fingerprint != snapshot.fingerprint:
             raise ConfigError(
                 f"its sources have changed; run `flexroad rerun {self.path}`, then export again"

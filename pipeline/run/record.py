@@ -29,6 +29,7 @@ import yaml
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.allowlist import needed
+from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
@@ -205,7 +206,7 @@ class Run:
         """The part of the graph that is the same for all tiles."""
         return Pattern.of(self.config)
 
-    def graph(self, tile: Tile, stat_file: Stat = stat, recorded: Recorded = ()) -> TileGraph:
+    def graph(self, tile: Tile, stat_file: Stat = source_stat, recorded: Recorded = ()) -> TileGraph:
         """Return the graph of a tile for the current configuration and sources (`Pattern.graph`)."""
         return self.pattern.graph(tile, self.checksum, stat_file, recorded)
 
@@ -213,7 +214,7 @@ class Run:
         """Return a stat function for many source files; in a bucket it lists each folder once."""
         remote = StatCache()
         # On disk a stat is cheap and always current, so it is not cached.
-        return lambda file: remote(file) if is_remote(file) else stat(file)
+        return lambda file: remote(file) if is_remote(file) else source_stat(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""

@@ -18,7 +18,8 @@ from time import perf_counter
 from typing import Any
 
 from flexroad.catalog import Tile
-from flexroad.catalog.storage.paths import Location, stat
+from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.storage.paths import Location
 from flexroad.pipeline.graph.borders import STAGE
 from flexroad.pipeline.graph.graph import Node, TileGraph, files_read
 from flexroad.pipeline.store.artefacts import ArtefactStore
@@ -203,7 +204,7 @@ def check_unchanged(graph: TileGraph, files: Iterable[Location]) -> None:
         If one has changed.
     """
     for file in files:
-        if stat(file) != graph.file_stats[str(file)]:
+        if source_stat(file) != graph.file_stats[str(file)]:
             raise SourceChanged(str(file))
 
 

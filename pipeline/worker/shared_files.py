@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from types import TracebackType
 
+from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.storage import paths
 from flexroad.catalog.storage.paths import PROBE, FileStat, parse_location
 from flexroad.pipeline.worker.tile import TileJob
@@ -88,7 +89,7 @@ class SharedFiles:
             raise OSError(f"what it writes to {missing[0]} does not arrive here; {MOUNT}")
         for file, there in different.items():
             # A file may have changed since the graph was made: then it differs here, too.
-            if paths.stat(parse_location(file)) != there:
+            if source_stat(parse_location(file)) != there:
                 what = "does not exist" if there is None else "has another size or time"
                 raise OSError(f"{file} {what} there; {MOUNT}")
 
@@ -119,7 +120,7 @@ def _arrived(folder: str, name: str) -> bool:
 def _different(job: TileJob) -> dict[str, FileStat | None]:
     """Return size and version of those source files that this process has otherwise: one of each folder."""
     known = {file: stat for file, stat in job.graph.file_stats.items() if stat is not None}
-    here = {file: paths.stat(parse_location(file)) for file in _one_of_each_folder(known)}
+    here = {file: source_stat(parse_location(file)) for file in _one_of_each_folder(known)}
     return {file: stat for file, stat in here.items() if stat != known[file]}
 
 

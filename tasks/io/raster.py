@@ -21,9 +21,10 @@ from rasterio.windows import Window
 from flexroad.catalog.crs import short
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.headers.kept_rasters import kept_raster
-from flexroad.catalog.headers.open_raster import ERRORS, files_of, has_own_blocks, open_raster
+from flexroad.catalog.headers.open_raster import ERRORS, has_own_blocks, open_raster
 from flexroad.catalog.headers.rasters import heights_fault
 from flexroad.catalog.headers.refused import Refused, read_through
+from flexroad.catalog.headers.source_files import files_of
 from flexroad.catalog.headers.valid_cells import transparent
 from flexroad.catalog.storage.paths import Location, is_remote
 from flexroad.catalog.text import reason

@@ -29,9 +29,10 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_vector import ERRORS, vector_name
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.headers.vectors import bounds_of, listed
 from flexroad.catalog.lazy import lazy
-from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch, stat
+from flexroad.catalog.storage.paths import FileStat, Location, exists, fetch
 from flexroad.catalog.storage.scratch import ScratchFolder
 from flexroad.catalog.text import count, reason
 from flexroad.tasks import memory
@@ -99,7 +100,7 @@ def read_near(request: Query, bounds: Bounds) -> Any:
         If the file is missing or cannot be read, has no such layer or column, or has no CRS.
     """
     try:
-        version = stat(request.path)
+        version = source_stat(request.path)
         is_other = version is None and exists(request.path)
     except OSError as error:
         raise _error(request, f"cannot be read: {error.strerror}; run again") from error
