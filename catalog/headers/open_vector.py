@@ -15,11 +15,11 @@ import os
 import re
 import shutil
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import quote
 from weakref import finalize
 from xml.parsers import expat
@@ -60,6 +60,7 @@ MAX_CRS_BYTES = 65536
 ERRORS = (RuntimeError, ValueError, OSError, UnboundLocalError)
 """What pyogrio raises for damaged files; the last one if a name in the CRS is not UTF-8."""
 LINKS = ("link", "url")
+T = TypeVar("T")
 
 
 def vector_name(path: Path) -> str:
@@ -136,6 +137,27 @@ def _complete(path: Path, data: bytes) -> Path:
     if state is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     return _copied(path, state).path
+
+
+def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
+    """Return what a function reads of a vector file, and the encoding of its text; empty if as declared.
+
+    Text that is not in the declared encoding, mostly UTF-8, is taken for cp1252, else for latin1, which has
+    all bytes.
+
+    Parameters
+    ----------
+    read : callable
+        Takes the option ``encoding`` of pyogrio.
+    """
+    try:
+        return read(), ""
+    except UnicodeDecodeError:
+        pass
+    try:
+        return read(encoding="cp1252"), "cp1252"
+    except UnicodeDecodeError:
+        return read(encoding="latin1"), "latin1"
 
 
 class _Copy:

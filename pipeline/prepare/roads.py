@@ -6,6 +6,7 @@ Lines have no width, so they make no mask: the file is entered in the catalog, f
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.open_vector import vector_name
+from flexroad.catalog.headers.open_vector import in_its_encoding, vector_name
 from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.headers.vectors import VectorFile, layers, listed, opened
 from flexroad.catalog.lazy import lazy
@@ -218,7 +219,8 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
             )
         if layer is not None and layer not in names:
             raise ConfigError(f"--roads {path} has no layer {layer!r}; it has {listed(found)}")
-        features = geopandas.read_file(file, layer=layer or names[0], where=where, rows=rows)
+        read = partial(geopandas.read_file, file, layer=layer or names[0], where=where, rows=rows)
+        features, _ = in_its_encoding(read)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
             f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"

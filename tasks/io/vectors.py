@@ -27,7 +27,7 @@ from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
-from flexroad.catalog.headers.open_vector import ERRORS, vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, in_its_encoding, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.headers.vectors import bounds_of, listed
@@ -53,6 +53,8 @@ OSM = {"lines": "highway IS NOT NULL", "multipolygons": "other_tags LIKE '%highw
 """Layers of the OSM format with roads, and SQL conditions that select their candidate features."""
 OTHER_TAGS = "other_tags"
 """Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
+ENCODING = "encoding"
+"""Attribute of a table whose text is not in the encoding that its file declares: the one it was read in."""
 WHOLE = 8
 """Memory that all features of a file take, as a multiple of its size."""
 TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
@@ -108,14 +110,29 @@ def read_near(request: Query, bounds: Bounds) -> Any:
         if is_other:
             raise _error(request, "is not a regular file; replace it by one")
         raise _error(request, "cannot be opened (no such file); put it back, or build the catalog again")
-    tables = []
+    tables, attributes = [], dict[str, str]()
     for layer in _layers(request, version):
         squares = list(_squares(bounds)) if layer.indexed else [None]
-        parts = [_touching(_part(request, version, layer, square), bounds) for square in squares]
-        whole = pandas.concat(parts)
+        parts = [_part(request, version, layer, square) for square in squares]
+        for part in parts:
+            attributes |= part.attrs
+        whole = pandas.concat([_touching(part, bounds) for part in parts])
         # A feature that reaches into several squares has the same index in all of them.
         tables.append(whole[~whole.index.duplicated()])
-    return pandas.concat(tables, ignore_index=True)
+    near = pandas.concat(tables, ignore_index=True)
+    near.attrs = attributes
+    return near
+
+
+def encoding_notes(table: Any, path: Location) -> tuple[str, ...]:
+    """Return a note if the text of a table of `read_near` is not in the encoding that its file declares."""
+    encoding = table.attrs.get(ENCODING)
+    if not encoding:
+        return ()
+    return (
+        f"roads: the text of {path.name} is not in the encoding that it declares, and was read as "
+        f"{encoding}; write it as UTF-8, or name its encoding in the .cpg of a Shapefile",
+    )
 
 
 def _error(request: Query, message: str) -> TaskError:
@@ -218,6 +235,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     """Return a layer's features, or those that touch a square (m, in ``request.crs``), in ``request.crs``."""
     try:
         table = _read_square(request, version, layer, square)
+        attributes = table.attrs
         table = table.drop(columns=list(layer.tested))
         table = table.set_crs(layer.crs, allow_override=True).to_crs(request.crs)
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
@@ -228,7 +246,9 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     # Coordinates that cannot be transformed to the tiles' CRS become infinite.
     table = table[~(table.geometry.isna() | table.geometry.is_empty)]
     table = table[has_place(table.geometry.to_numpy())]
-    return _unpacked(table if square is None else _touching(table, square), request.columns)
+    table = _unpacked(table if square is None else _touching(table, square), request.columns)
+    table.attrs = attributes
+    return table
 
 
 def has_place(features: NDArray[np.object_]) -> Bools:
@@ -269,12 +289,15 @@ def _read(request: Query, file: str, layer: _Layer, bbox: Bounds | None) -> Any:
         )
 
     try:
-        return read()
+        table, encoding = in_its_encoding(read)
     except pyogrio.errors.FeatureError as error:
         if "OSM_USE_CUSTOM_INDEXING" not in str(error):
             raise
         # GDAL's fast reader needs sorted nodes, but editors write them in any order.
         return read(USE_CUSTOM_INDEXING="NO")
+    if encoding:
+        table.attrs[ENCODING] = encoding
+    return table
 
 
 def _unpacked(table: Any, columns: tuple[str, ...]) -> Any:

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds
-from flexroad.tasks.io.vectors import Query, read_near
+from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.roads.rasterise import Options, columns, selected
 from flexroad.tasks.roads.routes import CentreLine
@@ -66,7 +66,7 @@ def read_centre_lines(source: Source, bounds: Bounds, crs: str, options: Options
         part = from_table(table, options)
         found |= {line.points.tobytes(): line for line in part.lines}
         areas += part.areas
-        notes += part.notes
+        notes += (*encoding_notes(table, path), *part.notes)
     return CentreLines(tuple(found.values()), areas, tuple(dict.fromkeys(notes)))
 
 

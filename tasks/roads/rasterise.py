@@ -16,7 +16,7 @@ from pydantic import Field
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import LayerMissing
-from flexroad.tasks.io.vectors import Query, has_place, read_near
+from flexroad.tasks.io.vectors import Query, encoding_notes, has_place, read_near
 from flexroad.tasks.roads import widths
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
@@ -122,20 +122,16 @@ def roads(source: Source | None, grid: Grid, options: Options) -> Roads:
     west, south, east, north = grid.bounds
     bounds = (west - reach, south - reach, east + reach, north + reach)
     names = columns(options)
-    parts = [
-        _from_table(
-            read_near(
-                Query(path, options.layer or source.sublayer, options.where, names, source.crs, grid.crs),
-                bounds,
-            ),
-            options,
-        )
-        for path in source.paths
-    ]
+    layer = options.layer or source.sublayer
+    parts, notes = list[Roads](), list[str]()
+    for path in source.paths:
+        table = read_near(Query(path, layer, options.where, names, source.crs, grid.crs), bounds)
+        notes += encoding_notes(table, path)
+        parts.append(_from_table(table, options))
     return Roads(
         np.concatenate([part.areas for part in parts]),
         np.concatenate([part.bridge for part in parts]),
-        tuple(note for part in parts for note in part.notes),
+        (*notes, *(note for part in parts for note in part.notes)),
     )
 
 

@@ -52,6 +52,15 @@ def test_burn_selects_features_by_layer_and_condition(tmp_path):
     assert not mask[:, 10:].any()
 
 
+def test_burn_reads_text_in_another_encoding_than_declared(tmp_path):
+    path = write(tmp_path / "a.shp", [box(400_000, 5_700_000, 400_010, 5_700_100)], name=["xxxxxx"])
+    dbf = path.with_suffix(".dbf")
+    dbf.write_bytes(dbf.read_bytes().replace(b"xxxxxx", "Straße".encode("cp1252")))
+    path.with_suffix(".cpg").write_text("UTF-8")
+    check_roads(PrepareOptions(roads=path))
+    assert burn(path, None, None, GRID).sum() == 1000
+
+
 @pytest.mark.parametrize("suffix", ["shp", "fgb", "geojson"])
 def test_burn_selects_features_by_any_column(suffix, tmp_path):
     shapes = [box(400_000, 5_700_000, 400_010, 5_700_100), box(400_040, 5_700_000, 400_050, 5_700_100)]

@@ -1,5 +1,8 @@
 """Centre lines have what the attributes of a table say of width, lanes, direction and name."""
 
+import contextlib
+import sqlite3
+
 import geopandas
 import numpy as np
 import pytest
@@ -78,3 +81,33 @@ def test_read_centre_lines_are_selected_by_any_column(suffix, tmp_path):
     )
     (line,) = found.lines
     assert line.points.tolist() == [list(place) for place in on_grid((0, 60), (90, 60))]
+
+
+def with_name(path, data):
+    """A line whose name has these bytes, declared as UTF-8."""
+    more = {} if path.suffix == ".shp" else {"layer_options": {"SPATIAL_INDEX": "NO"}}
+    line = shapely.LineString(on_grid((0, 20), (90, 20)))
+    table([line], name=["x" * len(data)]).to_file(path, **more)
+    if path.suffix == ".shp":
+        dbf = path.with_suffix(".dbf")
+        dbf.write_bytes(dbf.read_bytes().replace(b"x" * len(data), data))
+        path.with_suffix(".cpg").write_text("UTF-8")
+    else:
+        with contextlib.closing(sqlite3.connect(path)) as file:
+            file.execute("UPDATE a SET name = CAST(? AS TEXT)", (data,))
+            file.commit()
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["shp", "gpkg"])
+@pytest.mark.parametrize("data", ["Königsstraße".encode("cp1252"), b"Stra\xdfe \x81"])
+def test_name_in_another_encoding_than_declared_is_read_with_a_note(suffix, data, tmp_path):
+    """A byte that cp1252 does not have is latin1's, and GDAL leaves it out of a Shapefile's text."""
+    path = with_name(tmp_path / f"a.{suffix}", data)
+    found = read_centre_lines(Source("roads", (path,)), GRID.bounds, GRID.crs, Options())
+    encoding = "latin1" if b"\x81" in data and suffix == "gpkg" else "cp1252"
+    text = data.decode("latin1")
+    assert [line.name for line in found.lines] == [text if suffix == "gpkg" else text.removesuffix(" \x81")]
+    (note,) = [note for note in found.notes if "encoding" in note]
+    assert note.startswith(f"roads: the text of {path.name} is not in the encoding that it declares")
+    assert f"was read as {encoding};" in note

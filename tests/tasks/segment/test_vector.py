@@ -147,3 +147,16 @@ def test_segment_golden(tmp_path):
     rows, cols = np.nonzero(road.mask)
     sums = int(rows.sum()), int(cols.sum())
     assert (VERSION, len(rows), *sums, int(road.bridge.sum())) == GOLDEN
+
+
+def test_class_in_another_encoding_than_declared_costs_no_road(tmp_path):
+    path = write(tmp_path / "a.shp", [LINE], highway=["xxxxxxx"])
+    dbf = path.with_suffix(".dbf")
+    dbf.write_bytes(dbf.read_bytes().replace(b"xxxxxxx", "Straße ".encode("cp1252")))
+    path.with_suffix(".cpg").write_text("UTF-8")
+    declared = write(tmp_path / "b.shp", [LINE], highway=["Straße"])
+    road, expected = (segment(tile(file), Options()) for file in (path, declared))
+    assert np.array_equal(road.mask, expected.mask)
+    assert road.mask.any()
+    assert "was read as cp1252" in road.notes[0]
+    assert not any("cp1252" in note for note in expected.notes)
