@@ -66,6 +66,14 @@ def test_all_flags_have_words_and_a_remedy():
         assert meaning.remedy
 
 
+def test_dropped_road_under_a_dsm_off_the_dtm_has_that_as_its_reason():
+    row = {"flags": "dropped, inferred", "dropped_road": 1.0, "inferred_road": 0.6}
+    notes = ("dsm resampled", "the DSM lies 47.0 m above the DTM: ellipsoidal heights?")
+    dropped, inferred = reasons(row, Options(), {}, notes)
+    assert dropped.remedy == "the DSM lies 47.0 m above the DTM (ellipsoidal heights?)"
+    assert inferred.remedy == reasons(row, Options(), {})[1].remedy
+
+
 def test_reason_names_value_limit_place_and_remedy():
     (reason,) = reasons(
         {"flags": "spike", "curvature_per_m": 0.31}, Options(), {"spike": (588612.4, 4519130.0)}

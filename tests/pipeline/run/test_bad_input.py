@@ -247,6 +247,10 @@ def _flat(tile: Tile) -> None:
     rewrite(tile, "dsm", np.full(tile.grid.shape, 100, np.float32))
 
 
+def _above(tile: Tile) -> None:
+    rewrite(tile, "dsm", values(layer(tile, "dtm")) + np.float32(47))
+
+
 def _all_road(tile: Tile) -> None:
     rewrite(tile, "road_mask", np.ones(tile.grid.shape, np.uint8))
 
@@ -280,6 +284,7 @@ def _specks(tile: Tile) -> None:
             "the DSM is more than 1 m below the DTM in 100% of the cells and above it in 0%: are their files "
             "swapped?",
         ),
+        (_above, "the DSM lies 47.0 m above the DTM: ellipsoidal heights?"),
         (_all_road, None),
         (_one_cell, None),
         (_small_mask, None),
@@ -293,7 +298,10 @@ def test_unusual_input_gives_finite_metrics(damage, note, run, survey, tmp_path)
     result = run("--tile", tile.id)
     # The filter drops a road of one cell.
     said = result.err.removeprefix("starting: 1 tile\n")
-    warning = "warning: no tile of this run has a road" if damage is _one_cell else ""
+    warning = {
+        _one_cell: "warning: no tile of this run has a road",
+        _above: "warning: the DSM lies 47.0 m above the DTM on 1 of 1 tile: ellipsoidal heights? ",
+    }.get(damage, "")
     assert (result.code, said[: len(warning) or None]) == (0, warning)
     rows = read_metrics(tmp_path / "run")
     assert set(rows.status) == {"done"}
