@@ -94,7 +94,6 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     usable = [tile for tile in tiles if not tile.fault]
     named = set[str]()
     for layer, stage, ids in lacking(usable, config):
-        named.update(ids)
         yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")
     yield from _missing(usable, layers)
     for reason, ids in _unfit(usable, config).items():

@@ -92,7 +92,7 @@ def test_index_square_gives_tiles_of_250_m(tmp_path):
         ("dop", ("dop10rgbi_32_356_5699_1_nw_2021.jp2",), None),
     ]
     data = load(tile, Options())
-    assert data.notes == ()
+    assert data.notes == ("the DSM lies 10.0 m above the DTM: ellipsoidal heights?",)
     assert np.array_equal(data.dsm, dom[:250, :250].astype(np.float64))
     assert np.allclose(data.dtm, dgm[:250, :250], atol=0.0051)
     assert sorted(tmp_path.rglob("*")) == before
