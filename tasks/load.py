@@ -25,7 +25,7 @@ from flexroad.tasks.io.height_units import check_units
 from flexroad.tasks.io.mosaic import Mosaic, read_mosaic
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
-VERSION = 4
+VERSION = 3
 
 CLASSES = ("road_mask", "reference_road")
 READS = HEIGHTS + CLASSES

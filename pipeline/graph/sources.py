@@ -14,6 +14,7 @@ from flexroad.catalog import Grid, Layer, Tile
 from flexroad.catalog.borders import Border
 from flexroad.catalog.headers.source_files import files_of, source_stat
 from flexroad.catalog.storage.paths import FileStat, Location, read
+from flexroad.tasks.load import READS
 
 Stat = Callable[[Location], FileStat | None]
 """Returns the state of a source (`source_stat`), None if it does not exist."""
@@ -25,6 +26,10 @@ File = list[Any]
 """Name, size and version of a file, or name and checksum; None if it does not exist."""
 Entry = list[Any]
 """Name of a layer, its files (`File`), values, CRS and, if it has one, its conversion."""
+
+JOINED = ',["joined"]]'
+"""End of the description of several rasters: they are resampled together, and were not in earlier versions.
+Fingerprints of single files stay valid."""
 
 to_json = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 _GRID = tuple(field.name for field in fields(Grid))
@@ -83,7 +88,8 @@ class SourceFiles:
             self.frames[layer.name] = f"[{to_json(layer.name)},[", f"],{to_json(_about(layer))[1:]}"
         start, end = self.frames[layer.name]
         names = layer.files if numbers is None else [layer.files[number] for number in numbers]
-        return f"{start}{','.join([self._text(layer.name, name) for name in names])}{end}"
+        text = f"{start}{','.join([self._text(layer.name, name) for name in names])}{end}"
+        return text[:-1] + JOINED if len(names) > 1 and layer.name in READS else text
 
     def models(self, files: Iterable[Path]) -> str:
         """Return the checksums of files that options name, such as a model, as JSON."""

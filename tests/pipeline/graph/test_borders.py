@@ -171,6 +171,7 @@ def reference_nodes(tile, config, stat_file):
     def described(layer):
         files = [(name, stat_file(path)) for name, path in zip(layer.files, tile.paths(layer), strict=True)]
         how = [["reproject", layer.reproject, layer.height_unit]] if layer.reproject else []
+        how += [["joined"]] if len(files) > 1 and layer.name in load.READS else []
         return [
             *(
                 layer.name,

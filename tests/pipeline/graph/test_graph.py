@@ -20,6 +20,7 @@ from flexroad.pipeline.graph.graph import (
     own_files_missing,
     tile_graph,
 )
+from flexroad.pipeline.graph.sources import SourceFiles
 from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
@@ -321,3 +322,19 @@ def test_missing_files_around_the_tile_are_not_its_own(survey):
     assert own_files_missing(tile_graph(tile, config)) == [str(own)]
     unknown = replace(tile, layers=tuple(replace(layer, extents=()) for layer in tile.layers))
     assert set(own_files_missing(tile_graph(unknown, config))) == {str(own), str(beside)}
+
+
+@pytest.mark.parametrize(
+    ("name", "files", "end"),
+    [
+        ("dsm", ("a.tif",), []),
+        ("dsm", ("a.tif", "b.tif"), [["joined"]]),
+        ("road_mask", ("a.tif", "b.tif"), [["joined"]]),
+        ("roads", ("a.gpkg", "b.gpkg"), []),
+    ],
+)
+def test_several_rasters_are_hashed_as_joined_and_one_as_ever(name, files, end, survey):
+    layer = Layer(name, files, values=(1,), crs="EPSG:25832")
+    tile = replace(Catalog.read(survey).tiles[0], layers=(layer,))
+    hashed = json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(layer))
+    assert hashed == [name, [[file, None] for file in files], [1], "EPSG:25832", *end]
