@@ -6,7 +6,7 @@ The folder lies outside the run, and one export at a time writes it; existing fi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
@@ -112,6 +112,10 @@ def _written(
         more = kind.write(source, tiles, folder, options, executor) or {}
     except TaskError as error:
         raise ConfigError(f"{name}: {error}") from error
+    finally:
+        # Else an error, which refers to the iterator, would keep its progress lines going.
+        if isinstance(tiles, Generator):
+            tiles.close()
     files = file_sizes(folder)
     if removed := len(before.keys() - files.keys()):
         notify(f"removed {count(removed, 'file')} of an earlier export from {folder}")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -119,7 +119,12 @@ def write_viewer(
     roads = options if isinstance(options, rasterise.Options) else rasterise.DEFAULTS
     look = Look(run.origin, photo_px, roads)
     finished = track(_finished(run, done, variant), "writing tiles", len(done))
-    rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+    try:
+        rows = list(write_pieces(finished, out, VERSION, piece, look, executor))
+    finally:
+        # Else an error, which refers to the iterator, would keep its progress lines going.
+        if isinstance(finished, Generator):
+            finished.close()
     for file in built_files():
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())

@@ -100,7 +100,7 @@ def test_run_job_of_two_workers_cancelled_equals_serial_run(slurm, tmp_path, fle
     said = flexroad("run", *catalog, "--out", run, "--config", tmp_path / "slurm.yaml").expected(0)
     thread.join()
     assert "1 SLURM job ended; submitted again" in said.err
-    assert_whole(run, serial)
+    assert_whole(run, serial, killed=2)
     assert len(list((run / "logs").glob("flexroad-*.err"))) == 2
     assert not list(Path.cwd().glob("slurm-*.out"))
 

@@ -45,6 +45,6 @@ def test_load_gzipped_xyz_dtm_matches_dsm_cells(real_data, tmp_path):
     (tmp_path / "dgm1_32_356_5699_1_nw.xyz.gz").write_bytes(gzip.compress("\n".join(lines).encode()))
     tile = next(tile for tile in index(tmp_path).tiles if tile.id == "356000_5699750")
     data = load(tile, Options())
-    assert data.notes == ()
+    assert data.notes == ("the DSM lies 10.0 m above the DTM: ellipsoidal heights?",)
     assert np.array_equal(data.dsm, surface[:250, :250].astype(float))
     assert np.allclose(data.dsm - data.dtm, 10, atol=0.006)

@@ -27,7 +27,7 @@ def test_area_selects_the_tiles_of_an_export(town, area, tmp_path):
     out = tmp_path / "out"
     path = area(west + 5, south + 5, west + 20, south + 20)
     said = call("export", town.path, "--format", "mosaic", "--area", path, "-o", out).expected(0)
-    assert "mosaic: 4 files" in said.out
+    assert "mosaic: 7 files" in said.out
     assert json.loads((out / "export.json").read_text())["tiles"] == 1
 
 

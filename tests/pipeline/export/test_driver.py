@@ -3,11 +3,13 @@
 import gzip
 import json
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import rhino3dm
+from rich.console import Console
 
 from flexroad.catalog import Catalog
 from flexroad.catalog.ellipsoidal import Datum
@@ -19,8 +21,10 @@ from flexroad.pipeline.export import pieces
 from flexroad.pipeline.export.driver import check_formats, export
 from flexroad.pipeline.export.formats import FORMATS
 from flexroad.pipeline.export.source import Options, select
+from flexroad.pipeline.run.progress import StepProgress
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
+from flexroad.tasks.errors import TaskError
 from tests.read_exports import OFFSET_M, heightfields, off_surface, true_heights, vertices
 
 OPTIONS = Options(Datum("offset", str(OFFSET_M)))
@@ -137,6 +141,26 @@ def test_library_that_is_missing_is_named_before_any_file_is_written(
     with pytest.raises(ConfigError, match=r"^[^:]*needs? .*pip install 'flexroad\[export\]'$"):
         export(select(city), tmp_path, ["landxml", name], OPTIONS, SerialExecutor())
     assert not list(tmp_path.iterdir())
+
+
+def test_error_ends_the_progress_lines(city, tmp_path, monkeypatch):
+    def fail(source, tiles, folder, options, executor):
+        next(iter(tiles))
+        raise TaskError("no space")
+
+    monkeypatch.setitem(FORMATS, "obj", replace(FORMATS["obj"], write=fail))
+    before = threading.active_count()
+    with pytest.raises(ConfigError, match="obj: no space") as raised:
+        export(
+            select(city),
+            tmp_path,
+            ["obj"],
+            OPTIONS,
+            SerialExecutor(),
+            track=StepProgress(Console(quiet=True)),
+        )
+    assert raised.tb  # It refers to the iterator of the tiles.
+    assert threading.active_count() == before
 
 
 def test_formats_that_cannot_be_written_are_refused_before_any_work():
