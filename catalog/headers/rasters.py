@@ -30,6 +30,7 @@ from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.refused import Refused
+from flexroad.catalog.headers.valid_cells import color_kinds
 from flexroad.catalog.storage.settings import gdal_options
 from flexroad.catalog.text import access_reason, some
 from flexroad.catalog.tile import HEIGHTS, ROAD_HEIGHT_BANDS
@@ -450,7 +451,7 @@ def heights_fault(dataset: Any) -> str | None:
 
     They are its only band of numbers, or the first one if its bands are described as `ROAD_HEIGHT_BANDS`.
     """
-    kinds = [kind for kind in dataset.colorinterp if kind != ColorInterp.alpha]
+    kinds = [kind for kind in color_kinds(dataset) if kind != ColorInterp.alpha]
     if len(kinds) > 1 and dataset.descriptions[: len(BANDS)] != BANDS:
         bands = f"{len(kinds)} bands ({', '.join(kind.name for kind in kinds[:4])})"
         return f"has {bands}, but heights are one; keep theirs with gdal_translate -b 1"

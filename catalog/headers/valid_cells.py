@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,23 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 
 
+def color_kinds(dataset: Any) -> tuple[ColorInterp, ...]:
+    """Return the kind of each band of an open raster, such as grey or alpha."""
+    kinds: tuple[ColorInterp, ...]
+    # The call raises the last error of GDAL, which may be about a tag that does not matter, and so clears it.
+    with contextlib.suppress(Exception):
+        kinds = dataset.colorinterp
+        return kinds
+    kinds = dataset.colorinterp
+    return kinds
+
+
 def alpha_band(dataset: Any) -> int | None:
     """Return the number of an open raster's alpha band that GDAL does not take for a mask, None without one.
 
     GDAL takes one of uint8 or uint16 alone, and only if the file has no other mask and no nodata value.
     """
-    kinds = dataset.colorinterp
+    kinds = color_kinds(dataset)
     if ColorInterp.alpha not in kinds[1:] or MaskFlags.alpha in dataset.mask_flag_enums[0]:
         return None
     return int(kinds.index(ColorInterp.alpha, 1)) + 1

@@ -22,6 +22,7 @@ from flexroad.catalog.crs import bounds_in
 from flexroad.catalog.grid import Bounds
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.rasters import date_of
+from flexroad.catalog.headers.valid_cells import color_kinds
 from flexroad.catalog.to_metres import MetricTransform
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
@@ -211,7 +212,7 @@ def _warped(source: Any, frame: MetricTransform, grid: Grid, reduction: Resampli
 
 
 def _has_alpha(source: Any) -> bool:
-    return ColorInterp.alpha in source.colorinterp
+    return ColorInterp.alpha in color_kinds(source)
 
 
 def _windows(grid: Grid) -> Iterator[tuple[Grid, Window]]:

@@ -17,6 +17,7 @@ from rasterio.vrt import WarpedVRT
 
 from flexroad.catalog.grid import LATTICE_TOLERANCE, Grid
 from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.headers.valid_cells import color_kinds
 from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import edges
 from flexroad.tasks.errors import LayerMissing, TaskError, Unusable
@@ -129,7 +130,7 @@ def _gsd_m(lattice: RasterGrid, grid: Grid) -> float:
 def _depth(src: Any, path: Location, name: str) -> int:
     """Return the number of bits per colour."""
     kind = src.dtypes[0]
-    if src.colorinterp[0] == ColorInterp.palette:
+    if color_kinds(src)[0] == ColorInterp.palette:
         raise Unusable(
             f"{name} has a palette instead of colours; expand it with gdal_translate -expand rgb", str(path)
         )
@@ -146,7 +147,7 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
     cell_x, cell_y = lattice.cell_of(pixels)
     coarser = min(cell_x / lattice.dx, cell_y / lattice.dy) > 1 + LATTICE_TOLERANCE
     bands = (1, 2, 3) if src.count >= 3 else (1,)
-    has_alpha = ColorInterp.alpha in src.colorinterp
+    has_alpha = ColorInterp.alpha in color_kinds(src)
     with WarpedVRT(
         src,
         # If the file's CRS is the same one by another name: prevent a reprojection.
@@ -162,7 +163,7 @@ def _warped(src: Any, lattice: RasterGrid, pixels: Grid) -> tuple[NDArray[np.flo
         # A pixel is unknown only if all bands are nodata: pure red has two bands at 0.
         UNIFIED_SRC_NODATA="YES",
     ) as vrt:
-        alpha = src.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else vrt.count
+        alpha = color_kinds(src).index(ColorInterp.alpha) + 1 if has_alpha else vrt.count
         known: Bools = vrt.read(alpha) > 0
         colour: NDArray[np.float32] = vrt.read(bands)
     return np.where(known, colour, np.float32(0)), known

@@ -1,5 +1,7 @@
 """Cells without a value: an alpha band of any type counts, as do nodata values and masks."""
 
+import struct
+
 import numpy as np
 import pytest
 import rasterio
@@ -96,3 +98,12 @@ def test_alpha_of_a_mask_has_no_values(tmp_path):
     path = with_alpha(tmp_path / "m.tif", road, VOID, dtype="int16")
     (note,) = mask_notes(tmp_path, "road_mask", [path.name], (2,))
     assert "no cell has --road-value 2 but 1," in note
+
+
+def test_tag_that_gdal_cannot_read_does_not_hide_the_heights(tmp_path):
+    path = write(tmp_path / "a.tif", PLANE.astype(np.float32), WEST, NORTH)
+    content = path.read_bytes()
+    planar_configuration = struct.pack("<HHII", 284, 3, 1, 1)
+    assert planar_configuration in content
+    path.write_bytes(content.replace(planar_configuration, struct.pack("<HHII", 65535, 32767, 1, 1)))
+    assert np.array_equal(window(path).values, PLANE)
