@@ -32,7 +32,9 @@ def test_run_interrupted_while_workers_start_says_so_in_one_line(made_survey, qu
             os.killpg(process.pid, signal.SIGKILL)
     lines = (tmp_path / "output").read_text().splitlines()
     assert lines[-1] == "interrupted; the same command goes on from here"
-    assert all(line.startswith(("starting: ", "preparing ", "0/4 tiles")) for line in lines[:-1]), lines
+    assert all(
+        line.startswith(("starting: ", "preparing ", "reading ", "0/4 tiles")) for line in lines[:-1]
+    ), lines
 
 
 def test_extra_keeps_the_handler_of_interrupts(monkeypatch):
