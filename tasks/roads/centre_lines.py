@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.io.vectors import Query, encoding_notes, read_near
 from flexroad.tasks.roads import widths
+from flexroad.tasks.roads.attributes import has_value
 from flexroad.tasks.roads.rasterise import Options, columns, selected
 from flexroad.tasks.roads.routes import CentreLine
 from flexroad.tasks.types import Source
@@ -105,5 +106,5 @@ def _texts(table: Any, names: tuple[str, ...]) -> list[str]:
     texts = [""] * len(table)
     for name in names:
         for k, value in enumerate(table.get(name, ())):
-            texts[k] = texts[k] or (str(value).strip() if widths.has_value(value) else "")
+            texts[k] = texts[k] or (str(value).strip() if has_value(value) else "")
     return texts

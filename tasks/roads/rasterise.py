@@ -18,6 +18,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.errors import LayerMissing
 from flexroad.tasks.io.vectors import Query, encoding_notes, has_place, read_near
 from flexroad.tasks.roads import widths
+from flexroad.tasks.roads.attributes import NO, is_yes
 from flexroad.tasks.types import Bools, Floats, Source, TileData
 
 rasterio = lazy("rasterio")
@@ -27,8 +28,6 @@ CLASS_TAGS = ("highway", "area:highway")
 HIDDEN_TAGS = ("tunnel", "covered")
 """Tags of roads under something, whose heights are not in the DSM."""
 BRIDGE, AREA = "bridge", "area"
-NO = ("", "no", "false", "f", "n", "0", "0.0", "nan", "<na>", "none")
-"""Values that mean no, or no value, in lower case."""
 SAME_M = 0.01
 """Ends of lines within this distance are the same (m)."""
 
@@ -191,13 +190,6 @@ def _is_road(table: Any, classes: NDArray[np.object_], options: Options) -> Bool
         for tag in HIDDEN_TAGS:
             road &= ~is_yes(table, tag)
     return road
-
-
-def is_yes(table: Any, column: str) -> Bools:
-    """Return the rows whose value in a column is not one of `NO`, ``(n,)``; none if the column is missing."""
-    if column not in table:
-        return np.zeros(len(table), bool)
-    return np.array([str(value).strip().lower() not in NO for value in table[column]], bool)
 
 
 def _closed(parts: NDArray[np.object_], area: Bools) -> NDArray[np.object_]:

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flexroad.tasks import options as base
+from flexroad.tasks.roads.attributes import has_value
 from flexroad.tasks.types import Floats
 
 CLASS_WIDTH_M = {
@@ -182,9 +183,3 @@ def _numbers(table: Any, columns: tuple[str, ...], lowest: float, highest: float
                 number = float(text)
                 numbers[i] = number if lowest <= number <= highest else np.nan
     return numbers
-
-
-def has_value(value: Any) -> bool:
-    """Return whether a table has a value there."""
-    # pandas has several values for "missing".
-    return value is not None and str(value).strip().lower() not in ("", "nan", "<na>", "none")
