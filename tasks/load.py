@@ -123,6 +123,7 @@ def load(tile: Tile, options: Options) -> TileData:
         notes=(*(note for mosaic in mosaics.values() for note in mosaic.notes), *remarks),
         dop=layer_source(tile, "dop"),
         roads=layer_source(tile, "roads"),
+        decks=mosaics["bridges"].values if "bridges" in mosaics else None,
     )
 
 
@@ -169,6 +170,7 @@ def load_border(ground: Tile, core: Grid, options: Options | None = None) -> Til
         road_mask=_road(ground, "road_mask", mosaics),
         dop=_optional(layer_source(ground, "dop")),
         roads=_optional(layer_source(ground, "roads")),
+        decks=mosaics["bridges"].values if "bridges" in mosaics else None,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flexroad.catalog.grid import Bounds, Grid
@@ -14,6 +15,13 @@ from flexroad.catalog.trust import AllowedFolders
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+BLEND_M = 4.0
+"""Beyond an approach the ground returns to its own surface over this distance (m)."""
+ON_JOINT_M = 1e-3
+"""Points within this distance of a joint lie on it (m)."""
+FREE_M = 0.05
+"""Points that are nearer to the outline of a level by this (m) than to its joints lie at a free edge."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,9 @@ class TileData:
     offset_dsm: bool = False
     """Whether roads are fitted to the DSM minus its height above the DTM on open road
     (`tasks.roads.road_height`)."""
+    decks: Floats | None = None
+    """Height of bridge decks, ``(H, W)``, m, NaN elsewhere (the layer ``bridges``); None if the tile has no
+    such layer."""
 
     def lacks_road(self, mask: Bools) -> bool:
         """Return whether no cell of the tile's core is road in a mask, ``(H, W)``."""
@@ -76,8 +87,51 @@ class TileData:
 
 
 @dataclass(frozen=True, eq=False)
+class Level:
+    """The roads of one level: decks above the ground (number above 0), or tubes below it (below 0).
+
+    Level 0 is the ground with its streets and has no `Level`. Coordinates are those of the tile's CRS (m).
+    """
+
+    number: int
+    areas: shapely.MultiPolygon
+    """The decks or tubes on and around the tile."""
+    joints: shapely.MultiLineString
+    """The parts of their outline where a road of level 0 goes on."""
+    approach: shapely.MultiPolygon
+    """The road of level 0 beyond the joints: there level 0 has the surface of this level."""
+
+    def covers(self, easting: Floats, northing: Floats) -> Bools:
+        """Return which points lie on the decks or tubes, in the points' broadcast shape."""
+        shapely.prepare(self.areas)
+        return np.asarray(shapely.intersects_xy(self.areas, easting, northing))
+
+    def weight(self, easting: Floats, northing: Floats) -> Floats:
+        """Return the share of this level's surface in that of level 0, from 0 to 1, in the broadcast shape.
+
+        It is 1 on the approach, falls to 0 over `BLEND_M` beside and behind it, and is 0 below the decks and
+        at their free edges.
+        """
+        easting, northing = np.broadcast_arrays(easting, northing)
+        result = np.zeros(easting.shape)
+        if self.approach.is_empty:
+            return result
+        west, south, east, north = shapely.buffer(shapely.box(*self.approach.bounds), BLEND_M).bounds
+        near = (easting > west) & (easting < east) & (northing > south) & (northing < north)
+        places = shapely.points(easting[near], northing[near])
+        share = np.clip(1 - shapely.distance(self.approach, places) / BLEND_M, 0.0, 1.0)
+        away, from_joints = shapely.distance(self.areas, places), shapely.distance(self.joints, places)
+        free = (away < from_joints - FREE_M) | ((away == 0.0) & (from_joints > ON_JOINT_M))
+        result[near] = np.where(free, 0.0, share * share * (3 - 2 * share))
+        return result
+
+
+@dataclass(frozen=True, eq=False)
 class RoadMask:
-    """The result of `segment`: the paper's M^r, before the filter."""
+    """The result of `segment`: the paper's M^r, before the filter.
+
+    With levels, mask and areas are those of level 0, without the decks and tubes.
+    """
 
     grid: Grid
     core: Grid
@@ -95,11 +149,16 @@ class RoadMask:
     None if there are none, or if the mask is not that of polygons."""
     notes: tuple[str, ...] = ()
     """Warnings about the mask (such as a photo shifted against the heights), one line each."""
+    levels: tuple[Level, ...] = ()
+    """The other levels that the tile's surface depends on, by ascending number."""
 
 
 @dataclass(frozen=True, eq=False)
 class RoadClusters:
-    """The result of ECSRC: the paper's labels L and, as `mask`, M^{r+}."""
+    """The result of ECSRC: the paper's labels L and, as `mask`, M^{r+}.
+
+    With levels, the labels are those of what level 0 sees: its streets, without approaches.
+    """
 
     grid: Grid
     labels: NDArray[np.int32]
@@ -110,6 +169,10 @@ class RoadClusters:
     beside: Bools | None = None
     """Cells beside the streets whose ground has its own height (`tasks.spline.stepped`), ``(H, W)``: the
     verge, whose DTM is left out of the fit, and cells near it. None if there is no verge."""
+    level: Level | None = None
+    """The level that these clusters are of; None: level 0."""
+    levels: tuple[RoadClusters, ...] = ()
+    """The clusters of each other level, of its roads and of the streets far from them."""
 
     @property
     def mask(self) -> Bools:
@@ -152,6 +215,9 @@ class Mesh:
     road: Bools
     """``(F,)``, True where the cell under the face's centroid is road by the mask used for sampling, or where
     the centroid is in the road's polygons, if the mesh has their outline."""
+    level: NDArray[np.int8] | None = None
+    """Level of each face, ``(F,)``; None: all are on level 0. Faces of different levels share no vertex: on a
+    joint both have vertices at the same places."""
 
 
 @dataclass(frozen=True)

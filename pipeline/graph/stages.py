@@ -42,7 +42,9 @@ def stage_version(stage: str, options: Options) -> tuple[str, int]:
 
 def stage_head(stage: str, options: Options) -> list[Any]:
     """Return stage, `VERSION` and options as they enter fingerprints."""
-    return [stage, stage_module(options).VERSION, options.model_dump(mode="json")]
+    fields = type(options).model_fields
+    unchanged = {name for name in options.LATER if getattr(options, name) == fields[name].default}
+    return [stage, stage_module(options).VERSION, options.model_dump(mode="json", exclude=unchanged)]
 
 
 def model_files(options: Options) -> tuple[Path, ...]:

@@ -14,17 +14,23 @@ from dataclasses import asdict, fields, is_dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 
 from flexroad.catalog import Grid
 from flexroad.pipeline.config.methods import methods
 from flexroad.tasks.io.archive import npz
 from flexroad.tasks.spline.frame import Corner, Edge
+from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
 from flexroad.tasks.spline.moving import MovingNurbs
 from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface
-from flexroad.tasks.types import Mesh, Metrics, Quality, RoadClusters, RoadMask
+from flexroad.tasks.types import Level, Mesh, Metrics, Quality, RoadClusters, RoadMask
 
 HEADER = "header.json"
+SEPARATOR = "."
+"""Between the names of a field and of a field of the result in it, in the names of arrays."""
+LEVELS = ("level", "levels")
+"""Fields that are left out if they are empty: results without levels have the bytes of earlier versions."""
 SHA256_BYTES = 32
 
 
@@ -41,15 +47,7 @@ class Stored(NamedTuple):
 def encode(value: Any, seconds: Mapping[str, float], notes: Sequence[str] = ()) -> bytes:
     """Return the bytes of a result, of the seconds of each stage and of the notes up to it (`Stored`)."""
     arrays: dict[str, Any] = {}
-    plain: dict[str, Any] = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
-        if isinstance(item, np.ndarray):
-            # Points are a quarter smaller by columns: many have the same x or y.
-            points = item.dtype.kind == "f" and item.shape[1:] == (3,)
-            arrays[field.name] = np.asfortranarray(item) if points else item
-        else:
-            plain[field.name] = {"grid": asdict(item)} if isinstance(item, Grid) else item
+    plain = _fields(value, "", arrays)
     header = {"type": type(value).__name__, "seconds": dict(seconds), "notes": list(notes), "fields": plain}
     arrays[HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     payload = npz(arrays)
@@ -70,23 +68,64 @@ def decode(data: bytes) -> Stored:
     with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
         arrays = {name: np.asarray(archive[name], order="C") for name in archive.files}
     header = json.loads(arrays.pop(HEADER).tobytes())
-    plain = {name: _plain(item) for name, item in header["fields"].items()}
     # Stores of earlier versions have no notes.
     notes = tuple(header.get("notes", ()))
-    return Stored(_types()[header["type"]](**plain, **arrays), header["seconds"], notes)
+    return Stored(_result(header["type"], header["fields"], "", arrays), header["seconds"], notes)
 
 
-def _plain(item: Any) -> Any:
+def _fields(value: Any, prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a result as JSON values, and add its arrays to those of the file by name."""
+    plain: dict[str, Any] = {}
+    for field in fields(value):
+        item, name = getattr(value, field.name), prefix + field.name
+        if isinstance(item, np.ndarray):
+            # Points are a quarter smaller by columns: many have the same x or y.
+            points = item.dtype.kind == "f" and item.shape[1:] == (3,)
+            arrays[name] = np.asfortranarray(item) if points else item
+        elif item or field.name not in LEVELS:
+            plain[field.name] = _json(item, name, arrays)
+    return plain
+
+
+def _json(item: Any, name: str, arrays: dict[str, Any]) -> Any:
+    if isinstance(item, Grid):
+        return {"grid": asdict(item)}
+    if isinstance(item, shapely.Geometry):
+        arrays[name] = np.frombuffer(shapely.to_wkb(item), np.uint8)
+        return {"wkb": name}
+    if is_dataclass(item):
+        return {
+            "result": type(item).__name__,
+            "prefix": name + SEPARATOR,
+            "fields": _fields(item, name + SEPARATOR, arrays),
+        }
+    if isinstance(item, tuple):
+        return [_json(part, f"{name}{SEPARATOR}{number}", arrays) for number, part in enumerate(item)]
+    return item
+
+
+def _result(kind: str, plain: Mapping[str, Any], prefix: str, arrays: Mapping[str, Any]) -> Any:
+    """Return a result from its fields of JSON and from the arrays whose names begin with a prefix."""
+    own = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    own = {name: array for name, array in own.items() if SEPARATOR not in name and name not in plain}
+    return _types()[kind](**{name: _plain(item, arrays) for name, item in plain.items()}, **own)
+
+
+def _plain(item: Any, arrays: Mapping[str, Any]) -> Any:
     if isinstance(item, dict):
-        return Grid(**item["grid"])
+        if "grid" in item:
+            return Grid(**item["grid"])
+        if "wkb" in item:
+            return shapely.from_wkb(arrays[item["wkb"]].tobytes())
+        return _result(item["result"], item["fields"], item["prefix"], arrays)
     # The result types hold tuples, which JSON stores as lists.
-    return tuple(_plain(part) for part in item) if isinstance(item, list) else item
+    return tuple(_plain(part, arrays) for part in item) if isinstance(item, list) else item
 
 
 def _types() -> dict[str, type]:
     shared = (
-        Corner, Edge, Mesh, Metrics, MovingNurbs, NurbsSurface, Quality, RoadClusters, RoadMask,
-        SteppedSurface,
+        Corner, Edge, Level, LevelledSurface, LevelSpline, Mesh, Metrics, MovingNurbs, NurbsSurface, Quality,
+        RoadClusters, RoadMask, SteppedSurface,
     )  # fmt: skip
     types: dict[str, type] = {result.__name__: result for result in shared}
     for module in methods("fit").values():

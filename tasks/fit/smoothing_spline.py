@@ -183,13 +183,15 @@ def edge(
     first, last = (end.outside for end in ends)
     outside[:, 0], outside[:, -1] = (first[:, 1], last[:, 0]) if eastward else (first[0], last[1])
     spline = spline_around(lattice, border, u, v, around)
+    beside = border_steps(data, road, clusters, border, spline) if options.steps else {}
     return Edge(
         control,
         road=border.along(road.mask)[1],
         kept=border.along(clusters.mask)[1],
         outside=outside,
         crossings=crossings(road.areas, border),
-        **(border_steps(data, road, clusters, border, spline) if options.steps else {}),
+        steps=beside.get("steps"),
+        road_m=beside.get("road_m"),
     )
 
 

@@ -6,7 +6,7 @@ the parts of one tile are its frame: it fixes the surface and the mesh along the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,12 @@ class Corner:
     """Control heights, ``(q, p)``, m; row 0 in the south. NaN if there is no ground to fit."""
     outside: Bools
     """Whether the four cells around it lie beyond the survey, ``(2, 2)``; row 0 in the north."""
+    levels: tuple[tuple[int, Corner], ...] = ()
+    """Number and corner of each other level near it; its own control points are those of level 0."""
+
+    def at(self, number: int) -> Corner:
+        """Return the corner of a level, that of level 0 if it has none."""
+        return dict(self.levels).get(number, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +58,14 @@ class Edge:
     road_m: Floats | None = None
     """Distance of the nearer of the two cells to the nearest road cell of the raw mask, ``(cells,)``, m; with
     ``steps``."""
+    levels: tuple[tuple[int, Edge], ...] = ()
+    """Number and edge of each other level near it; its own control points, classes and steps are those of
+    level 0. Crossings of a level are those of the outline of its decks; those on joints are also among the
+    crossings of level 0."""
+
+    def at(self, number: int) -> Edge:
+        """Return the edge of a level, that of level 0 if it has none."""
+        return dict(self.levels).get(number, self)
 
     def steps_beyond(self, distance_m: float, cells: int) -> Floats:
         """Return the steps, ``(cells,)``, m: 0 within a distance of road cells, and if there are none."""
@@ -83,6 +97,10 @@ class Frame:
     north: Edge
     west: Edge
     east: Edge
+
+    def at(self, number: int) -> Frame:
+        """Return the frame of a level: its corners and edges, or those of level 0 where it has none."""
+        return Frame(*(getattr(self, field.name).at(number) for field in fields(self)))
 
     def control(self, shape: tuple[int, int]) -> Floats:
         """Return the control heights of a tile's surface, ``shape``; NaN where the frame leaves them free."""

@@ -21,7 +21,7 @@ from flexroad.pipeline.graph.graph import (
     tile_graph,
 )
 from flexroad.pipeline.graph.sources import SourceFiles
-from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_version
+from flexroad.pipeline.graph.stages import STAGE_NAMES, STAGES, stage_head, stage_version
 from flexroad.tasks.filter import ecsrc
 from flexroad.tasks.options import stage_module
 from flexroad.tasks.segment import mask
@@ -338,3 +338,13 @@ def test_several_rasters_are_hashed_as_joined_and_one_as_ever(name, files, end, 
     tile = replace(Catalog.read(survey).tiles[0], layers=(layer,))
     hashed = json.loads(SourceFiles(tile, lambda path: None, checksum=False).text(layer))
     assert hashed == [name, [[file, None] for file in files], [1], "EPSG:25832", *end]
+
+
+def test_later_option_enters_fingerprints_only_if_it_is_changed():
+    class Extended(mask.Options):
+        __module__ = mask.__name__
+        LATER = ("extra",)
+        extra: int = 3
+
+    assert stage_head("segment", Extended()) == stage_head("segment", mask.Options())
+    assert stage_head("segment", Extended(extra=4))[-1] == {"method": "mask", "extra": 4}

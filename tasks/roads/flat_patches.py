@@ -1,0 +1,112 @@
+"""Flat patches of a road: squares of cells that a plane fits, as no plane fits a car, a crown or a facade."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.tasks.compiled import compiled
+from flexroad.tasks.types import Bools, Floats
+
+PATCH_M = 3.0
+"""Side of a patch (m); at least three cells."""
+STREET_M = 5.0
+"""Half side of the square around a patch over which the street's slope is averaged (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """The flat patches of a tile, by their centres."""
+
+    centres: Bools
+    """Cells that are the centre of a flat patch, ``(H, W)``."""
+    trend: Floats
+    """Slope of the street along rows and columns at each centre, ``(H, W, 2)``, m per cell; 0 elsewhere."""
+    reach: int
+    """Number of cells from a centre to the edge of its patch."""
+
+
+def flat_patches(heights: Floats, points: Bools, cell: float, roughness_m: float, bend: float) -> Patches:
+    """Find the flat patches.
+
+    A patch is flat if the residuals to its least-squares plane have a root mean square (over the degrees of
+    freedom) of at most ``roughness_m``, and if its slope differs from the street's by at most ``bend``; the
+    street's slope is the mean over the patches nearby. The second condition excludes patches across a step: a
+    plane tilted up to the roof of a car has small residuals.
+
+    Parameters
+    ----------
+    heights : (H, W) array
+        Surface model (m).
+    points : (H, W) array of bool
+        Cells that may belong to a patch; a patch has no other cells.
+    cell : float
+        Size of a cell (m).
+    roughness_m : float
+        Largest root mean square of a patch's residuals (m).
+    bend : float
+        Largest difference of slope (m per m).
+    """
+    reach = max(1, math.floor((PATCH_M / cell - 1) / 2 + 1e-9))
+    slopes, smooth = _planes(heights, points, reach, roughness_m**2)
+    around = max(1, math.floor(STREET_M / cell + 1e-9))
+    return Patches(*_along_street(slopes, smooth, around, (bend * cell) ** 2), reach)
+
+
+@compiled()
+def _planes(heights: Floats, points: Bools, reach: int, largest: float) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return slopes along rows and columns (m per cell), ``(H, W, 2)``, and the centres of smooth patches."""
+    rows, cols = heights.shape
+    slopes, smooth = np.zeros((rows, cols, 2)), np.zeros((rows, cols), np.bool_)
+    side = 2 * reach + 1
+    n, spread = side * side, side * (reach * (reach + 1) * side / 3)
+    for r in range(reach, rows - reach):
+        for c in range(reach, cols - reach):
+            if not points[r, c]:
+                continue
+            whole, z, zz, rz, cz = True, 0.0, 0.0, 0.0, 0.0
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    whole = whole and points[r + i, c + j]
+                    up = heights[r + i, c + j] - heights[r, c]
+                    z, zz, rz, cz = z + up, zz + up * up, rz + i * up, cz + j * up
+                if not whole:
+                    break
+            if whole:
+                slopes[r, c] = rz / spread, cz / spread
+                square = zz - z * z / n - (rz * rz + cz * cz) / spread
+                smooth[r, c] = square <= largest * (n - 3)
+    return slopes, smooth
+
+
+@compiled()
+def _along_street(slopes: Floats, smooth: Bools, around: int, largest: float) -> tuple[Bools, Floats]:
+    """Return the smooth patches with the street's slope, ``(H, W)``, and that slope, ``(H, W, 2)``.
+
+    The street's slope is the mean of the smooth patches ``around`` a patch. The square of the difference to
+    it is at most ``largest``.
+    """
+    rows, cols = smooth.shape
+    trend, beside, centres = np.zeros((rows, cols, 2)), np.zeros((rows, cols, 3)), smooth.copy()
+    # First the sums of 1 and both slopes over columns, then the sums of these over rows.
+    for r in range(rows):
+        for c in range(cols):
+            if smooth[r, c]:
+                for j in range(max(c - around, 0), min(c + around + 1, cols)):
+                    beside[r, j, 0] += 1
+                    beside[r, j, 1] += slopes[r, c, 0]
+                    beside[r, j, 2] += slopes[r, c, 1]
+    for r in range(rows):
+        for c in range(cols):
+            if smooth[r, c]:
+                n, down, across = 0.0, 0.0, 0.0
+                for i in range(max(r - around, 0), min(r + around + 1, rows)):
+                    n, down, across = n + beside[i, c, 0], down + beside[i, c, 1], across + beside[i, c, 2]
+                down, across = down / n, across / n
+                trend[r, c] = down, across
+                bend = (slopes[r, c, 0] - down) ** 2 + (slopes[r, c, 1] - across) ** 2
+                centres[r, c] = bend <= largest
+    return centres, trend

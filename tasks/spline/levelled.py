@@ -1,0 +1,127 @@
+"""The surfaces of a tile with several levels: the ground, and decks above or tubes below it.
+
+Each level has a spline over the complete tile. Near a joint, the ground has the surface of the level that
+begins there, so that both are one spline across it. Its own spline, with control points metres apart, cannot
+follow the end of an embankment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.spline.stepped import SteppedSurface
+from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import BLEND_M, Floats, Level
+
+GRADIENT_M = 0.01
+"""Distance over which the slope of the weight of a level is taken (m)."""
+STEEPEST = 1.6 / BLEND_M
+"""More than the largest slope of the weight where it is smooth (1/m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSpline:
+    """The spline of a level other than 0."""
+
+    level: Level
+    A: Floats
+    """Control heights, ``(m, n)``, m; row 0 in the south."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelledSurface(SteppedSurface):
+    """The surfaces of all levels of a tile; height, normal and steps are those of level 0.
+
+    ``A`` are the control heights of level 0 alone. Within approaches its height is not that of this spline.
+    """
+
+    levels: tuple[LevelSpline, ...] = ()
+    """The other levels, by ascending number."""
+
+    @classmethod
+    def of(cls, spline: NurbsSurface, levels: tuple[LevelSpline, ...], cells: Grid) -> LevelledSurface:
+        """Return the surface of level 0 with the other levels, without steps on the cells of a grid."""
+        rows, cols = cells.shape
+        return cls(
+            **{field.name: getattr(spline, field.name) for field in fields(NurbsSurface)},
+            steps=np.zeros((rows, cols), np.float32),
+            cells=cells,
+            south_north=np.zeros((2, cols), np.float32),
+            west_east=np.zeros((2, rows), np.float32),
+            levels=levels,
+        )
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of the levels, ascending; 0 is one of them."""
+        return tuple(sorted((0, *(own.level.number for own in self.levels))))
+
+    def at(self, number: int) -> NurbsSurface:
+        """Return the surface of a level. Of others than 0 it counts only on the level's areas."""
+        if number == 0:
+            return self
+        control = next(own.A for own in self.levels if own.level.number == number)
+        own = {field.name: getattr(self, field.name) for field in fields(NurbsSurface)}
+        return NurbsSurface(**own | {"A": control})
+
+    def top(self, easting: Floats, northing: Floats) -> NDArray[np.int8]:
+        """Return the number of the highest level at points, in their broadcast shape."""
+        result = np.zeros(np.broadcast_shapes(np.shape(easting), np.shape(northing)), np.int8)
+        for own in self.levels:
+            if own.level.number > 0:
+                result[own.level.covers(easting, northing)] = own.level.number
+        return result
+
+    def smooth(self, easting: Floats, northing: Floats) -> Floats:
+        """Return the heights of level 0 without its steps (m) at points, in their broadcast shape."""
+        return self._joined(super().smooth(easting, northing), easting, northing)
+
+    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return heights of level 0 (m) at every pair, ``(len(northings), len(eastings))``."""
+        east, north = np.meshgrid(eastings, northings)
+        heights = self._joined(NurbsSurface.lattice(self, eastings, northings), east, north)
+        return np.asarray(heights + self._steps_at(east, north))
+
+    def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives of the height of level 0 without steps, by easting and northing (m/m)."""
+        easting, northing = np.broadcast_arrays(np.asarray(easting, float), np.asarray(northing, float))
+        heights = super().smooth(easting, northing)
+        by_easting, by_northing = (np.array(part) for part in super().slope(easting, northing))
+        for own in self.levels:
+            weight = own.level.weight(easting, northing)
+            near = weight > 0
+            east, north, share = easting[near], northing[near], weight[near]
+            other = self.at(own.level.number)
+            off = other.height(east, north) - heights[near]
+            for total, of_other, aside in zip(
+                (by_easting, by_northing),
+                other.slope(east, north),
+                ((GRADIENT_M, 0.0), (0.0, GRADIENT_M)),
+                strict=True,
+            ):
+                total[near] += share * (of_other - total[near]) + off * _rise(own.level, east, north, aside)
+            heights[near] += share * off
+        return by_easting, by_northing
+
+    def _joined(self, heights: Floats, easting: Floats, northing: Floats) -> Floats:
+        """Return heights of the spline of level 0 (m) with those of the other levels near their joints."""
+        east, north = np.broadcast_arrays(np.asarray(easting, float), np.asarray(northing, float))
+        result = np.array(heights)
+        for own in self.levels:
+            weight = own.level.weight(east, north)
+            near = weight > 0
+            other = self.at(own.level.number).height(east[near], north[near])
+            result[near] += weight[near] * (other - result[near])
+        return result
+
+
+def _rise(level: Level, easting: Floats, northing: Floats, aside: tuple[float, float]) -> Floats:
+    """Return the derivative of the weight of a level in a direction (1/m), 0 at its jump at the joint."""
+    east, north = aside
+    ahead, behind = (level.weight(easting + s * east, northing + s * north) for s in (1, -1))
+    rise = (ahead - behind) / (2 * GRADIENT_M)
+    return np.where(np.abs(rise) > STEEPEST, 0.0, rise)
