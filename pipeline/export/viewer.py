@@ -129,6 +129,8 @@ def write_viewer(
         if file.name != PAGE:
             write(out / file.name, file.read_bytes())
     # In the order of the catalog: equal viewers are equal byte by byte.
+    places = {row["tile"]: row["places"] for row in rows}
+    index["tiles"]["places"] = [places.get(tile.id, {}) for tile in tiles]
     found = {row["tile"]: row["picture"] for row in rows if row["picture"]}
     pictures = {tile.id: found[tile.id] for tile in done if tile.id in found}
     write(out / viewer.NAME_PICTURES, viewer.encode_pictures(pictures))
@@ -328,7 +330,7 @@ class Look:
 
 
 def piece(item: TileItem, look: Look) -> Piece:
-    """Return the script of a tile; its row has its picture, and names what could not be read."""
+    """Return the script of a tile; its row has its picture, the places of its flags, and what it lacks."""
     tile = item.tile
     source, notes = tile.tile, list[str]()
     photo = _photo(source, look.photo_px, notes)
@@ -337,13 +339,14 @@ def piece(item: TileItem, look: Look) -> Piece:
         data, (estimate, _) = tile.data, tile.cell_errors
     except ConfigError as error:
         dsm = dtm = estimate = None
-        seen = ""
+        seen, places = "", {}
         notes.append(f"no scan and terrain model to compare with: {error}")
     else:
         window = data.grid.window(data.core)
         dsm, dtm = data.dsm[window], data.dtm[window]
         height = surface.lattice(data.core.eastings, data.core.northings)
         height[tile.road.outside[window]] = np.nan
+        places = {flag: list(place) for flag, place in tile.flag_places.items()}
         small = viewer.picture(height, tile.road.mask[window], data.core.cell)
         seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(
@@ -359,7 +362,10 @@ def piece(item: TileItem, look: Look) -> Piece:
         _lines(source, look.roads, notes),
     )
     name = f"tiles/{safe_name(tile.id)}{viewer.NAME_TILE}"
-    return Piece({name: viewer.encode_tile(scene)}, {"tile": tile.id, "notes": notes, "picture": seen})
+    return Piece(
+        {name: viewer.encode_tile(scene)},
+        {"tile": tile.id, "notes": notes, "picture": seen, "places": places},
+    )
 
 
 def corners(tile: Tile) -> Floats:

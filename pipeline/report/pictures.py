@@ -36,7 +36,6 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import Track, peek_statuses, untracked
 from flexroad.tasks.metrics.vertical_distance import drape
 from flexroad.tasks.quality.estimate import compare
-from flexroad.tasks.quality.places import places
 from flexroad.tasks.types import Mesh
 
 MOST = 24
@@ -107,9 +106,7 @@ def _maps(tile: FinishedTile) -> TilePictures:
     truth = (data.dtm if data.reference is None else data.reference)[window]
     against = "DTM" if data.reference is None else "reference"
     cells = compare(data, road, clusters, tile.surface, tile.assessment.agree_m)
-    at = {
-        flag: place for flag, place in places(cells, core, tile.assessment).items() if flag in quality.flags
-    }
+    at = tile.flag_places
     return TilePictures(
         tile.id,
         (

@@ -31,6 +31,8 @@ from flexroad.pipeline.store.products import TileProducts
 from flexroad.pipeline.store.records import DONE, MarkerStat, from_item
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.quality import assess
+from flexroad.tasks.quality.estimate import compare
+from flexroad.tasks.quality.places import Place, places
 from flexroad.tasks.types import (
     Floats,
     Mesh,
@@ -273,6 +275,17 @@ class FinishedTile:
     def cell_errors(self) -> tuple[Floats, NDArray[np.uint8]]:
         """Estimated error (m) and support of each cell of the core; needs the source files."""
         return assess.cell_errors(self.data, self.road, self.clusters, self.surface, self.assessment)
+
+    @property
+    def flag_places(self) -> dict[str, Place]:
+        """Easting and northing (m) by raised flag, of those that have a place; needs the source files."""
+        flags = self.quality.flags
+        if not flags:
+            return {}
+        data = self.data
+        cells = compare(data, self.road, self.clusters, self.surface, self.assessment.agree_m, only_road=True)
+        found = places(cells, data.core, self.assessment)
+        return {flag: found[flag] for flag in flags if flag in found}
 
     @cached_property
     def graph(self) -> TileGraph:

@@ -27,7 +27,7 @@ from flexroad.tasks.types import Bools, Floats
 
 Image = lazy("PIL.Image")
 
-VERSION = 2
+VERSION = 3
 NAME_TILE, NAME_RUN, NAME_PICTURES = ".js", "run.js", "pictures.js"
 MOST_CELLS = 256
 """Largest width and height of the rasters (cells); finer ones are thinned."""

@@ -13,6 +13,10 @@ const PAN_PX = 60;
 const EDGE_PX = 12;
 const DOT_PX = 14;
 const SEEN_PX = 60;
+/** Places of flags are rings on tiles that are at least so wide, and are chosen within their radius and a little more. */
+const PLACES_PX = 52;
+const RING_PX = 7;
+const NEAR_PX = 4;
 const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 /** Subclasses have `paint()`, and `chosen(tile)`, which is called for a tile that an arrow key leads to. */
@@ -120,6 +124,46 @@ export class FlatMap {
       const [right, bottom] = this.box.toScreen(tile.east, tile.south);
       if (right < 0 || bottom < 0 || left > this.box.width || top > this.box.height) continue;
       yield [tile, [left, top, right - left, bottom - top]];
+    }
+  }
+
+  /** Yields the places of flags in sight, each with its tile, flag and pixel. */
+  *placesInSight() {
+    for (const [tile, [, , width]] of this.inSight()) {
+      if (width < PLACES_PX) continue;
+      for (const [flag, place] of Object.entries(tile.places ?? {})) {
+        yield { tile, flag, place, pixel: this.box.toScreen(...place) };
+      }
+    }
+  }
+
+  /** Returns the place of a flag under a pixel; null without one. */
+  placeAt(x, y) {
+    let [best, least] = [null, RING_PX + NEAR_PX];
+    for (const found of this.placesInSight()) {
+      const away = Math.hypot(found.pixel[0] - x, found.pixel[1] - y);
+      if (away < least) [best, least] = [found, away];
+    }
+    return best;
+  }
+
+  /** Draws rings around the places of flags. */
+  paintPlaces(colours) {
+    for (const { pixel } of this.placesInSight()) {
+      this.twice(colours, [4.5, 2], (context) => {
+        context.beginPath();
+        context.arc(...pixel, RING_PX, 0, 2 * Math.PI);
+        context.stroke();
+      });
+    }
+  }
+
+  /** Strokes a wide line around a thin one, so that it is seen on every colour. */
+  twice({ halo, mark }, [wide, thin], stroke) {
+    for (const [colour, line] of [[halo, wide], [mark, thin]]) {
+      this.context.strokeStyle = colour;
+      this.context.lineWidth = line;
+      stroke(this.context);
     }
   }
 

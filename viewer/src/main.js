@@ -5,7 +5,7 @@ import { MapView, summary } from "./map_view.js";
 import { format, parse } from "./permalink.js";
 import { DONE, runOf } from "./run.js";
 import { TileScripts } from "./tile_scripts.js";
-import { TileView } from "./tile_view.js";
+import { OUTLINE, TileView } from "./tile_view.js";
 
 const LAYERS = { road: true, terrain: true, wire: false, points: false };
 const scripts = new TileScripts();
@@ -37,7 +37,7 @@ class Page {
     show(byId("message"), false);
     show(byId("app"), true);
     document.title = `${run.name} – FlexRoad`;
-    this.maps = new MapView(run, { open: (tile) => this.openTile(tile), changed: () => this.follow() });
+    this.maps = new MapView(run, { open: (tile, place) => this.openTile(tile, { place }), changed: () => this.follow() });
     this.listen();
     this.obey();
     if (run.pictures) this.loadPictures();
@@ -95,7 +95,7 @@ class Page {
     if (Object.keys(look).length) this.tiles.stage.apply(look);
     this.theme();
     this.maps.map.selected = tile;
-    await this.tiles.open(tile, state.camera, look.colour);
+    await this.tiles.open(tile, state, look.colour);
     this.follow();
   }
 
@@ -182,6 +182,7 @@ class Page {
       lines: this.tiles?.drive.lines.length ?? 0,
       driving: this.tiles?.drive.running ?? false,
       box: { ...this.maps.map.box },
+      outline: stage?.active ? this.tiles.overlay.drawn(OUTLINE) : null,
       corners: stage?.active && this.tiles.tile ? stage.pixels(stage.corners(this.tiles.tile)) : null,
       free: stage ? this.tiles.canvas.clientWidth - stage.covered() : null,
     };

@@ -9,19 +9,27 @@ const GAP_PX = 6;
 const PICTURE_PX = 16;
 const HATCH_PX = 24;
 const SCALE_PX = 160;
+const RINGS = { halo: "#ffffff", mark: "#b8352c" };
 /** Room for the bar above and the scale below (pixels). */
 const MARGINS = { top: 84, bottom: 48, sides: 24 };
 
 export class OverviewMap extends FlatMap {
-  /** Draws into a canvas; `open(tile)` is called for a chosen tile, `point(tile, x, y)` for the one under the pointer. */
+  /**
+   * Draws into a canvas; `open(tile, place)` is called for a chosen tile, with the place of a flag if that was
+   * chosen; `point(tile, x, y, flag)` for the tile and the flag's place under the pointer.
+   */
   constructor(canvas, run, { open, point }) {
     const under = (x, y) => tileAt(run, ...this.box.toGround(x, y));
     super(canvas, run.tiles, run.bounds, {
       margins: () => MARGINS,
-      point: (x, y) => point(x === null ? null : under(x, y), x, y),
+      point: (x, y) => {
+        const found = x === null ? null : this.placeAt(x, y);
+        point(x === null ? null : (found?.tile ?? under(x, y)), x, y, found?.flag);
+      },
       choose: (x, y) => {
-        const tile = under(x, y);
-        if (tile) open(tile);
+        const found = this.placeAt(x, y);
+        const tile = found?.tile ?? under(x, y);
+        if (tile) open(tile, found?.place);
       },
     });
     this.open = open;
@@ -77,6 +85,7 @@ export class OverviewMap extends FlatMap {
       if (width > LABEL_PX) label(context, tile, left, top, width);
     }
     context.globalAlpha = 1;
+    this.paintPlaces(RINGS);
     if (this.selected) this.outline(this.selected, color);
     this.paintScale(Math.min(SCALE_PX, this.box.width / 3), [18, this.box.height - 18], color, `12px ${fontFamily}`);
   }

@@ -5,12 +5,12 @@ import { OverviewMap } from "./map.js";
 import { choices } from "./map_colours.js";
 import { legend, reason, section, select, tileHead, tileId, tileList } from "./panel.js";
 import { DONE, FAILED, worst } from "./run.js";
-import { count, isFlagged, stateText } from "./words.js";
+import { count, flagText, isFlagged, stateText } from "./words.js";
 
 const LISTED = 10;
 
 export class MapView {
-  /** `open(tile)` shows a tile in 3D; `changed()` is called when the address must follow. */
+  /** `open(tile, place)` shows a tile in 3D, and a place on it if one is given; `changed()` is called when the address must follow. */
   constructor(run, { open, changed }) {
     this.run = run;
     this.open = open;
@@ -18,8 +18,8 @@ export class MapView {
     this.choices = choices(run);
     this.choice = this.choices[0];
     this.map = new OverviewMap(byId("map"), run, {
-      open: (tile) => this.choose(tile),
-      point: (tile, x, y) => this.tip(tile, x, y),
+      open: (tile, place) => this.choose(tile, place),
+      point: (tile, x, y, flag) => this.tip(tile, x, y, flag),
     });
     this.map.colourBy(this.choice.colour);
   }
@@ -75,7 +75,7 @@ export class MapView {
             tileList(listed, {
               mark: first.colour,
               value: (tile) => (tile.state === DONE ? rate?.text(tile) : null),
-              open: (tile) => this.choose(tile),
+              open: (tile, place) => this.choose(tile, place),
             }),
           )
         : null,
@@ -89,7 +89,7 @@ export class MapView {
     const list = tileList(found.slice(0, LISTED), {
       mark: this.choices[0].colour,
       value: () => null,
-      open: (tile) => this.choose(tile),
+      open: (tile, place) => this.choose(tile, place),
     });
     fill(this.results, list, more, none);
   }
@@ -101,10 +101,10 @@ export class MapView {
   }
 
   /** Opens a finished tile; of others, says what is known. */
-  choose(tile) {
+  choose(tile, place = null) {
     this.map.select(tile);
     if (tile.state === DONE) {
-      this.open(tile);
+      this.open(tile, place);
       return;
     }
     this.say(tileHead(tile), tile.state === FAILED ? null : el("p", { class: "quiet small" }, "It has no surface yet."));
@@ -117,7 +117,7 @@ export class MapView {
     byId("panel-content").scrollTop = 0;
   }
 
-  tip(tile, x, y) {
+  tip(tile, x, y, flag = null) {
     const element = byId("tip");
     show(element, Boolean(tile));
     if (!tile) return;
@@ -126,7 +126,7 @@ export class MapView {
       element,
       el("b", {}, tileId(tile)),
       value ? el("div", {}, `${this.choice.label}: ${value}`) : el("div", {}, stateText(tile)),
-      reason(tile) ? el("div", { class: "quiet" }, reason(tile)) : null,
+      flag || reason(tile) ? el("div", { class: "quiet" }, flag ? `here: ${flagText(flag)}` : reason(tile)) : null,
     );
     const { clientWidth, clientHeight } = byId("map-view");
     element.style.left = `${Math.max(Math.min(x + 16, clientWidth - element.offsetWidth - 8), 8)}px`;

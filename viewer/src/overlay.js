@@ -40,6 +40,11 @@ export class Overlay {
     this.stage.draw();
   }
 
+  /** Returns the places of a line; null if it is not drawn. */
+  drawn(name) {
+    return this.lines.get(name)?.places ?? null;
+  }
+
   /** Puts a dot at a place [easting, northing, height]; null removes it. */
   dot(name, place, colour) {
     let dot = this.dots.get(name);

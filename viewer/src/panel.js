@@ -106,7 +106,7 @@ export function tileId(tile) {
   return tile.stale ? el("s", {}, tile.id) : tile.id;
 }
 
-/** Returns a list of tiles as buttons: mark, id, value, and why a tile is listed. */
+/** Returns a list of tiles as buttons: mark, id, value, and why a tile is listed; flags with a place open it there. */
 export function tileList(tiles, { mark, value, open }) {
   const rows = tiles.map((tile) =>
     el(
@@ -118,27 +118,38 @@ export function tileList(tiles, { mark, value, open }) {
         el("span", { class: "swatch", style: `background: ${mark(tile)}` }),
         el("span", { class: "id" }, tileId(tile)),
         el("span", { class: "value" }, value(tile) ?? ""),
-        reason(tile) ? el("span", { class: "why" }, reason(tile)) : null,
+        reason(tile, false) ? el("span", { class: "why" }, reason(tile, false)) : null,
       ),
+      tile.state === DONE ? placed(tile).map((flag) => placeButton(tile, flag, (place) => open(tile, place))) : null,
     ),
   );
   return el("ol", { class: "list" }, rows);
 }
 
-/** Returns why a tile needs a look, in one line; empty if it does not. */
-export function reason(tile) {
+/** Returns why a tile needs a look, in one line, empty if it does not; flags that have a place may be left out. */
+export function reason(tile, all = true) {
   if (tile.state === FAILED) return tile.error || "failed";
-  return tile.flags.map(flagText).join("; ");
+  return tile.flags.filter((flag) => all || !tile.places[flag]).map(flagText).join("; ");
 }
 
-/** Returns id, state and problems of a tile. */
-export function tileHead(tile) {
+function placed(tile) {
+  return tile.flags.filter((flag) => tile.places[flag]);
+}
+
+/** Returns a button with a flag in words, which goes to its place. */
+function placeButton(tile, flag, go) {
+  const attributes = { type: "button", class: "place", "data-flag": flag, title: "Show the place" };
+  return el("button", { ...attributes, click: () => go(tile.places[flag]) }, flagText(flag));
+}
+
+/** Returns id, state and problems of a tile; `go(place)` shows the place of a flag. */
+export function tileHead(tile, go) {
   return [
     el("h3", {}, tileId(tile)),
     el("p", { class: "quiet" }, stateText(tile)),
     tile.state === FAILED ? el("p", { class: "error" }, tile.error || "The reason is in the run's failures.csv.") : null,
     tile.state === DONE && tile.flags.length
-      ? el("ul", { class: "notes" }, tile.flags.map((flag) => el("li", {}, flagText(flag))))
+      ? el("ul", { class: "notes" }, tile.flags.map((flag) => el("li", {}, tile.places[flag] ? placeButton(tile, flag, go) : flagText(flag))))
       : null,
   ];
 }

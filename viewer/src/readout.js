@@ -3,7 +3,7 @@
 import { el, fill } from "./dom.js";
 import { nearestLine } from "./lines.js";
 import { lonLat, metres, signed } from "./place.js";
-import { along, compass, steepest } from "./slopes.js";
+import { along, climb, compass, fall, steepest } from "./slopes.js";
 import { SUPPORT } from "./words.js";
 
 const LINE_WITHIN_M = 12;
@@ -44,14 +44,13 @@ export class Readout {
     if (pick.kind === "road" && direction) {
       const { grade, crossfall } = along(pick, direction);
       // Beside a standing cursor nobody drives: up and down have no meaning there.
-      const sense = pick.direction ? (grade < 0 ? " down" : " up") : "";
       return [
-        ["Grade along the road", `${Math.abs(grade).toFixed(1)} %${sense}`],
-        ["Crossfall", `${Math.abs(crossfall).toFixed(1)} %, falls to ${side(crossfall, direction, pick.direction)}`],
+        ["Grade along the road", climb(grade, pick.direction)],
+        ["Crossfall", fall(crossfall, side(crossfall, direction, pick.direction))],
       ];
     }
     const { percent, towards } = steepest(pick);
-    return [["Slope", `${percent.toFixed(1)} %, falls to ${towards}`]];
+    return [["Slope", fall(percent, towards)]];
   }
 }
 

@@ -18,6 +18,7 @@ export function runOf(data) {
     state: columns.state[number],
     stale: columns.stale[number],
     flags: columns.flags[number],
+    places: columns.places[number],
     error: columns.error[number],
     measures: Object.fromEntries(Object.entries(columns.measures).map(([name, values]) => [name, values[number]])),
   }));

@@ -15,6 +15,19 @@ export function along({ byEasting, byNorthing }, [east, north]) {
   };
 }
 
+/** Returns the size of a slope with the direction that it falls to, or "level" if it is 0.0 as shown. */
+export function fall(percent, towards) {
+  const size = Math.abs(percent).toFixed(1);
+  return `${size} %, ${Number(size) === 0 ? "level" : `falls to ${towards}`}`;
+}
+
+/** Returns the size of a grade, with up or down for a driver unless it is 0.0 as shown. */
+export function climb(percent, driven) {
+  const size = Math.abs(percent).toFixed(1);
+  const sense = Number(size) === 0 ? ", level" : percent < 0 ? " down" : " up";
+  return `${size} %${driven ? sense : ""}`;
+}
+
 /** Returns the name of a bearing in degrees. */
 export function compass(bearing) {
   return ["N", "NE", "E", "SE", "S", "SW", "W", "NW"][Math.round(bearing / 45) % 8];

@@ -16,6 +16,10 @@ const NEARBY = 1.6;
 const FROM_SOUTH = new Vector3(-0.25, 0.8, 0.9);
 // Part of the free height and width that a tile seen as a whole takes.
 const FILLED = 0.86;
+// Distance to a place that is looked at from near (m), and points of a tile's edge, each side.
+const CLOSE_M = 40;
+const OUTLINE_POINTS = 64;
+const EDGE_M = 0.05;
 
 export class Stage {
   /** Draws into a canvas; `events` are changed(), entered(tile), loading(number), failed(tile, error), frame(). */
@@ -47,8 +51,11 @@ export class Stage {
     return this.renderer.domElement.clientWidth > 900 ? 330 : 0;
   }
 
-  /** Opens a tile: loads it, looks at it, then loads those around. `camera` is easting, northing, height of eye and target. */
-  async open(tile, camera = null) {
+  /**
+   * Opens a tile: loads it, looks at it, or at a place (easting, northing) on it, then loads those around.
+   * `camera` is easting, northing, height of eye and target.
+   */
+  async open(tile, { camera = null, place = null }) {
     this.active = true;
     this.tile = tile;
     const object = await this.load(tile);
@@ -56,6 +63,7 @@ export class Stage {
     this.resize();
     if (object) this.rebase(object.low);
     if (camera) this.place(camera);
+    else if (place) this.approach(place);
     else this.overlook(tile);
     this.moved();
   }
@@ -87,6 +95,31 @@ export class Stage {
     this.controls.target.copy(target);
     this.controls.update();
     this.moved();
+  }
+
+  /** Looks at a place (easting, northing) from near, from the south. */
+  approach([easting, northing]) {
+    const target = this.toScene(easting, northing, this.heightAt(easting, northing) ?? this.base);
+    this.controls.target.copy(target);
+    this.camera.position.copy(target).addScaledVector(FROM_SOUTH.clone().normalize(), CLOSE_M);
+    this.controls.update();
+    this.moved();
+  }
+
+  /** Returns the edge of a tile on its surface: places [easting, northing, height] around it; the corners twice. */
+  outline({ tile, data }) {
+    // Just inside, where the steps beside roads are those of the tile's cells.
+    const [west, south, east, north] = [tile.west + EDGE_M, tile.south + EDGE_M, tile.east - EDGE_M, tile.north - EDGE_M];
+    const corners = [[west, south], [east, south], [east, north], [west, north], [west, south]];
+    // Heights of a mesh alone take a search of all its triangles.
+    const number = data.surface ? OUTLINE_POINTS : OUTLINE_POINTS / 8;
+    return corners.slice(1).flatMap(([toX, toY], side) => {
+      const [x, y] = corners[side];
+      return Array.from({ length: number + 1 }, (_, i) => {
+        const [easting, northing] = [x + ((toX - x) * i) / number, y + ((toY - y) * i) / number];
+        return [easting, northing, this.heightAt(easting, northing) ?? this.base];
+      });
+    });
   }
 
   /** Returns the corners of a tile at the height of the surface. */

@@ -14,6 +14,10 @@ import { POINTS } from "./tile_object.js";
 const CLICK_PX = 5;
 const KEYS = { r: "road", t: "terrain", w: "wire", s: "points" };
 const COLOUR_KEYS = ["class", "photo", "support", "estimate"];
+/** Name of the line around the tile. */
+export const OUTLINE = "outline";
+const OUTLINE_COLOUR = "#1f8fd0";
+const FLAG_COLOUR = "#e3a02c";
 const SPEEDS = { min: 10, max: 130, step: 5 };
 
 export class TileView {
@@ -38,11 +42,11 @@ export class TileView {
     this.listen();
   }
 
-  /** Shows a tile in 3D. */
-  async open(tile, camera, colour) {
+  /** Shows a tile in 3D; `camera` and `place` are those of `Stage.open`. */
+  async open(tile, { camera, place }, colour) {
     this.chosen ||= Boolean(colour);
     this.enter(tile);
-    await this.stage.open(tile, camera);
+    await this.stage.open(tile, { camera, place });
     if (this.tile === tile) this.redraw();
   }
 
@@ -51,6 +55,22 @@ export class TileView {
     this.tile = tile;
     fill(byId("title"), tile.id);
     this.redraw();
+    this.mark();
+  }
+
+  /** Draws the tile's outline and the places of its flags, once it is loaded. */
+  mark() {
+    const object = this.stage.objects.get(this.tile);
+    if (this.marked === object) return;
+    this.marked = object;
+    this.overlay.line(OUTLINE, object ? this.stage.outline(object) : null, OUTLINE_COLOUR);
+    for (const flag of this.flagged ?? []) this.overlay.dot(`flag:${flag}`, null);
+    this.flagged = object ? Object.keys(this.tile.places) : [];
+    for (const flag of this.flagged) {
+      const [easting, northing] = this.tile.places[flag];
+      const height = this.stage.heightAt(easting, northing) ?? this.stage.base;
+      this.overlay.dot(`flag:${flag}`, [easting, northing, height], FLAG_COLOUR);
+    }
   }
 
   close() {
@@ -59,6 +79,7 @@ export class TileView {
     this.readout.show(null);
     this.stage.close();
     this.tile = null;
+    this.mark();
     show(byId("hint"), false);
   }
 
@@ -77,7 +98,7 @@ export class TileView {
     const layer = (name, label, off) => check(name, label, look[name], (on) => this.apply({ [name]: on }), off);
     const set = (colour) => this.apply({ colour });
     return [
-      el("section", {}, tileHead(this.tile)),
+      el("section", {}, tileHead(this.tile, (place) => this.approach(place))),
       this.tools(),
       section("Colour", buttons(colours, look.colour, set), surfaceLegend(look.colour)),
       section(
@@ -94,6 +115,11 @@ export class TileView {
       ),
       el("section", {}, this.figures(), el("div", { class: "quiet small" }, this.systems())),
     ];
+  }
+
+  approach(place) {
+    byId("panel").classList.remove("open");
+    this.stage.approach(place);
   }
 
   tools() {
@@ -148,6 +174,7 @@ export class TileView {
   followed() {
     if (!this.tile) return;
     const object = this.stage.objects.get(this.tile);
+    this.mark();
     if (object && !this.chosen && object.data.photo && this.stage.look.colour === "class") {
       this.chosen = true;
       this.stage.apply({ colour: "photo" });

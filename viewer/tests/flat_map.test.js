@@ -1,6 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { beside } from "../src/flat_map.js";
+import { FlatMap, beside } from "../src/flat_map.js";
+import { ViewBox } from "../src/view_box.js";
 import { lengthText, mix, roundLength } from "../src/scale.js";
 
 const tile = (column, row) => ({ west: 10 * column, east: 10 * column + 10, south: 10 * row, north: 10 * row + 10 });
@@ -13,6 +14,19 @@ test("arrow keys lead to the next tile in a direction, and to the nearest one of
   assert.equal(beside(tiles, east, [0, 1]), north);
   assert.equal(beside(tiles, origin, [-1, 0]), null);
   assert.equal(beside(tiles, null, [1, 0], [26, 27]), diagonal);
+});
+
+test("places of flags are chosen by pixels near them, on tiles that are large enough", () => {
+  const [flagged, other] = [tile(0, 0), tile(1, 0)];
+  flagged.places = { spike: [2, 5], patch: [2.5, 5] };
+  const map = Object.assign(Object.create(FlatMap.prototype), { tiles: [flagged, other], box: new ViewBox() });
+  Object.assign(map.box, { easting: 10, northing: 5, scale: 20, width: 400, height: 200 });
+  assert.deepEqual([...map.placesInSight()].map(({ flag, pixel }) => [flag, pixel]), [["spike", [40, 100]], ["patch", [50, 100]]]);
+  assert.deepEqual(map.placeAt(44, 102).place, [2, 5]);
+  assert.equal(map.placeAt(48, 100).flag, "patch");
+  assert.equal(map.placeAt(80, 100), null);
+  map.box.scale = 5;
+  assert.equal(map.placeAt(...map.box.toScreen(2, 5)), null);
 });
 
 test("scale bars have round lengths", () => {

@@ -21,6 +21,7 @@ function run() {
       state: [1, 2, 1],
       stale: [false, true, false],
       flags: [[], [], ["spike"]],
+      places: [{}, {}, { spike: [250.5, 49.5] }],
       error: ["", "load: broken", ""],
       measures: { error_estimate_m: [0.02, null, 0.05] },
     },

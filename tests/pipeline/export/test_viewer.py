@@ -24,6 +24,7 @@ from flexroad.pipeline.config.loading import load_config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export import viewer
+from flexroad.pipeline.export.source import select
 from flexroad.pipeline.export.viewer import MARK, PAGE, server, write_viewer
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
@@ -31,12 +32,13 @@ from flexroad.pipeline.run.runner import run_tiles
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    """A run of four tiles of 60 m with orthophotos: two done, one failed, one not computed."""
+    """A run of four tiles of 60 m with orthophotos: two done and flagged, one failed, one not computed."""
     folder = tmp_path_factory.mktemp("view")
     catalog = Catalog.read(write_scenes(folder / "survey", 4, seed=3, size_m=60, dop=True))
     broken = catalog.tiles[2].layer("dsm")
     catalog.tiles[2].paths(broken)[0].write_bytes(b"<script>")
-    run = Run.create(folder / "city", load_config("production"), catalog)
+    config = load_config("production", ["assess.error_estimate_m=1e-6"])
+    run = Run.create(folder / "city", config, catalog)
     run_tiles(run, SerialExecutor(), only=lambda tile: tile != catalog.tiles[3])
     return run.path
 
@@ -67,6 +69,24 @@ def test_index_has_all_tiles_with_their_states_and_errors(city, folder):
         assert (west, north) == (grids[tile_id].west, 60)
     done = [state == viewer.DONE for state in tiles["state"]]
     assert [value is not None for value in tiles["measures"]["error_estimate_m"]] == done
+
+
+def test_index_has_the_places_of_the_flags_of_finished_tiles(city, folder):
+    (index,) = handed_over(folder / "run.js")
+    finished = {tile.id: tile for tile in select(city).finished()}
+    assert len(finished) == 2
+    for tile_id, flags, found in zip(
+        *(index["tiles"][name] for name in ("id", "flags", "places")), strict=True
+    ):
+        assert set(found) == set(flags)
+        assert set(flags) == ({"error-estimate"} if tile_id in finished else set())
+        for easting, northing in found.values():
+            core, mask = finished[tile_id].data.core, finished[tile_id].road.mask
+            inside = finished[tile_id].data.grid.window(core)
+            row, col = round(core.north - northing - 0.5), round(easting - core.west - 0.5)
+            assert (core.eastings[col], core.northings[row]) == (easting, northing)
+            near = mask[inside][max(0, row - 6) : row + 7, max(0, col - 6) : col + 7]
+            assert near.any()
 
 
 def test_tile_script_has_surface_rasters_and_degrees_of_the_run(city, folder):

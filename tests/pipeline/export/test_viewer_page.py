@@ -62,6 +62,7 @@ def made(folder, ids, states, errors=None):
         "state": states,
         "stale": [False] * number,
         "flags": [[] for _ in ids],
+        "places": [{} for _ in ids],
         "error": errors or [""] * number,
         "measures": {"error_estimate_m": [0.001 * (i % 97) for i in range(number)]},
     }
@@ -319,6 +320,72 @@ def test_back_and_forward_lead_from_the_tile_to_the_map_and_again_to_the_tile(ru
         {"eval": f"{INSPECT}.tile"},
     )
     assert results[-1] == run.catalog.tiles[0].id
+
+
+@pytest.fixture(scope="module")
+def flagged(run, tmp_path_factory):
+    """The page of a run with one flagged tile, this tile, and the place of its flag."""
+    folder = tmp_path_factory.mktemp("flagged")
+    flagging = Run.create(
+        folder / "run", load_config("production", ["assess.error_estimate_m=1e-6"]), run.catalog
+    )
+    tile = run.catalog.tiles[0]
+    run_tiles(flagging, SerialExecutor(), only=lambda one: one == tile)
+    (finished,) = select(flagging.path).finished()
+    return (
+        write_viewer(Run.open(flagging.path), folder / "page", SerialExecutor()).page,
+        tile,
+        finished.flag_places["error-estimate"],
+    )
+
+
+def test_places_of_flags_are_marked_and_a_click_on_map_list_or_tile_goes_there(flagged):
+    page, tile, place = flagged
+    (box,) = browse(page, {"eval": f"{INSPECT}.box"})
+    target = {"eval": f"{INSPECT}.camera.slice(3, 5)"}
+    pixel = pixel_of(box, *place)
+    by_map = browse(
+        page,
+        {"move": pixel},
+        {"eval": "document.getElementById('tip').textContent"},
+        {"click": pixel},
+        {"wait": SETTLED},
+        target,
+    )
+    assert "here: the surface is far from scan and terrain model on average" in by_map[1]
+    assert by_map[-1] == pytest.approx(place, abs=0.1)
+    by_list = browse(page, {"press": ".list button.place"}, {"wait": SETTLED}, target)
+    assert by_list[-1] == pytest.approx(place, abs=0.1)
+    _, before, _, after = browse(
+        page,
+        {"wait": SETTLED},
+        target,
+        {"press": "#panel-content button.place"},
+        target,
+        fragment=f"#tile={tile.id}",
+    )
+    assert np.hypot(*np.subtract(before, place)) > 1
+    assert after == pytest.approx(place, abs=0.1)
+
+
+def test_outline_of_the_tile_lies_on_the_surface_and_goes_with_the_tile(flagged):
+    page, tile, _ = flagged
+    _, around, _, on_map = browse(
+        page,
+        {"wait": SETTLED},
+        {"eval": f"{INSPECT}.outline"},
+        {"key": "Escape"},
+        {"eval": f"{INSPECT}.outline"},
+        fragment=f"#tile={tile.id}",
+    )
+    assert on_map is None
+    x, y, z = np.array(around).T
+    west, south, east, north = tile.grid.bounds
+    to_edge = np.min([x - west, east - x, y - south, north - y], axis=0)
+    np.testing.assert_allclose(to_edge, 0.05, rtol=0, atol=1e-6)
+    assert (np.ptp(x), np.ptp(y)) == pytest.approx((east - west - 0.1, north - south - 0.1), abs=1e-6)
+    (finished,) = select(page.parent.parent / "run").finished()
+    np.testing.assert_allclose(z, finished.surface.height(x, y), rtol=0, atol=viewer.STEP_M)
 
 
 def test_unknown_tile_in_the_address_is_named(run, page):

@@ -13,7 +13,7 @@ export class TileMap extends FlatMap {
   constructor(canvas, data, relief, on) {
     const [west, south, east, north] = data.bounds;
     const tiles = data.boxes.flatMap((box, number) =>
-      box ? [{ number, west: box[0], south: box[1], east: box[2], north: box[3] }] : []);
+      box ? [{ number, west: box[0], south: box[1], east: box[2], north: box[3], places: relative(data.places[number], west, south) }] : []);
     super(canvas, tiles, { west: 0, south: 0, east: east - west, north: north - south }, {
       margins: ({ width, height }) => ({ top: FIT_MARGIN * height, bottom: FIT_MARGIN * height, sides: FIT_MARGIN * width }),
       point: (x, y) => this.point(x, y),
@@ -78,6 +78,7 @@ export class TileMap extends FlatMap {
     for (const [i, rect] of visible) this.paintTile(i, rect, theme);
     c.globalCompositeOperation = "source-over";
     for (const [i, rect] of visible) this.paintMarks(i, rect, theme);
+    this.paintPlaces(theme);
     for (const [tile, rect] of this.inSight()) if (tile === this.selected) this.twice(theme, [6, 3], () => c.strokeRect(...wholePixels(rect)));
     // On paper the map has another size than in the window, and its scale bar is a part of it.
     if (printing) this.paintScale(SCALE_PX, [14, this.box.height - 14], theme.mark, "14px sans-serif");
@@ -85,15 +86,6 @@ export class TileMap extends FlatMap {
     this.canvas.style.touchAction = this.isFitted() ? "pan-y" : "none";
     const [metres, text] = this.scaleBar(SCALE_PX);
     this.on.view(metres * this.box.scale, text);
-  }
-
-  /** Strokes a wide line around a thin one, so that it is seen on every colour. */
-  twice(theme, [wide, thin], stroke) {
-    for (const [colour, line] of [[theme.halo, wide], [theme.mark, thin]]) {
-      this.context.strokeStyle = colour;
-      this.context.lineWidth = line;
-      stroke();
-    }
   }
 
   paintRelief(visible, theme) {
@@ -140,18 +132,11 @@ export class TileMap extends FlatMap {
       }
       c.stroke();
     }
-    const spots = this.data.places[i];
-    if (spots && w > 2 * DETAIL_PX) {
-      for (const [east, north] of Object.values(spots)) {
-        const [px, py] = this.box.toScreen(east - this.data.bounds[0], north - this.data.bounds[1]);
-        this.twice(theme, [4.5, 2], () => {
-          c.beginPath();
-          c.arc(px, py, 7, 0, 2 * Math.PI);
-          c.stroke();
-        });
-      }
-    }
   }
+}
+
+function relative(places = {}, west, south) {
+  return Object.fromEntries(Object.entries(places).map(([flag, [east, north]]) => [flag, [east - west, north - south]]));
 }
 
 // So that neighbours have no line between them.
