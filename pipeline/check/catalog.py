@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+
+from rasterio.windows import Window
 
 from flexroad.catalog import LAYERS, Catalog, CatalogError, Layer, Tile
 from flexroad.catalog.allowlist import check_allowed
 from flexroad.catalog.crs import in_plan, same, short
 from flexroad.catalog.crs_checks import crs_of
-from flexroad.catalog.headers.cover import height_share
+from flexroad.catalog.headers.cover import AS_TEXT, height_share
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.plateaus import plateau_notes
-from flexroad.catalog.headers.rasters import quiet
+from flexroad.catalog.headers.rasters import heights_fault, quiet
 from flexroad.catalog.headers.refused import Refused, head
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import Location
@@ -23,14 +26,19 @@ from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
 from flexroad.pipeline.check.finding import Finding
 from flexroad.pipeline.check.heights import height_findings
+from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.models import Config
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.graph.layers import check_layers, lacking, without_photo
 from flexroad.tasks import load
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.orthophoto import read_photo
+from flexroad.tasks.io.raster_header import header
 from flexroad.tasks.roads import coregistration
 
+MISSING, NO_FILE = "missing", "not a regular file"
+REMEDIES = {MISSING: "restore it or build the catalog again", NO_FILE: "replace it by one"}
+"""What to do with a file that is not there."""
 MAX_SHOWN = 5
 """Number of missing files, and of entries that cannot be used, that are named."""
 MAX_PHOTO_TILES = 12
@@ -77,7 +85,8 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
 
     The reasons are entries that cannot be used, missing layers and files, rasters in another CRS than their
     tile, and a DSM that covers less of a tile than `load.min_valid`. Every raster is opened once, and the DSM
-    is read. On some tiles DSM and DTM are compared (`height_findings`).
+    is read. Some tiles, with those of doubtful files first, are read as the run would (`trials`), and their
+    DSM and DTM are compared (`height_findings`).
 
     Parameters
     ----------
@@ -86,21 +95,25 @@ def expected_failures(tiles: Sequence[Tile], config: Config, layers: Collection[
     layers : collection of str
         The layers whose files are looked up.
     """
-    faults = [tile for tile in tiles if tile.fault]
-    for tile in faults[:MAX_SHOWN]:
+    unusable = [tile for tile in tiles if tile.fault]
+    for tile in unusable[:MAX_SHOWN]:
         yield Finding(f"{tile.id}: {tile.fault}", fault=True)
-    if len(faults) > MAX_SHOWN:
-        yield Finding(f"{len(faults) - MAX_SHOWN} more entries cannot be used", fault=True)
+    if len(unusable) > MAX_SHOWN:
+        yield Finding(f"{len(unusable) - MAX_SHOWN} more entries cannot be used", fault=True)
     usable = [tile for tile in tiles if not tile.fault]
     named = set[str]()
     for layer, stage, ids in lacking(usable, config):
         yield _would_fail(ids, usable, f"no {layer}, which {stage} needs")
-    yield from _missing(usable, layers)
-    for reason, ids in _unfit(usable, config).items():
+    absent = _absent(usable, layers)
+    yield from _missing(usable, layers, absent)
+    by_reason, doubtful = _unfit(usable, config)
+    for reason, ids in by_reason.items():
         named.update(ids)
         yield _would_fail(ids, usable, reason)
-    if {"dsm", "dtm"} <= set(layers):
-        yield from height_findings(usable, next(iter(config.chains.values()))["load"], named)
+    if set(load.NEEDS) <= set(layers):
+        read, faults = trials(usable, config, named, doubtful, {str(path) for path in absent})
+        yield from faults
+        yield from height_findings(read)
     if plain := without_photo(usable, config):
         yield Finding(
             f"{len(plain)} of {count(len(usable), 'tile')} would have no texture: no dop, which "
@@ -112,19 +125,32 @@ def _would_fail(ids: Sequence[str], tiles: Sequence[Tile], reason: str) -> Findi
     return Finding(f"{len(ids)} of {count(len(tiles), 'tile')} would fail: {reason}: {some(ids)}", fault=True)
 
 
-def _missing(tiles: Sequence[Tile], layers: Collection[str]) -> Iterator[Finding]:
-    """Name the files that are missing or cannot be read, each with the number of tiles that it lies on."""
-    files: Counter[Location] = Counter()
-    for tile in tiles:
-        for layer in (layer for layer in tile.all_layers if layer.name in layers):
-            files.update(dict.fromkeys(tile.paths(layer), 0))
-            on_tile = layer.reaching(tile.grid.bounds)
-            files.update(tile.paths(on_tile) if on_tile else ())
+def _absent(tiles: Sequence[Tile], layers: Collection[str]) -> dict[Location, str]:
+    """Return the files that are missing or cannot be read, each with the reason."""
     stat = StatCache()
+    files = dict.fromkeys(
+        path
+        for tile in tiles
+        for layer in tile.all_layers
+        if layer.name in layers
+        for path in tile.paths(layer)
+    )
+    return {path: reason for path in files if (reason := _no_access(path, stat))}
+
+
+def _missing(
+    tiles: Sequence[Tile], layers: Collection[str], absent: Mapping[Location, str]
+) -> Iterator[Finding]:
+    """Name the files that are missing or cannot be read, each with the number of tiles that it lies on."""
+    number: Counter[Location] = Counter()
+    for tile in tiles if absent else ():
+        for layer in (layer for layer in tile.all_layers if layer.name in layers):
+            on_tile = layer.reaching(tile.grid.bounds)
+            number.update(tile.paths(on_tile) if on_tile else ())
     by_reason: dict[str, list[str]] = defaultdict(list)
-    for path, number in files.items():
-        if reason := _no_access(path, stat):
-            by_reason[reason].append(f"{path} ({count(number, 'tile')})")
+    for path, reason in absent.items():
+        line = f"{path} ({count(number[path], 'tile')})"
+        by_reason[reason].append(f"{line}; {REMEDIES[reason]}" if reason in REMEDIES else line)
     for reason, lines in by_reason.items():
         for line in lines[:MAX_SHOWN]:
             yield Finding(f"{reason}: {line}", fault=True)
@@ -138,23 +164,44 @@ def _no_access(path: Location, stat: StatCache) -> str | None:
         try:
             head(path)
         except FileNotFoundError:
-            return "missing"
+            return MISSING
         except Refused:
-            return "not a regular file"
+            return NO_FILE
         except OSError as error:
             return access_reason(error) or str(error)
-    return "missing" if stat(path) is None else None
+    return MISSING if stat(path) is None else None
 
 
-def _unfit(tiles: Sequence[Tile], config: Config) -> dict[str, list[str]]:
-    """Return the tiles with a raster in another CRS, and those whose DSM has too few heights, by reason."""
+@dataclass(frozen=True)
+class _Header:
+    """What opening a raster once tells of it."""
+
+    crs: str | None
+    """Horizontal CRS, or the given one; None if both are missing or unusable."""
+    unit: str = ""
+    doubtful: bool = False
+    """Whether it cannot be opened, has no usable position or heights, or lacks its last block."""
+
+
+def _unfit(tiles: Sequence[Tile], config: Config) -> tuple[dict[str, list[str]], set[str]]:
+    """Return the tiles that would fail, by reason, and those with a doubtful file.
+
+    The reasons are a raster in another CRS, and a DSM with too few heights.
+    """
     min_valid = max(chain["load"].min_valid for chain in config.chains.values())
-    known: dict[tuple[Location, str | None], str | None] = {}
+    known: dict[tuple[Location, str | None], _Header] = {}
     by_reason: dict[str, list[str]] = defaultdict(list)
+    doubtful = set[str]()
     for tile in tiles:
-        if reason := _other_crs(tile, known) or _few_heights(tile, min_valid):
+        headers = _headers(tile, known)
+        share = _share(tile)
+        if reason := _other_crs(tile, headers) or _few_heights(share, min_valid):
             by_reason[reason].append(tile.id)
-    return by_reason
+        units = {found.unit for layer, found in headers if layer.name in HEIGHTS}
+        # Without any height the file may lie elsewhere, or be in another unit.
+        if not share or len(units) > 1 or any(found.doubtful for _, found in headers):
+            doubtful.add(tile.id)
+    return by_reason, doubtful
 
 
 def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[Location, ...]]]:
@@ -164,34 +211,49 @@ def _on_tile(tile: Tile, names: Collection[str]) -> Iterator[tuple[Layer, tuple[
             yield on_tile, tile.paths(on_tile)
 
 
-def _other_crs(tile: Tile, known: dict[tuple[Location, str | None], str | None]) -> str:
-    """Return why a tile would fail if a raster on it is in another CRS; ``known`` has those read before."""
+def _headers(tile: Tile, known: dict[tuple[Location, str | None], _Header]) -> list[tuple[Layer, _Header]]:
+    """Return the headers of the rasters on a tile; ``known`` has those read before."""
+    found = []
     for layer, paths in _on_tile(tile, load.READS):
-        for path in () if layer.reproject else paths:
+        for path in paths:
             key = path, layer.crs
             if key not in known:
-                known[key] = _crs(path, layer.crs, tile.allowed)
-            crs = known[key]
-            if crs and not same(crs, tile.grid.crs):
-                return f"{layer.name} is in {short(crs)}, not {short(tile.grid.crs)}"
+                known[key] = _header(path, layer, tile.allowed)
+            found.append((layer, known[key]))
+    return found
+
+
+def _other_crs(tile: Tile, headers: Sequence[tuple[Layer, _Header]]) -> str:
+    """Return why a tile would fail if a raster on it is in another CRS."""
+    for layer, found in headers:
+        if not layer.reproject and found.crs and not same(found.crs, tile.grid.crs):
+            remedy = "reproject it, or make the catalog with --reproject"
+            return f"{layer.name} is in {short(found.crs)}, not {short(tile.grid.crs)}; {remedy}"
     return ""
 
 
-def _crs(path: Location, given: str | None, allowed: AllowedFolders | None) -> str | None:
-    """Return the horizontal CRS of a raster, or the given one; None if both are missing or unusable."""
+def _header(path: Location, layer: Layer, allowed: AllowedFolders | None) -> _Header:
     try:
         with quiet(), open_raster(path, allowed) as raster:
-            crs = crs_of(raster.crs.to_wkt() if raster.crs else None, given, raster.bounds)
-            return in_plan(crs) if crs else None
+            crs = crs_of(raster.crs.to_wkt() if raster.crs else None, layer.crs, raster.bounds)
+            fault = header(raster).fault or (heights_fault(raster) if layer.name in HEIGHTS else None)
+            if Path(str(path)).suffix.lower() not in AS_TEXT:
+                # A truncated file lacks it.
+                raster.read(1, window=Window(raster.width - 1, raster.height - 1, 1, 1))
+            return _Header(in_plan(crs) if crs else None, raster.units[0] or "", bool(fault))
     except (*ERRORS, CatalogError):
-        return given
+        return _Header(layer.crs, doubtful=True)
 
 
-def _few_heights(tile: Tile, min_valid: float) -> str:
-    """Return why a tile would fail if its DSM covers too little of it."""
+def _share(tile: Tile) -> float | None:
+    """Return the share of a tile's cells that has a height in the DSM (0 to 1), None if it is not known."""
     dsm = next(_on_tile(tile, ("dsm",)), None)
-    share = height_share(tile.grid, dsm[1], tile.allowed, dsm[0].crs) if dsm else None
-    if share is None or share >= max(min_valid, 1e-9):
+    return height_share(tile.grid, dsm[1], tile.allowed, dsm[0].crs) if dsm else None
+
+
+def _few_heights(share: float | None, min_valid: float) -> str:
+    """Return why a tile would fail if its DSM covers too little of it."""
+    if not share or share >= min_valid:
         return ""
     return f"a DSM height in less than {min_valid:.0%} of the cells (load.min_valid)"
 

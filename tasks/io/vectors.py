@@ -241,7 +241,9 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
         # A failed transformation also raises RuntimeError.
         hint = "; check segment.where" if request.where else ""
-        raise _error(request, f"cannot be read as roads: {reason(error)}{hint}") from error
+        # SQLite's error follows GDAL's complete query, which has the square.
+        why = reason(error).rpartition(f"({layer.where}): ")[2]
+        raise _error(request, f"cannot be read as roads: {why}{hint}") from error
     table = table.rename(columns={name: name.lower() for name in layer.columns})
     # Coordinates that cannot be transformed to the tiles' CRS become infinite.
     table = table[~(table.geometry.isna() | table.geometry.is_empty)]

@@ -21,6 +21,7 @@ from flexroad.tasks.load import Options, load
 from tests.make_rasters import write
 from tests.permissions import permissions_enforced
 
+RESTORE = "restore it or build the catalog again"
 FEW = "a DSM height in less than 25% of the cells (load.min_valid)"
 
 
@@ -59,9 +60,10 @@ def test_expected_failures_name_count_and_examples_of_each_reason(survey):
     assert said == [
         "fifth: its entry is damaged",
         f"1 of 4 tiles would fail: no road_mask, which segment: mask needs: {one.id}",
-        f"missing: {missing} (1 tile)",
+        f"missing: {missing} (1 tile); {RESTORE}",
         f"1 of 4 tiles would fail: {FEW}: {two.id}",
-        f"1 of 4 tiles would fail: dtm is in EPSG:25833, not EPSG:25832: {three.id}",
+        "1 of 4 tiles would fail: dtm is in EPSG:25833, not EPSG:25832; reproject it, or make the catalog "
+        f"with --reproject: {three.id}",
     ]
     for tile in (two, three, four):
         with pytest.raises(TaskError):
@@ -81,7 +83,7 @@ def test_expected_failures_tell_files_without_permission_from_missing_ones(surve
         ]
     folder.chmod(0o755)
     assert f"cannot be read: Permission denied: {closed} (1 tile)" in said
-    assert f"missing: {gone} (1 tile)" in said
+    assert f"missing: {gone} (1 tile); {RESTORE}" in said
     for tile in tiles:
         assert f"cannot be read: Permission denied: {folder / f'{tile.id}.tif'} (1 tile)" in said
     assert sum(text.startswith("missing") for text in said) == 1

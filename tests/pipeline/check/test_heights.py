@@ -5,11 +5,11 @@ import pytest
 
 from flexroad.catalog import LAYERS, Catalog
 from flexroad.catalog.sources.rasters import index
-from flexroad.pipeline.check import heights
+from flexroad.pipeline.check import trial
 from flexroad.pipeline.check.catalog import expected_failures
 from flexroad.pipeline.check.heights import height_findings
+from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.loading import load_config
-from flexroad.tasks.load import Options
 from tests.make_rasters import write
 
 WEST, NORTH = 499_980.0, 5_600_040.0
@@ -32,7 +32,8 @@ def said(folder, dsm, dtm, unit=None):
 
 
 def found(tiles):
-    return [finding.text for finding in height_findings(tiles, Options(), ())]
+    read, faults = trials(tiles, load_config("production"), (), (), ())
+    return [finding.text for finding in (*faults, *height_findings(read))]
 
 
 @pytest.mark.parametrize(
@@ -84,16 +85,14 @@ def test_heights_in_feet_are_noted_and_a_single_band_in_feet_would_fail(tmp_path
     ]
     write(tmp_path / "dtm" / "all.tif", PLANE, WEST, NORTH)
     tiles = index(tmp_path, {"dsm": "dsm/*.tif", "dtm": "dtm/*.tif"}, tile_size_m=60).tiles
-    of_one = found(tiles)
-    assert len(of_one) == 2
-    assert of_one[0].startswith(
-        f"{tiles[0].id} would fail: dsm dsm/all.tif has heights in ft, dtm dtm/all.tif in "
-    )
+    (line,) = found(tiles)
+    ids = f"{tiles[0].id}, {tiles[1].id}"
+    assert line.startswith(f"{ids} would fail: dsm dsm/all.tif has heights in ft, dtm dtm/all.tif in ")
 
 
 def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
     """A step in one of four sheets is found though two tiles of eight are read."""
-    monkeypatch.setattr(heights, "MOST_TILES", 4)
+    monkeypatch.setattr(trial, "MOST_TILES", 4)
     wide = np.tile(PLANE, (1, 4))
     for number in range(4):
         part = wide[:, 120 * number : 120 * (number + 1)] + np.float32(0.5 * (number == 2))

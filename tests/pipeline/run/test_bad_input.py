@@ -169,11 +169,32 @@ FAULTS = (
 )
 
 
+OTHERWISE = {
+    _absent: "missing: FILE (1 tile); restore it or build the catalog again",
+    _a_folder: "not a regular file: FILE (1 tile); replace it by one",
+    _a_pipe: "not a regular file: FILE (1 tile); replace it by one",
+    _other_crs: "1 of 4 tiles would fail: dtm is in EPSG:25833, not EPSG:25832; reproject it, or make the "
+    "catalog with --reproject: TILE",
+    _thin: "1 of 4 tiles would fail: a DSM height in less than 25% of the cells (load.min_valid): TILE",
+}
+"""What `catalog check` says where it does not say what the run does."""
+
+
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.damage.__name__.lstrip("_"))
-def test_load_broken_file_fails_only_its_tile(fault, run, flexroad, survey, tmp_path):
+def test_load_broken_file_fails_only_its_tile_and_is_named_by_the_check(
+    fault, run, flexroad, survey, quick_config, tmp_path
+):
     tile = Catalog.read(survey).tiles[1]
     fault.damage(tile)
-    assert_only_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", str(layer(tile, fault.name)))
+    file = str(layer(tile, fault.name))
+    check = flexroad("catalog", "check", survey, "--config", quick_config).expected(1)
+    (line,) = (line for line in check.out.splitlines() if line.startswith("warning: "))
+    if expected := OTHERWISE.get(fault.damage):
+        assert line == "warning: " + expected.replace("FILE", file).replace("TILE", tile.id)
+    else:
+        assert re.search(f"^warning: {tile.id} would fail: .*{fault.message}", line)
+        assert f"{fault.name}/{tile.id}.tif" in line
+    assert_only_tile_failed(run(), tile, fault, flexroad, tmp_path / "run", file)
 
 
 def assert_only_tile_failed(result: Said, tile: Tile, fault: Fault, flexroad, out: Path, file: str) -> None:

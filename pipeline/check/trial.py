@@ -1,0 +1,137 @@
+"""Tiles of a catalog read as a run reads them, before it: what fails here fails there, in the same words."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flexroad.catalog import LAYERS, Tile
+from flexroad.catalog.text import some
+from flexroad.pipeline.check.finding import Finding
+from flexroad.pipeline.config.models import Config
+from flexroad.tasks import load
+from flexroad.tasks.errors import TaskError
+from flexroad.tasks.io.height_offset import Offset, offset_note, open_offset
+from flexroad.tasks.io.height_units import is_conversion
+from flexroad.tasks.options import stage_function, stage_module
+
+MOST_TILES = 48
+"""Number of tiles that are read: those with a doubtful file first, then one of each set of files."""
+MOST_ERRORS = 5
+"""Number of errors that are told."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a run would read of one tile."""
+
+    tile_id: str
+    sheets: frozenset[str]
+    """Files of DSM and DTM on the tile: ``dsm a.tif``."""
+    offset: Offset | None
+    note: str | None
+    """That the DSM lies off the DTM as a whole; None if it does not."""
+    units: tuple[str, ...]
+    """Notes on heights that were converted to metres."""
+
+
+def trials(
+    tiles: Sequence[Tile],
+    config: Config,
+    named: Collection[str],
+    doubtful: Collection[str],
+    absent: Collection[str],
+) -> tuple[list[Trial], list[Finding]]:
+    """Read some tiles as the stages of a run do, up to the road mask and the splines.
+
+    Parameters
+    ----------
+    tiles : sequence of Tile
+        Usable tiles; some of them are read (`MOST_TILES`).
+    config : Config
+        Configuration of the run.
+    named : collection of str
+        Tiles of which something else was found: they are left out.
+    doubtful : collection of str
+        Tiles with a file that may fail: they come first.
+    absent : collection of str
+        Files that are missing or closed, which have been named.
+
+    Returns
+    -------
+    read : list of Trial
+    faults : list of Finding
+        A line for each error, with the tiles that it would fail.
+    """
+    chains = _chains(config)
+    read, errors = list[Trial](), defaultdict[str, list[str]](list)
+    for tile in _sample([tile for tile in tiles if tile.id not in named], doubtful):
+        try:
+            found = [_trial(tile, chain) for chain in chains]
+        except TaskError as error:
+            if error.file not in absent:
+                errors[str(error)].append(tile.id)
+        else:
+            read.append(found[0])
+    lines = [f"{some(ids)} would fail: {error}" for error, ids in errors.items()]
+    if len(lines) > MOST_ERRORS:
+        more = sum(len(ids) for ids in list(errors.values())[MOST_ERRORS:])
+        lines = [*lines[:MOST_ERRORS], f"{more} more tiles would fail like that"]
+    return read, [Finding(line, fault=True) for line in lines]
+
+
+def _chains(config: Config) -> list[Mapping[str, Any]]:
+    """Return the chains of a configuration, one of those that read the same with the same splines."""
+    chains = {
+        repr([chain[name] for name in ("load", "segment", "fit")]): chain for chain in config.chains.values()
+    }
+    return list(chains.values())
+
+
+def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
+    """Return what the first stages read of a tile.
+
+    Raises
+    ------
+    TaskError
+        As of these stages.
+    """
+    data = load.load(tile, chain["load"])
+    if "roads" in getattr(stage_module(chain["segment"]), "READS", ()):
+        stage_function("segment", chain["segment"])(data, chain["segment"])
+    if space_of := getattr(stage_module(chain["fit"]), "space_of", None):
+        space_of(data, chain["fit"])
+    core = data.grid.window(data.core)
+    models = data.dsm[core], data.dtm[core]
+    units = tuple(filter(is_conversion, data.notes))
+    return Trial(tile.id, _sheets(tile, load.NEEDS), open_offset(*models), offset_note(*models), units)
+
+
+def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:
+    """Return doubtful tiles, the first of each set of files, then others; each spread evenly."""
+    tiles = [tile for tile in tiles if all(map(tile.layer, load.NEEDS))]
+    first = {_sheets(tile, LAYERS): tile for tile in reversed(tiles)}
+    kinds = [
+        [tile for tile in tiles if tile.id in doubtful],
+        sorted(first.values(), key=lambda tile: tile.id),
+        tiles,
+    ]
+    chosen: dict[str, Tile] = {}
+    for kind in kinds:
+        left = [tile for tile in kind if tile.id not in chosen]
+        chosen |= {tile.id: tile for tile in _evenly(left, MOST_TILES - len(chosen))}
+    return list(chosen.values())
+
+
+def _evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
+    number = min(most, len(tiles))
+    return [tiles[k * len(tiles) // number] for k in range(number)]
+
+
+def _sheets(tile: Tile, names: Collection[str]) -> frozenset[str]:
+    """Return the files of some layers that lie on a tile."""
+    layers = [layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in names]
+    return frozenset(f"{layer.name} {Path(file).name}" for layer in layers if layer for file in layer.files)
