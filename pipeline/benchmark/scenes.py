@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import shapely
 
@@ -21,8 +22,9 @@ from flexroad.pipeline.execute import AdaptiveExecutor, DaskExecutor, Executor, 
 from flexroad.pipeline.prepare.mesh import POINTS, MeshOptions, prepare_mesh
 from flexroad.pipeline.prepare.options import PrepareOptions
 from flexroad.tasks.io.vectors import vector_date
-from flexroad.tasks.synthetic import SceneOptions, block, dsc3d, gerod, make_scene
+from flexroad.tasks.synthetic import Scene, SceneOptions, block, dsc3d, gerod, make_scene
 from flexroad.tasks.synthetic.centrelines import CentreLine, centre_lines
+from flexroad.tasks.synthetic.crossings import CrossingOptions, Crossings, make_crossings
 from flexroad.tasks.synthetic.dsc3d import Place
 from flexroad.tasks.synthetic.orthophoto import orthophoto
 from flexroad.tasks.synthetic.photogrammetry import encode, photogrammetry
@@ -53,7 +55,7 @@ class _SceneJob:
     seed: int
     stratum: str | None
     """None for a mix of districts."""
-    options: SceneOptions
+    options: SceneOptions | CrossingOptions
     name: str
     """Name of the dataset."""
     dop: bool
@@ -69,10 +71,12 @@ def write_scenes(
     size_m: int | None = None,
     dop: bool = False,
     preset: str | None = None,
+    decks: bool = False,
 ) -> Path:
     """Write a block of neighbouring tiles, or the tiles of a preset; return the path of their catalog.
 
-    The reference of a preset's tiles is the one that the paper describes. Beside their catalog,
+    With decks the true height of level N is the layer ``reference`` of the folder ``known/levelN``. The
+    reference of a preset's tiles is the one that the paper describes. Beside their catalog,
     ``catalog_true.parquet`` lists them with the truth as reference.
 
     Parameters
@@ -89,15 +93,21 @@ def write_scenes(
         Whether to write orthophotos; the preset dsc3d always has them.
     preset : str, optional
         One of `PRESETS`; None for a block of neighbouring tiles.
+    decks : bool
+        Whether the block has roads on decks and in tubes (`tasks.synthetic.crossings`).
 
     Raises
     ------
     ConfigError
-        If the folder cannot be written, or the preset is unknown or has tiles of another size.
+        If the folder cannot be written, the preset is unknown or has tiles of another size, or decks are
+        wanted with photos or a preset.
     """
+    if decks and (dop or preset):
+        what = "--dop" if dop else f"--preset {preset}"
+        raise ConfigError(f"--decks {what}: scenes with decks have no photos and no preset; leave {what} out")
     if preset == "dsc3d" and size_m in (None, dsc3d.SIZE_M):
         return write_stand_in(folder, tiles, seed)
-    jobs = _jobs(folder, tiles, seed, size_m, dop, preset)
+    jobs = _jobs(folder, tiles, seed, size_m, dop, preset, decks)
     executor = AdaptiveExecutor(None, DaskExecutor(), lambda line: None)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -119,10 +129,17 @@ def write_scenes(
 
 
 def _jobs(
-    folder: Path, tiles: int | None, seed: int, size_m: int | None, dop: bool, preset: str | None
+    folder: Path,
+    tiles: int | None,
+    seed: int,
+    size_m: int | None,
+    dop: bool,
+    preset: str | None,
+    decks: bool,
 ) -> list[_SceneJob]:
     if preset is None:
-        name, options = f"synthetic, seed {seed}", SceneOptions()
+        name = f"synthetic, seed {seed}"
+        options = CrossingOptions() if decks else SceneOptions()
         return [
             _SceneJob(str(folder), tile_id, grid, seed, None, options, name, dop, extended_dtm=False)
             for tile_id, grid in block(tiles or TILES, size_m or SIZE_M)
@@ -140,6 +157,8 @@ def _jobs(
 
 
 def _write_scene(job: _SceneJob) -> Tile | str:
+    if isinstance(job.options, CrossingOptions):
+        return _write_crossings(job, make_crossings(job.grid, job.seed, job.options))
     arguments = (job.grid, job.seed, job.stratum, job.options)
     scene = make_scene(*arguments)
     layers = {**scene.layers, **({"dop": orthophoto(*arguments)} if job.dop else {})}
@@ -151,25 +170,40 @@ def _write_scene(job: _SceneJob) -> Tile | str:
     return prepared.write_tile(folder, job.tile_id, job.grid, layers, *about)
 
 
+def _write_crossings(job: _SceneJob, scene: Scene) -> Tile:
+    folder, about = Path(job.folder), (scene.stratum, MADE, job.name)
+    for level, heights in scene.levels.items():
+        truth = {"reference": heights}
+        prepared.write_tile(folder / KNOWN / f"level{level}", job.tile_id, job.grid, truth, *about)
+    return prepared.write_tile(folder, job.tile_id, job.grid, scene.layers, *about)
+
+
 def _with_roads(path: Path, jobs: Sequence[_SceneJob], tiles: Sequence[Tile]) -> tuple[Tile, ...]:
     """Write the centre lines of all scenes to one file; return the tiles with it as layer ``roads``."""
     output_file(path).unlink(missing_ok=True)
     # Neighbouring tiles share streets; equal lines are written once.
-    lines = {
-        line.points.tobytes(): line
-        for job in jobs
-        for line in centre_lines(job.grid, job.seed, job.stratum, job.options)
-    }
+    lines = {line.points.tobytes(): line for job in jobs for line in _lines(job)}
     if not lines:
         return tuple(tiles)
     _write_lines(path, list(lines.values()), jobs[0].grid.crs)
     return with_roads(tiles, [opened(path, None)], None)[0]
 
 
+def _lines(job: _SceneJob) -> list[CentreLine]:
+    if isinstance(job.options, CrossingOptions):
+        return Crossings(job.seed, job.options).roads(job.grid.bounds)
+    return centre_lines(job.grid, job.seed, job.stratum, job.options)
+
+
 def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
     target = output_file(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.gpkg")
-    columns = {"highway": [line.highway for line in lines], "width_m": [line.width_m for line in lines]}
+    columns: dict[str, list[Any]] = {
+        "highway": [line.highway for line in lines],
+        "width_m": [line.width_m for line in lines],
+    }
+    if any(line.level for line in lines):
+        columns |= _level_columns(lines)
     shapes = [shapely.LineString(line.points) for line in lines]
     try:
         with vector_date(MADE):
@@ -177,6 +211,16 @@ def _write_lines(path: Path, lines: Sequence[CentreLine], crs: str) -> None:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _level_columns(lines: Sequence[CentreLine]) -> dict[str, list[Any]]:
+    """Return OSM's tags of decks and tubes, and the level as a number."""
+    return {
+        "bridge": ["yes" if line.level > 0 else None for line in lines],
+        "tunnel": ["yes" if line.level < 0 else None for line in lines],
+        "layer": [str(line.level) if line.level else None for line in lines],
+        "level": [line.level for line in lines],
+    }
 
 
 def _failure(job: _SceneJob, reason: str) -> Tile | str:

@@ -251,11 +251,15 @@ def catalog_synthetic(
         int | None, typer.Option(min=10, metavar="METRES", help="Size of a tile in m; default: 250.")
     ] = None,
     dop: Annotated[bool, typer.Option("--dop", help="Also make orthophotos with pixels of 0.5 m.")] = False,
+    decks: Annotated[
+        bool,
+        typer.Option("--decks", help="Make roads on decks and in tubes, with the heights of both levels."),
+    ] = False,
 ) -> None:
     """Make synthetic scenes with known truth, and their catalog."""
     from flexroad.pipeline.benchmark.scenes import write_scenes  # noqa: PLC0415 loads scipy
 
-    path = write_scenes(output, tiles, seed, tile_size, dop, preset)
+    path = write_scenes(output, tiles, seed, tile_size, dop, preset, decks)
     echo(f"{count(len(Catalog.read(path).tiles), 'tile')} in {path}")
     echo(after_catalog(path, {"gerod": "paper"}.get(preset or "", preset)))
 

@@ -30,6 +30,8 @@ class CentreLine:
     width_m: float
     highway: str
     """Class: a value of OSM's ``highway`` key."""
+    level: int = 0
+    """Number of the level: above 0 on a deck, below 0 in a tube."""
 
 
 def centre_lines(

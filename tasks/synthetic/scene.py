@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -61,6 +61,8 @@ class Scene:
     """True road, ``(H, W)``."""
     kind: NDArray[np.uint8]
     """Object that the surface model shows, a `Kind` per cell, ``(H, W)``."""
+    levels: Mapping[int, Floats] = field(default_factory=dict)
+    """True height of each level, ``(H, W)``, m, NaN where it is not; only of `tasks.synthetic.crossings`."""
 
     @property
     def layers(self) -> Mapping[str, NDArray[np.generic]]:
@@ -110,7 +112,7 @@ def make_scene(grid: Grid, seed: int, stratum: str | None = None, options: Scene
     dsm, kind = _survey(canvas, here, truth, objects, options, rng)
     offset = _flight_offset(canvas, options.flight_offset_m)
     bare = here.bare + scars(canvas, objects.houses, seed, options.scars_m) + offset
-    dtm = _terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
+    dtm = terrain_model(bare, wide.cell, options.dtm_noise_m, rng)
     return Scene(
         grid=grid,
         stratum=plan.stratum_at(*_centre(canvas)).name,
@@ -196,7 +198,7 @@ def _ground_near(canvas: Canvas, options: SceneOptions) -> GroundAt:
     return partial(ground, land, ways)
 
 
-def _terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
+def terrain_model(bare: Floats, cell: float, noise_m: float, rng: np.random.Generator) -> Floats:
     """Return the bare ground, smoothed and with correlated noise, as interpolated from ground points."""
     grain = gaussian_filter(rng.standard_normal(bare.shape), DTM_GRAIN_M / cell)
     # A Gaussian of sigma cells reduces the deviation of white noise to 1 / (2 sigma sqrt(pi)).

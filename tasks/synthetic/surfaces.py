@@ -174,7 +174,7 @@ class _Blend:
         edge: Floats,
         share: Floats | float = 1.0,
     ) -> None:
-        weight = share * (1 - _smoothstep((beyond - SHOULDER_M) / SLOPE_M))
+        weight = share * (1 - smoothstep((beyond - SHOULDER_M) / SLOPE_M))
         self.total[where] += weight * height
         self.weights[where] += weight
         self.heaviest[where] = np.maximum(self.heaviest[where], weight)
@@ -209,13 +209,13 @@ def _street_lift(street: Street, land: Relief, x: Floats, y: Floats) -> tuple[Fl
 
 def _pavement(edge: Floats) -> Floats:
     """Return the pavement's profile beside an edge, 0 to 1: a step up, level, then a slope down."""
-    up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
+    up, down = (smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (2.2, 1.5)))
     return up - down
 
 
 def _terrace(edge: Floats) -> Floats:
     """Return the profile of the ground behind a wall, 0 to 1: a step up, level, then a slope down."""
-    up, down = (_smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (8.0, 12.0)))
+    up, down = (smoothstep((edge - start) / width) for start, width in ((0.0, 0.2), (8.0, 12.0)))
     return up - down
 
 
@@ -224,7 +224,7 @@ def _crest(streams: Sequence[Stream], x: Floats, y: Floats) -> Floats:
     crest = np.zeros_like(x)
     for stream in streams:
         if not stream.paved:
-            crest = np.maximum(crest, 1 - _smoothstep(stream.distance(x, y) / (BED_M + BANK_M)))
+            crest = np.maximum(crest, 1 - smoothstep(stream.distance(x, y) / (BED_M + BANK_M)))
     return crest
 
 
@@ -237,11 +237,12 @@ def _near(street: Street, x: Floats, y: Floats) -> Bools:
 def _trough(streams: Sequence[Stream], x: Floats, y: Floats) -> Floats:
     depth = np.zeros_like(x)
     for stream in streams:
-        cut = STREAM_DEPTH_M * (1 - _smoothstep((stream.distance(x, y) - BED_M) / BANK_M))
+        cut = STREAM_DEPTH_M * (1 - smoothstep((stream.distance(x, y) - BED_M) / BANK_M))
         depth = np.maximum(depth, cut)
     return depth
 
 
-def _smoothstep(t: Floats) -> Floats:
+def smoothstep(t: Floats) -> Floats:
+    """Return a smooth rise from 0 (at 0 and below) to 1 (at 1 and above)."""
     t = np.clip(t, 0, 1)
     return t * t * (3 - 2 * t)

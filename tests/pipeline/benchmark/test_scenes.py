@@ -1,6 +1,7 @@
 import re
 from pathlib import Path
 
+import geopandas
 import numpy as np
 import pytest
 import rasterio
@@ -10,8 +11,10 @@ from flexroad.catalog.sources.prepared import HEIGHTS, MASKS, PHOTO
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.errors import ConfigError
 from flexroad.tasks.load import Options, load
+from flexroad.tasks.roads.level_numbers import level_numbers
 from flexroad.tasks.segment import vector
 from flexroad.tasks.synthetic import make_scene
+from flexroad.tasks.synthetic.crossings import Crossings, make_crossings
 from flexroad.tasks.synthetic.dsc3d import survey as survey_of_scenes
 from flexroad.tasks.synthetic.gerod import survey
 
@@ -146,3 +149,42 @@ def test_stand_in_mesh_prepared_again_gives_same_rasters(scene, tmp_path):
     assert tile.grid == circular.grid
     for name in ("dsm", "dtm"):
         assert np.array_equal(read(tile, name), read(circular, name), equal_nan=True)
+
+
+@pytest.fixture(scope="module")
+def decks(tmp_path_factory):
+    return write_scenes(tmp_path_factory.mktemp("decks"), 4, seed=1, size_m=60, decks=True)
+
+
+def test_write_scenes_decks_have_rasters_and_truth_of_both_levels(decks):
+    tiles = Catalog.read(decks).tiles
+    assert len(tiles) == 4
+    for tile in tiles:
+        scene = make_crossings(tile.grid, 1)
+        data = load(tile, Options())
+        assert np.array_equal(data.dsm, scene.dsm.astype(np.float32))
+        for level, heights in scene.levels.items():
+            with rasterio.open(
+                decks.parent / "known" / f"level{level}" / "reference" / f"{tile.id}.tif"
+            ) as file:
+                np.testing.assert_array_equal(file.read(1), heights.astype(np.float32))
+    assert sum(1 in make_crossings(tile.grid, 1).levels for tile in tiles) > 1
+
+
+def test_write_scenes_decks_name_the_levels_of_their_roads(decks):
+    table = geopandas.read_file(decks.with_name("roads.gpkg"))
+    lines = {line.points.tobytes(): line for line in Crossings(1).roads((499980, 5599980, 500100, 5600100))}
+    assert sorted(table.level) == sorted(line.level for line in lines.values())
+    assert set(table.level) >= {0, 1}
+    for names in ((), ("level",)):
+        numbers, notes = level_numbers(table.drop(columns=list(names)))
+        assert numbers.tolist() == table.level.tolist()
+        assert notes == ()
+
+
+def test_write_scenes_decks_with_photo_or_preset_raise(tmp_path):
+    with pytest.raises(ConfigError, match="--decks --dop: scenes with decks have no photos and no preset"):
+        write_scenes(tmp_path, 1, seed=0, dop=True, decks=True)
+    with pytest.raises(ConfigError, match="--decks --preset gerod: .*; leave --preset gerod out"):
+        write_scenes(tmp_path, 1, seed=0, preset="gerod", decks=True)
+    assert not list(tmp_path.iterdir())
