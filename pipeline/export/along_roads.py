@@ -18,7 +18,7 @@ from flexroad.catalog.storage.paths import Location, read, stat, write
 from flexroad.catalog.text import count, no_formula
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
-from flexroad.pipeline.export.ground import Ground, GroundTile
+from flexroad.pipeline.export.ground import SMOOTH, Ground, GroundTile, steps_left_out
 from flexroad.pipeline.export.network import Network, network
 from flexroad.pipeline.export.pieces import (
     MARKERS,
@@ -40,15 +40,15 @@ from flexroad.tasks.roads.along_line import (
     elevation_error,
     grid_error,
     height_grid,
+    largest_steps,
     profile_error,
     profiles,
 )
 from flexroad.tasks.roads.local_frame import LocalFrame
 from flexroad.tasks.roads.reference_line import ReferenceLine
 from flexroad.tasks.roads.routes import Route
-from flexroad.tasks.types import Floats
 
-VERSION = 3
+VERSION = 4
 """Of the roads themselves: their division, lines and grids."""
 INTERNAL = {"bounds", "lanes_assumed"}
 """Entries of a road's row that the report does not show."""
@@ -103,13 +103,15 @@ class RouteUnit:
         return text.hexdigest()
 
     def height(self, work: Work) -> HeightAt:
-        """Return the surface in the local frame."""
-        ground = Ground(self.tiles)
+        """Return the surface without steps in the local frame."""
+        return self._local(Ground(self.tiles).height, work)
 
-        def height(x: Floats, y: Floats) -> Floats:
-            return ground.height(*work.frame.to_run(x, y))
+    def step(self, work: Work) -> HeightAt:
+        """Return the height of the surface with steps above it, in the local frame."""
+        return self._local(Ground(self.tiles).step, work)
 
-        return height
+    def _local(self, of: HeightAt, work: Work) -> HeightAt:
+        return lambda x, y: of(*work.frame.to_run(x, y))
 
     def road_id(self, part: int) -> int:
         """Return the number of a road: OpenDRIVE's readers want whole numbers."""
@@ -137,8 +139,10 @@ def write_crg(
     roads = network(source, options)
     rows, _ = write_units(opencrg.VERSION, crg_piece, Work.of(source, roads), roads, tiles, folder, executor)
     summary = report(folder, rows, roads)
-    error = summary["crg_max_mm"]
-    return with_line(summary, f"misses the surface by at most {error:.1f} mm" if error is not None else "")
+    error, steps = summary["crg_max_mm"], steps_left_out(_metres(summary["crg_steps_max_mm"]))
+    surface = SMOOTH if steps else "the surface"
+    text = f"misses {surface} by at most {error:.1f} mm{steps}"
+    return with_line(summary, text if error is not None else "")
 
 
 def write_xodr(
@@ -171,9 +175,10 @@ def _without_crg(summary: Mapping[str, Any]) -> str:
         f"{summary[f'{name}_mean_mm']:.0f} mm on average, at most {summary[f'{name}_max_mm']:.0f} mm"
         for name in ("profiles", "elevation")
     ]
-    return (
-        f"misses the surface by {errors[0]}, without OpenCRG; by elevation alone (CARLA, SUMO) by {errors[1]}"
-    )
+    steps = steps_left_out(_metres(summary["carriageway_steps_max_mm"]))
+    surface = SMOOTH if steps else "the surface"
+    alone = f"by elevation alone (CARLA, SUMO) by {errors[1]}"
+    return f"misses {surface} by {errors[0]}, without OpenCRG; {alone}{steps}"
 
 
 def write_units(
@@ -202,12 +207,13 @@ def crg_piece(unit: RouteUnit, work: Work) -> Piece:
     """Return the OpenCRG files of a route."""
     files, rows = dict[str, bytes](), list[Row]()
     grids_of, problem = _grids(unit, work)
+    step = unit.step(work)
     for part, (grid, height) in enumerate(grids_of):
         road = unit.road_id(part)
         heights = work.vertical or "as in the run"
         comment = f"FlexRoad: {grid.line.name}\nx, y: {work.frame.proj}\nheights: {heights}"
         files[f"{road}{opencrg.NAME}"] = opencrg.encode(grid, comment)
-        rows.append(row(road, grid, height, profiles(grid)))
+        rows.append(row(road, grid, height, step, profiles(grid)))
     return Piece(files, _route_row(unit, rows, problem))
 
 
@@ -215,12 +221,13 @@ def xodr_piece(unit: RouteUnit, work: Work) -> Piece:
     """Return the roads of a route as XML of OpenDRIVE."""
     texts, rows = list[bytes](), list[Row]()
     grids_of, problem = _grids(unit, work)
+    step = unit.step(work)
     for part, (grid, height) in enumerate(grids_of):
         road = unit.road_id(part)
         fitted = profiles(grid)
         crg = None if work.crg is None else f"{work.crg}{road}{opencrg.NAME}"
         texts.append(opendrive.encode(opendrive.Road(str(road), grid.line, fitted, crg), work.left_hand))
-        rows.append(row(road, grid, height, fitted))
+        rows.append(row(road, grid, height, step, fitted))
     return Piece({_fragment(unit.number): b"".join(texts)}, _route_row(unit, rows, problem))
 
 
@@ -254,11 +261,18 @@ def _route_row(unit: RouteUnit, rows: list[Row], problem: str) -> Row:
     return {"route": unit.number, "roads": rows, "problem": problem}
 
 
-def row(road: int, grid: HeightGrid, height: HeightAt, fitted: Profiles) -> Row:
-    """Return a road's row of the report."""
+def row(road: int, grid: HeightGrid, height: HeightAt, step: HeightAt, fitted: Profiles) -> Row:
+    """Return a road's row of the report.
+
+    Parameters
+    ----------
+    height, step : callable
+        The surface without steps, and how much higher that with steps is, in the line's coordinates.
+    """
     line = grid.line
     (crg_median, crg_max), (mean, most) = grid_error(grid, height), profile_error(grid, fitted)
     level_mean, level_most = elevation_error(grid, fitted)
+    crg_steps, carriageway_steps = largest_steps(grid, step)
     half, lanes = float(line.width.max()) / 2, opendrive.lane_count(line)
     errors = {
         "crg_median_mm": crg_median,
@@ -267,6 +281,8 @@ def row(road: int, grid: HeightGrid, height: HeightAt, fitted: Profiles) -> Row:
         "profiles_max_mm": most,
         "elevation_mean_mm": level_mean,
         "elevation_max_mm": level_most,
+        "crg_steps_max_mm": crg_steps,
+        "carriageway_steps_max_mm": carriageway_steps,
         "off_centre_line_mm": line.offset_m,
     }
     return {
@@ -291,6 +307,10 @@ def millimetres(metres: float) -> float | None:
     return round(metres * 1000, 3) if np.isfinite(metres) else None
 
 
+def _metres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else length_mm / 1000
+
+
 def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
     """Write the report of the roads, if it is new; return the summary for the manifest.
 
@@ -312,6 +332,8 @@ def report(folder: Location, rows: list[Row], roads: Network) -> dict[str, Any]:
         "profiles_max_mm": _largest(every, "profiles_max_mm"),
         "elevation_mean_mm": _mean(every, "elevation_mean_mm"),
         "elevation_max_mm": _largest(every, "elevation_max_mm"),
+        "crg_steps_max_mm": _largest(every, "crg_steps_max_mm"),
+        "carriageway_steps_max_mm": _largest(every, "carriageway_steps_max_mm"),
     }
 
 

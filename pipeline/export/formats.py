@@ -34,7 +34,7 @@ from flexroad.tasks.export import cityjson, landxml, obj, opencrg, opendrive, rh
 from flexroad.tasks.export import road_lines as line_file
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.roads.extent import covered
-from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.spline.surface import NurbsSurface
 
 MATERIALS = "materials.mtl"
@@ -110,13 +110,12 @@ def step_piece(tile: FinishedTile, place: Georeference) -> Piece:
     if not isinstance(surface, NurbsSurface):
         raise ConfigError("its surface is no NURBS surface, and STEP has no other; leave out step")
     bounds, beyond_m2 = covered(tile.road)
+    about = {"bounds": list(bounds), "beyond_survey_m2": beyond_m2, "steps_max_m": _steps_m(tile)}
     files = {
         f"{name}{step.NAME}": step.encode(surface, bounds, tile.id, source.datetime, place),
-        f"{name}{step.NAME_SIDECAR}": place.sidecar(
-            step.AXES, bounds=list(bounds), beyond_survey_m2=beyond_m2
-        ),
+        f"{name}{step.NAME_SIDECAR}": place.sidecar(step.AXES, **about),
     }
-    return Piece(files, _cut_note(bounds, beyond_m2, source.grid.bounds))
+    return Piece(files, _smooth_row(tile, bounds, beyond_m2))
 
 
 def rhino_piece(tile: FinishedTile, place: Georeference) -> Piece:
@@ -124,17 +123,30 @@ def rhino_piece(tile: FinishedTile, place: Georeference) -> Piece:
     surface = tile.surface
     nurbs = surface if isinstance(surface, NurbsSurface) else None
     bounds, beyond_m2 = covered(tile.road)
-    texts = {"bounds": " ".join(f"{v:.15g}" for v in bounds), "beyond_survey_m2": f"{beyond_m2:g}"}
+    texts = {
+        "bounds": " ".join(f"{v:.15g}" for v in bounds),
+        "beyond_survey_m2": f"{beyond_m2:g}",
+        "steps_max_m": f"{_steps_m(tile):g}",
+    }
     data = rhino.encode(tile.mesh, nurbs, bounds, place, texts)
-    row = _cut_note(bounds, beyond_m2, tile.tile.grid.bounds) if nurbs else {}
+    row = _smooth_row(tile, bounds, beyond_m2) if nurbs else {}
     return Piece({f"{safe_name(tile.id)}{rhino.NAME}": data}, row)
 
 
-def _cut_note(bounds: Bounds, beyond_m2: float, tile: Bounds) -> Row:
-    """Return the note on a surface that ends with the survey or goes on beyond it, if it does."""
-    parts = [CUT] if bounds != tile else []
+def _smooth_row(tile: FinishedTile, bounds: Bounds, beyond_m2: float) -> Row:
+    """Return the largest step that a surface leaves out, and a note if it ends with the survey or goes on."""
+    parts = [CUT] if bounds != tile.tile.grid.bounds else []
     parts += [BEYOND] if beyond_m2 else []
-    return {"note": "; ".join(parts)} if parts else {}
+    return {"steps_max_m": _steps_m(tile)} | ({"note": "; ".join(parts)} if parts else {})
+
+
+def _steps_m(tile: FinishedTile) -> float:
+    """Return the largest step of a tile's surface within the survey (m)."""
+    surface, road = tile.surface, tile.road
+    if not isinstance(surface, SteppedSurface):
+        return 0.0
+    inside = ~road.outside[road.grid.window(road.core)]
+    return round(float(np.abs(surface.steps[inside]).max(initial=0.0)), 6)
 
 
 Write = Callable[[Source, Iterable[FinishedTile], Location, Options, Executor], dict[str, Any] | None]

@@ -1,7 +1,12 @@
-"""Heights of a run's roads, from the surfaces of its tiles, of which a process keeps a few in memory."""
+"""Heights of a run's roads, from the surfaces of its tiles, of which a process keeps a few in memory.
+
+Formats of smooth surfaces, and those along roads, have the spline without the steps of kerbs, walls and banks
+beside roads. `Ground.step` and the texts here say by how much that differs from the surface of the run.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -11,11 +16,21 @@ from numpy.typing import NDArray
 from flexroad.catalog import Bounds, Grid
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.run.finished import FinishedTile
-from flexroad.tasks.spline.stepped import without_steps
+from flexroad.tasks.spline.stepped import SteppedSurface, without_steps
 from flexroad.tasks.types import Bools, Floats, Surface
 
 SURFACES, ESTIMATES = 128, 32
-"""Numbers of tiles of which a process keeps surface (some 0.2 MB each) and error estimates (0.6 MB)."""
+"""Numbers of tiles of which a process keeps surface (some 0.4 MB each) and error estimates (0.6 MB)."""
+SMOOTH = "the surface without kerbs and walls"
+STEPS_SHOWN_M = 0.01
+"""Height of steps that are left out from which the user is told (m)."""
+
+
+def steps_left_out(steps_m: float | None) -> str:
+    """Return the end of a line for the user about the largest step (m); empty if it is too small."""
+    if steps_m is None or steps_m < STEPS_SHOWN_M:
+        return ""
+    return f"; with kerbs and walls it differs by up to {steps_m:.2f} m, where the run has no road"
 
 
 @dataclass(frozen=True)
@@ -61,13 +76,22 @@ class Ground:
         ConfigError
             If a result of a tile cannot be read, or the tile has changed.
         """
+        return self._first(_Patch.height, easting, northing)
+
+    def step(self, easting: Floats, northing: Floats) -> Floats:
+        """Return by how much the surface with steps is higher (m); the rest is as of `height`."""
+        return self._first(_Patch.step, easting, northing)
+
+    def _first(
+        self, of: Callable[[_Patch, Floats, Floats], Floats], easting: Floats, northing: Floats
+    ) -> Floats:
         easting, northing = np.broadcast_arrays(easting, northing)
-        height = np.full(easting.shape, np.nan)
+        values = np.full(easting.shape, np.nan)
         for tile in self.tiles:
-            here = np.isnan(height) & _within(tile.grid.bounds, easting, northing)
+            here = np.isnan(values) & _within(tile.grid.bounds, easting, northing)
             if here.any():
-                height[here] = _patch(tile).height(easting[here], northing[here])
-        return height
+                values[here] = of(_patch(tile), easting[here], northing[here])
+        return values
 
     def error(self, easting: Floats, northing: Floats) -> tuple[Floats, NDArray[np.uint8]]:
         """Return the estimated error (m) of the surface and its `tasks.quality.support.Support`, ``(n,)``.
@@ -93,7 +117,13 @@ class _Patch:
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         beyond = self.outside[self.grid.cells(easting, northing)]
-        return np.where(beyond, np.nan, self.surface.height(easting, northing))
+        return np.where(beyond, np.nan, without_steps(self.surface).height(easting, northing))
+
+    def step(self, easting: Floats, northing: Floats) -> Floats:
+        beyond = self.outside[self.grid.cells(easting, northing)]
+        surface = self.surface
+        steps = surface.step(easting, northing) if isinstance(surface, SteppedSurface) else 0.0
+        return np.where(beyond, np.nan, steps)
 
 
 def _within(bounds: Bounds, easting: Floats, northing: Floats) -> Bools:
@@ -106,7 +136,7 @@ def _within(bounds: Bounds, easting: Floats, northing: Floats) -> Bools:
 def _patch(tile: GroundTile) -> _Patch:
     finished = tile.unread
     road = finished.road
-    return _Patch(tile.grid, without_steps(finished.surface), road.outside[road.grid.window(road.core)])
+    return _Patch(tile.grid, finished.surface, road.outside[road.grid.window(road.core)])
 
 
 @lru_cache(maxsize=ESTIMATES)

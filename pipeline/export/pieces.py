@@ -28,6 +28,7 @@ from flexroad.catalog.storage.staging import atomic_file
 from flexroad.catalog.text import count
 from flexroad.pipeline.errors import ConfigError
 from flexroad.pipeline.execute import Executor
+from flexroad.pipeline.export.ground import SMOOTH, steps_left_out
 from flexroad.pipeline.export.source import Source
 from flexroad.pipeline.run.finished import FinishedTile
 from flexroad.tasks.errors import TaskError
@@ -36,6 +37,8 @@ MARKERS = ".pieces"
 """Folder of the marks of tiles, areas or roads."""
 PARTS = ".parts"
 """Folder of the parts of a joined file."""
+LARGEST = {"height_error_m", "steps_max_m"}
+"""Entries of the rows of tiles of which the manifest has the largest."""
 Row = dict[str, Any]
 """What the files of the complete run need of a tile, as JSON values."""
 
@@ -178,13 +181,16 @@ def write_pieces(
 
 
 def figures(rows: Iterable[Row]) -> dict[str, Any]:
-    """Return what the manifest says of all tiles: the largest error, and the number of each note."""
-    errors, notes = list[float](), Counter[str]()
+    """Return what the manifest says of all tiles: the largest error and step, and the number of each note."""
+    largest, notes = dict[str, Any](), Counter[str]()
     for row in rows:
-        errors += [row["height_error_m"]] if "height_error_m" in row else []
+        for name in LARGEST & row.keys():
+            largest[name] = max(row[name], largest.get(name, row[name]))
         notes.update([row["note"]] if row.get("note") else [])
+    left_out = steps_left_out(largest.get("steps_max_m"))
+    summary = {"summary": f"of {SMOOTH}{left_out}"} if left_out else {}
     said = [f"{count(number, 'tile')}: {note}" for note, number in sorted(notes.items())]
-    return ({"height_error_m": max(errors)} if errors else {}) | {"notes": said}
+    return largest | summary | {"notes": said}
 
 
 def write_whole(file: Location, key: str, row: Row, fill: Callable[[Path], None]) -> None:

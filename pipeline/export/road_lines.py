@@ -25,7 +25,7 @@ from flexroad.pipeline.export.along_roads import (
     with_line,
     write_units,
 )
-from flexroad.pipeline.export.ground import Ground
+from flexroad.pipeline.export.ground import SMOOTH, Ground, steps_left_out
 from flexroad.pipeline.export.network import network
 from flexroad.pipeline.export.pieces import MARKERS, Piece, Row, write_whole
 from flexroad.pipeline.export.source import Options, Source
@@ -61,19 +61,24 @@ def write_lines(
             copyfile(file, local)
 
     write_whole(folder / f"{source.run.path.name}{road_lines.NAME}", key, {}, fill)
-    return with_line(totals(rows, roads))
+    steps = max((road["steps_max_m"] for row in rows for road in row["roads"]), default=0.0)
+    left_out = steps_left_out(steps)
+    return with_line(
+        {**totals(rows, roads), "steps_max_m": round(steps, 6)},
+        f"along {SMOOTH}{left_out}" if left_out else "",
+    )
 
 
 def lines_piece(unit: RouteUnit, work: Work) -> Piece:
     """Return the roads of a route as arrays; a road ends where the surface does."""
-    height = unit.height(work)
+    height, step = unit.height(work), unit.step(work)
     line, problem = reference_line(unit)
     known = np.empty(0) if line is None else height(line.x, line.y)
     parts = [] if line is None else lines.parts(line, np.isfinite(known), lines.Options())
     rows, arrays = list[Row](), dict[str, Any]()
     for number, part in enumerate(parts):
         along = stations(part, height)
-        rows.append(_road(unit.road_id(number), part, along, work))
+        rows.append(_road(unit.road_id(number), part, along, stations(part, step)))
         arrays |= {f"{number}.{name}": values for name, values in _arrays(along, unit, work).items()}
     if not rows and not problem:
         problem = "no part of it has a surface for long enough"
@@ -87,9 +92,16 @@ def _file(route: int) -> str:
     return f"{MARKERS}/{route}.npz"
 
 
-def _road(road: int, line: ReferenceLine, along: Stations, work: Work) -> Row:
-    """Return the columns of a road in the layer ``roads``."""
+def _road(road: int, line: ReferenceLine, along: Stations, steps: Stations) -> Row:
+    """Return the columns of a road in the layer ``roads``.
+
+    Parameters
+    ----------
+    along, steps : Stations
+        Of the surface without steps, and of the steps above it.
+    """
     step = np.diff(along.s)
+    edges = [steps.height + slope * steps.width / 2 for slope in (steps.left, steps.right)]
     return {
         "id": road,
         "name": line.name,
@@ -100,6 +112,7 @@ def _road(road: int, line: ReferenceLine, along: Stations, work: Work) -> Row:
         "grade_mean_percent": float(PERCENT * np.average(np.abs(along.grade), weights=step)),
         "grade_max_percent": float(PERCENT * np.abs(along.grade).max()),
         "crossfall_mean_percent": _mean(PERCENT * np.abs(along.crossfall)),
+        "steps_max_m": float(np.nanmax(np.abs(np.concatenate([steps.z, steps.height, *edges])))),
     }
 
 

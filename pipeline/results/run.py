@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -12,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
-from flexroad.catalog import Bounds, Tile
+from flexroad.catalog import Bounds, Grid
 from flexroad.catalog.grid import overlap
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.storage.paths import exists, read
@@ -29,6 +30,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import peek_statuses
 from flexroad.pipeline.store.tables import read_metrics
 from flexroad.tasks import sample
+from flexroad.tasks.spline.stepped import SteppedSurface
 from flexroad.tasks.spline.surface import NurbsSurface, uniform_knots
 from flexroad.tasks.types import Floats
 
@@ -147,7 +149,7 @@ class RunView:
             raise ConfigError(f"{path} is damaged: {error}; run `flexroad rerun {self.run.path}`") from error
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the height at points.
+        """Return the height at points, with the steps beside roads.
 
         Parameters
         ----------
@@ -174,7 +176,7 @@ class RunView:
         return answer.height.reshape(shape)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal at points.
+        """Return the upward unit normal at points: that of the spline, without the steps beside roads.
 
         Parameters
         ----------
@@ -250,9 +252,9 @@ class RunView:
         Returns
         -------
         Surface
-            Equal to the surfaces of its tiles except for rounding (below 1e-9 m), see docs/mosaic.md, and
-            for the steps beside roads, which it does not have. NaN in tiles that are not finished, and on
-            their edges. It has no road mask, and so no mesh.
+            Equal to the surfaces of its tiles, with the steps beside roads, except for rounding (below
+            1e-9 m), see docs/mosaic.md. NaN in tiles that are not finished, and on their edges. It has no
+            road mask, and so no mesh, and goes on beyond the survey.
 
         Raises
         ------
@@ -266,7 +268,7 @@ class RunView:
         >>> run = flexroad.open_run("runs/city")
         >>> surface = run.surface()
         >>> surface
-        <flexroad.Surface: nurbs of 20 x 20 control points>
+        <flexroad.Surface: stepped of 20 x 20 control points>
         EPSG:25832, 60 x 60 m, bounds 499980 5599980 500040 5600040
         road: unknown
         >>> bool(abs(surface.height(500010.0, 5600030.0) - run.height(500010.0, 5600030.0)) < 1e-9)
@@ -286,8 +288,9 @@ class RunView:
             raise ConfigError(
                 f"{self.run.path} has no finished tile in {bounds or 'its catalog'}; see `flexroad status`"
             )
-        surfaces = [FinishedTile.of(self.run, status, self.variant).surface for status in done]
-        whole = _joined([status.graph.tile for status in done], cast("list[NurbsSurface]", surfaces))
+        surfaces = (FinishedTile.of(self.run, status, self.variant).surface for status in done)
+        grids = [status.graph.tile.grid for status in done]
+        whole = _joined(grids, cast("Iterator[NurbsSurface]", surfaces))
         west, south, east, north = whole.bounds
         if bounds is not None:
             west, south = max(west, bounds[0]), max(south, bounds[1])
@@ -432,30 +435,43 @@ def open_run(path: str | Path, variant: str | None = None, allow: Sequence[str |
     return RunView(*open_variant(path, variant, allow), tuple(allow))
 
 
-def _joined(tiles: Sequence[Tile], surfaces: Sequence[NurbsSurface]) -> NurbsSurface:
+def _joined(grids: Sequence[Grid], surfaces: Iterable[NurbsSurface]) -> NurbsSurface:
     """Return one surface over the rectangle around the tiles; NaN where it has no tile."""
-    first = tiles[0].grid
-    if len({tile.grid.crs for tile in tiles}) > 1:
+    if len({grid.crs for grid in grids}) > 1:
         raise ConfigError("the tiles are in different CRS; give bounds with tiles of one CRS")
-    width, height = first.width * first.cell, first.height * first.cell
-    edges = np.array([tile.grid.bounds for tile in tiles])
-    (west, south), (east, north) = edges[:, :2].min(axis=0), edges[:, 2:].max(axis=0)
-    p, q = surfaces[0].degree
-    n, m = surfaces[0].A.shape[1] - p, surfaces[0].A.shape[0] - q
-    columns, rows = round((east - west) / width), round((north - south) / height)
-    heights = np.full((rows * m + q, columns * n + p), np.nan)
-    for tile, surface in zip(tiles, surfaces, strict=True):
-        j, i = round((tile.grid.south - south) / height) * m, round((tile.grid.west - west) / width) * n
-        # Points on the border are in both tiles; those of a missing neighbour stay.
-        heights[j : j + m + q, i : i + n + p] = surface.A
-    return NurbsSurface(
+    cells = Grid.holding(grids)
+    if cells is None:
+        raise ConfigError("the tiles have no common lattice; give bounds with tiles of one lattice")
+    first, surfaces = grids[0], iter(surfaces)
+    spline = next(surfaces)
+    (p, q), (height, width) = spline.degree, first.shape
+    n, m = spline.A.shape[1] - p, spline.A.shape[0] - q
+    columns, rows = round(cells.width / width), round(cells.height / height)
+    heights, steps = np.full((rows * m + q, columns * n + p), np.nan), np.zeros(cells.shape, np.float32)
+    south_north = np.zeros((rows + 1, cells.width), np.float32)
+    west_east = np.zeros((columns + 1, cells.height), np.float32)
+    stepped = False
+    for grid, surface in zip(grids, chain([spline], surfaces), strict=True):
+        window = down, along = cells.window(grid)
+        i, j = along.start // width, rows - 1 - down.start // height
+        # Points and steps on the border are in both tiles; those of a missing neighbour stay.
+        heights[j * m : (j + 1) * m + q, i * n : (i + 1) * n + p] = surface.A
+        if isinstance(surface, SteppedSurface):
+            stepped, steps[window] = True, surface.steps
+            south_north[j : j + 2, along], west_east[i : i + 2, down] = surface.south_north, surface.west_east
+    whole = NurbsSurface(
         crs=first.crs,
-        bounds=(float(west), float(south), float(east), float(north)),
+        bounds=cells.bounds,
         degree=(p, q),
         knots_u=uniform_knots(0, columns * n, p),
         knots_v=uniform_knots(0, rows * m, q),
         A=heights,
         W=np.ones_like(heights),
-        datum=surfaces[0].datum,
-        origin=(float(np.floor(west)), float(np.floor(south))),
+        datum=spline.datum,
+        origin=(float(np.floor(cells.west)), float(np.floor(cells.south))),
+    )
+    if not stepped:
+        return whole
+    return SteppedSurface(
+        **vars(whole), steps=steps, cells=cells, south_north=south_north, west_east=west_east
     )

@@ -131,7 +131,7 @@ class Surface:
         return np.where(self._valid(easting, northing), self.fitted.height(easting, northing), np.nan)[()]
 
     def normal(self, x: ArrayLike, y: ArrayLike) -> Floats:
-        """Return the upward unit normal at points.
+        """Return the upward unit normal at points: that of the spline, without the steps beside roads.
 
         Parameters
         ----------

@@ -112,7 +112,8 @@ def _surface(arrays: dict[str, np.ndarray]) -> NurbsSurface:
     cells = Grid(spline.crs, west, north, cell, int(width), int(height))
     steps, south_north, west_east = (arrays[name] for name in STEPS)
     shapes = steps.shape, south_north.shape, west_east.shape
-    if shapes != (cells.shape, (2, cells.width), (2, cells.height)):
+    rows, columns = (max(len(borders), 2) for borders in (south_north, west_east))
+    if shapes != (cells.shape, (rows, cells.width), (columns, cells.height)):
         raise ValueError(f"steps {shapes} do not fit cells {cells.shape}")
     return SteppedSurface(
         **vars(spline), steps=steps, cells=cells, south_north=south_north, west_east=west_east

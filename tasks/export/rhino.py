@@ -22,7 +22,7 @@ from flexroad.tasks.spline.cut import patch
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Bools, Mesh
 
-VERSION = 2
+VERSION = 3
 NAME = ".3dm"
 MEDIA_TYPE = "model/vnd.3dm"
 

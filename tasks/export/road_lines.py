@@ -20,7 +20,7 @@ from flexroad.tasks.types import Floats
 
 pyogrio = lazy("pyogrio")
 
-VERSION = 1
+VERSION = 2
 NAME = "_roads.gpkg"
 MEDIA_TYPE = "application/geopackage+sqlite3"
 

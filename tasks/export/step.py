@@ -20,7 +20,7 @@ from flexroad.tasks.spline.cut import patch
 from flexroad.tasks.spline.surface import ExactNurbs, NurbsSurface
 from flexroad.tasks.types import Floats
 
-VERSION = 2
+VERSION = 3
 NAME = ".stp"
 NAME_SIDECAR = "_stp.json"
 MEDIA_TYPE = "model/step"

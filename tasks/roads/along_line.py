@@ -104,6 +104,17 @@ def elevation_error(grid: HeightGrid, profiles: Profiles) -> tuple[float, float]
     return _missed(grid, np.broadcast_to(profiles.elevation(grid.line.s[:, None]), grid.heights.shape))
 
 
+def largest_steps(grid: HeightGrid, step: HeightAt) -> tuple[float, float]:
+    """Return the largest step up or down at the nodes of a grid, and at those of the carriageway (m).
+
+    NaN if no node has a height.
+    """
+    steps = np.abs(step(*grid.line.beside(grid.v)))
+    known, inside = steps[np.isfinite(steps)], steps[_carriageway(grid)]
+    everywhere, carriageway = (float(part.max()) if len(part) else np.nan for part in (known, inside))
+    return everywhere, carriageway
+
+
 def _missed(grid: HeightGrid, fitted: Floats) -> tuple[float, float]:
     missed = np.abs(fitted - grid.heights)[_carriageway(grid)]
     if not len(missed):

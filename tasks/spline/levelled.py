@@ -84,7 +84,7 @@ class LevelledSurface(SteppedSurface):
         """Return heights of level 0 (m) at every pair, ``(len(northings), len(eastings))``."""
         east, north = np.meshgrid(eastings, northings)
         heights = self._joined(NurbsSurface.lattice(self, eastings, northings), east, north)
-        return np.asarray(heights + self._steps_at(east, north))
+        return np.asarray(heights + self.step(east, north))
 
     def slope(self, easting: Floats, northing: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives of the height of level 0 without steps, by easting and northing (m/m)."""

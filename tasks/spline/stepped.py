@@ -48,8 +48,8 @@ HELD = 1e-9
 class SteppedSurface(NurbsSurface):
     """A spline, and the steps of cells above it; the slope and the normal are the spline's.
 
-    The border of the tile has steps of its own, which its neighbours have, too. In its corners the height is
-    the spline's.
+    The border of a tile has steps of its own, which its neighbours have, too. In its corners the height is
+    the spline's. A surface over several tiles of one size also has the steps of the borders between them.
     """
 
     steps: NDArray[np.float32]
@@ -57,13 +57,15 @@ class SteppedSurface(NurbsSurface):
     cells: Grid
     """The cells of the steps."""
     south_north: NDArray[np.float32]
-    """Steps on the southern and the northern border, ``(2, W)``, m, from west to east."""
+    """Steps on the borders of tiles from the southern to the northern one, ``(rows of tiles + 1, W)``, m,
+    from west to east."""
     west_east: NDArray[np.float32]
-    """Steps on the western and the eastern border, ``(2, H)``, m, from north to south."""
+    """Steps on those from the western to the eastern one, ``(columns of tiles + 1, H)``, m, from north
+    to south."""
 
     def height(self, easting: Floats, northing: Floats) -> Floats:
         """Return heights (m) at scattered points, in their broadcast shape."""
-        return np.asarray(self.smooth(easting, northing) + self._steps_at(easting, northing))
+        return np.asarray(self.smooth(easting, northing) + self.step(easting, northing))
 
     def smooth(self, easting: Floats, northing: Floats) -> Floats:
         """Return the heights of the spline (m) at scattered points, in their broadcast shape."""
@@ -83,20 +85,22 @@ class SteppedSurface(NurbsSurface):
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
-        steps = self._steps_at(np.asarray(eastings), np.asarray(northings)[:, None])
+        steps = self.step(np.asarray(eastings), np.asarray(northings)[:, None])
         return np.asarray(super().lattice(eastings, northings) + steps)
 
-    def _steps_at(self, easting: Floats, northing: Floats) -> Floats:
+    def step(self, easting: Floats, northing: Floats) -> Floats:
         """Return the steps (m) at points, in their broadcast shape; 0 in corners and beyond the tile."""
         (west, south, east, north), cells = self.cells.exact_bounds, self.cells
         # Two tiles count from edges that differ by rounding, and must find the same cell along their border.
         nudge = ROUNDING_M
         row, col = cells.cells(np.asarray(easting) + nudge, np.asarray(northing) - nudge)
-        across, along = _between(easting, west, east), _between(northing, south, north)
-        steps = np.where(across & along, self.steps[row, col], 0.0)
-        for k, (edge, side) in enumerate(((south, west), (north, east))):
-            steps = np.where(across & _equal(northing, edge), self.south_north[k][col], steps)
-            steps = np.where(along & _equal(easting, side), self.west_east[k][row], steps)
+        row_of, on_row, across_rows = _borders(northing, np.linspace(south, north, len(self.south_north)))
+        column_of, on_column, across = _borders(easting, np.linspace(west, east, len(self.west_east)))
+        steps = np.where(across & across_rows, self.steps[row, col], 0.0)
+        if on_row.any():
+            steps = np.where(across & on_row, self.south_north[row_of, col], steps)
+        if on_column.any():
+            steps = np.where(across_rows & on_column, self.west_east[column_of, row], steps)
         return steps
 
 
@@ -142,14 +146,11 @@ def ground_beside(data: TileData, clusters: RoadClusters, frame: Frame | None = 
     return Beside(cells, np.where(cells & preferred, dsm, np.nan), dtm, *border)
 
 
-def _between(values: Floats, low: float, high: float) -> Bools:
-    """Return which values are between two others and not equal to one of them, but for rounding."""
-    return np.asarray((values > low + ROUNDING_M) & (values < high - ROUNDING_M))
-
-
-def _equal(values: Floats, edge: float) -> Bools:
-    """Return which values are equal to another one, but for rounding."""
-    return np.asarray(np.abs(values - edge) <= ROUNDING_M)
+def _borders(values: Floats, borders: Floats) -> tuple[NDArray[np.intp], Bools, Bools]:
+    """Return the nearest border of each value, whether it is on it, and whether it is between two."""
+    nearest = np.searchsorted((borders[:-1] + borders[1:]) / 2, values)
+    on = np.abs(values - borders[nearest]) <= ROUNDING_M
+    return nearest, on, ~on & (values > borders[0]) & (values < borders[-1])
 
 
 def with_steps(beside: Beside, surface: NurbsSurface, core: Grid) -> SteppedSurface:

@@ -160,6 +160,9 @@ class NurbsSurface:
 
     def lattice(self, eastings: Floats, northings: Floats) -> Floats:
         """Return heights (m) at every pair, ``(len(northings), len(eastings))``."""
+        if np.isnan(self.A).any():
+            # A surface over tiles of which one is missing: in sums over all points NaN would be everywhere.
+            return NurbsSurface.height(self, np.asarray(eastings), np.asarray(northings)[:, None])
         u, v = self._parameters(eastings, northings)
         inside_u, inside_v = self._clipped(u, v)
         along_u = basis_matrix(self.knots_u, self.degree[0], inside_u)

@@ -335,6 +335,10 @@ def test_command_prints_length_and_error_of_the_roads(city, streets, tmp_path, f
     lines = said.expected(0).out.splitlines()
     assert lines[0].startswith("crg: 3 files, ")
     assert "2 roads, 0.29 km" in lines[1]
-    assert "misses the surface by at most" in lines[1]
+    # The streets are wider than the road of the run, up to its kerbs.
+    steps_mm = json.loads((tmp_path / "export.json").read_text())["formats"]["crg"]["crg_steps_max_mm"]
+    assert steps_mm > 10
+    assert "misses the surface without kerbs and walls by at most" in lines[1]
+    assert f"with kerbs and walls it differs by up to {steps_mm / 1000:.2f} m" in lines[1]
     assert "on average" in lines[3]
     assert "without OpenCRG" in lines[3]

@@ -20,7 +20,7 @@ from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.runner import run_tiles
 from flexroad.tasks.export import npz
 from tests.mesh_union import Union
-from tests.read_exports import spline_heights
+from tests.read_exports import true_heights
 
 SIZE_M = 100
 KERNELS: tuple[dict[str, str], ...] = ({}, {"OPENBLAS_CORETYPE": "Prescott"})
@@ -174,7 +174,7 @@ def test_tiles_processed_together_have_the_same_bytes(alone, tmp_path):
     west, south, east, north = np.array([tile.grid.bounds for tile in catalog.tiles]).T
     x, y = np.random.default_rng(0).uniform((west.min(), south.min()), (east.max(), north.max()), (500, 2)).T
     surface = view.surface()
-    heights = spline_heights(tmp_path / "run", np.column_stack([x, y]))
+    heights = true_heights(tmp_path / "run", np.column_stack([x, y]))
     np.testing.assert_allclose(surface.height(x, y), heights, rtol=0, atol=1e-9)
     np.testing.assert_allclose(surface.normal(x, y), view.normal(x, y), rtol=0, atol=1e-9)
 
@@ -183,8 +183,7 @@ def test_surface_of_part_of_unfinished_run(survey, tmp_path):
     catalog = Catalog.read(survey / "catalog.parquet").select(
         [tile.id for tile in Catalog.read(survey / "catalog.parquet").tiles[:2]]
     )
-    # A surface over tiles has no steps beside roads.
-    run = Run.create(tmp_path / "run", load_config("production", ["fit.steps=false"]), catalog)
+    run = Run.create(tmp_path / "run", load_config("production"), catalog)
     run_tiles(run, SerialExecutor(), only=lambda tile: tile == catalog.tiles[0])
     view = flexroad.open_run(tmp_path / "run")
     grid = catalog.tiles[0].grid
