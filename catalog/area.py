@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import shapely
 from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Grid
-from flexroad.catalog.headers.open_vector import ERRORS, vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, in_its_encoding, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.vectors import layers, listed
 from flexroad.catalog.lazy import lazy
@@ -63,7 +64,8 @@ class Area:
                 )
             if layer is not None and layer not in found:
                 raise CatalogError(f"--area {path} has no layer {layer!r}; it has {listed(found) or 'none'}")
-            table = pyogrio.read_dataframe(name, layer=layer, columns=[]) if found else None
+            read = partial(pyogrio.read_dataframe, name, layer=layer, columns=[])
+            table = in_its_encoding(read)[0] if found else None
         except Refused as error:
             raise CatalogError(f"--area {path} {error}") from error
         except ERRORS as error:

@@ -24,6 +24,17 @@ def write(path: Path, shapes, crs: str | None = GRID.crs, layer: str | None = No
     return path
 
 
+def in_cp1252(path: Path, placeholder: str, text: str) -> Path:
+    """Write a text of the same length in place of another one in cp1252; the file says UTF-8."""
+    files = [path.with_suffix(".dbf")] if path.suffix == ".shp" else [path]
+    for file in files:
+        assert placeholder.encode() in file.read_bytes()
+        file.write_bytes(file.read_bytes().replace(placeholder.encode(), text.encode("cp1252")))
+    if path.suffix == ".shp":
+        path.with_suffix(".cpg").write_text("UTF-8")
+    return path
+
+
 def tile(*paths: Path, grid: Grid = GRID, core: Grid | None = None, crs: str | None = None) -> TileData:
     """Return a flat tile whose layer ``roads`` has these files; without files it has no such layer."""
     flat = np.zeros(grid.shape)

@@ -17,7 +17,7 @@ import shutil
 import sqlite3
 from collections.abc import Callable, Iterable
 from contextlib import closing
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -158,6 +158,20 @@ def in_its_encoding(read: Callable[..., T]) -> tuple[T, str]:
         return read(encoding="cp1252"), "cp1252"
     except UnicodeDecodeError:
         return read(encoding="latin1"), "latin1"
+
+
+def layer_info(file: str, layer: str, **more: Any) -> dict[str, Any]:
+    """Return what pyogrio knows of a layer; names of columns may be in another encoding than declared."""
+    info: dict[str, Any] = in_its_encoding(partial(pyogrio.read_info, file, layer=layer, **more))[0]
+    return info
+
+
+def encoding_note(name: str, encoding: str) -> str:
+    """Return a line about a file whose text `in_its_encoding` has read in another encoding than declared."""
+    return (
+        f"the text of {name} is not in the encoding that it declares, and was read as {encoding}; "
+        "write it as UTF-8, or name its encoding in the .cpg of a Shapefile"
+    )
 
 
 class _Copy:

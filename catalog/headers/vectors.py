@@ -16,7 +16,7 @@ from flexroad.catalog.crs import bounds_in, transformer
 from flexroad.catalog.crs_checks import angle_fault, crs_of, elsewhere
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds, union
-from flexroad.catalog.headers.open_vector import ERRORS, vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, layer_info, vector_name
 from flexroad.catalog.headers.rasters import matching
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.lazy import lazy
@@ -92,7 +92,7 @@ def layers(path: Path) -> dict[str, str]:
     """
     file = vector_name(path)
     kinds = {name: kind for name, kind in pyogrio.list_layers(file) if kind is not None}
-    counts = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
+    counts = {name: layer_info(file, name)["features"] for name in kinds}
     # OSM files do not know their number of features.
     return {
         name: f"{kind}, {count(counts[name], 'feature')}" if counts[name] >= 0 else kind
@@ -111,11 +111,11 @@ def opened(path: Path, crs: str | None, sublayer: str | None = None) -> VectorFi
         file = vector_name(path)
         found = layers(path)
         names = [name for name in found if sublayer in (None, name)]
-        infos = [pyogrio.read_info(file, layer=name) for name in names]
+        infos = [layer_info(file, name) for name in names]
         # The bounds of an OSM file are known only after reading all of it.
         no_bounds = any(info["driver"] == "OSM" for info in infos)
         if not no_bounds:
-            infos = [pyogrio.read_info(file, layer=name, force_total_bounds=True) for name in names]
+            infos = [layer_info(file, name, force_total_bounds=True) for name in names]
     except Refused as error:
         raise CatalogError(f"--roads {path} {error}") from error
     except ERRORS as error:

@@ -6,6 +6,7 @@ Lines have no width, so they make no mask: the file is entered in the catalog, f
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from flexroad.catalog import CatalogError, Grid
 from flexroad.catalog.crs import short
 from flexroad.catalog.crs_checks import angle_fault
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
-from flexroad.catalog.headers.open_vector import in_its_encoding, vector_name
+from flexroad.catalog.headers.open_vector import encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.headers.valid_cells import read_valid
 from flexroad.catalog.headers.vectors import VectorFile, layers, listed, opened
 from flexroad.catalog.lazy import lazy
@@ -30,7 +31,7 @@ from flexroad.pipeline.prepare.raster_writer import RasterWriter
 from flexroad.tasks import memory
 from flexroad.tasks.acquire.mesh.read import read_mesh
 from flexroad.tasks.acquire.mesh.sample import covered_cells, in_metres
-from flexroad.tasks.io.vectors import has_place
+from flexroad.tasks.io.vectors import ENCODING, has_place
 from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools
 
@@ -78,12 +79,13 @@ def add_roads(writer: RasterWriter, common: PrepareOptions) -> bool:
     """
     if common.roads is None:
         return False
-    mask = burn(common.roads, common.roads_layer, common.roads_where, writer.grid)
+    notes = list[str]()
+    mask = burn(common.roads, common.roads_layer, common.roads_where, writer.grid, notes.append)
     if mask is not None:
         writer.write("road_mask", writer.grid, mask)
     vectors = _vectors(common.roads, common.roads_layer)
     if vectors is not None:
-        writer.attach_roads(vectors, *([] if mask is not None else [_lines_note(common)]))
+        writer.attach_roads(vectors, *notes, *([] if mask is not None else [_lines_note(common)]))
     return mask is not None
 
 
@@ -104,7 +106,13 @@ def _lines_note(common: PrepareOptions) -> str:
     )
 
 
-def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools | None:
+def burn(
+    path: Path,
+    layer: str | None,
+    where: str | None,
+    grid: Grid,
+    notify: Callable[[str], None] = lambda line: None,
+) -> Bools | None:
     """Return the cells whose centre is road, ``(H, W)``, or None if the roads are lines.
 
     Parameters
@@ -117,6 +125,8 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools 
         SQL condition that selects features: ``class = 'road'``.
     grid : Grid
         The cells.
+    notify : callable
+        Receives one line about text in another encoding than declared.
 
     Raises
     ------
@@ -125,7 +135,7 @@ def burn(path: Path, layer: str | None, where: str | None, grid: Grid) -> Bools 
     """
     mask = _mesh(path, grid) if path.suffix.lower() in MESHES else _raster(path, grid)
     if mask is None:
-        features = _features(path, layer, where, grid)
+        features = _features(path, layer, where, grid, notify)
         if features is None:
             return None
         mask = cells(features.geometry.to_numpy(), grid)
@@ -180,11 +190,15 @@ def _raster(path: Path, grid: Grid) -> Bools | None:
     return road
 
 
-def _features(path: Path, layer: str | None, where: str | None, grid: Grid) -> Any:
+def _features(
+    path: Path, layer: str | None, where: str | None, grid: Grid, notify: Callable[[str], None]
+) -> Any:
     """Return the polygons of a vector file in the grid's CRS, or None if it holds lines."""
     if _osm(path, layer):
         return None
     features = _read(path, layer, where)
+    if encoding := features.attrs.get(ENCODING):
+        notify(f"--roads: {encoding_note(path.name, encoding)}")
     features = features[~(features.geometry.isna() | features.geometry.is_empty)].to_crs(grid.crs)
     features = features[has_place(features.geometry.to_numpy())]
     kinds = sorted(set(features.geom_type) - {*AREAS, *LINES})
@@ -220,7 +234,7 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
         if layer is not None and layer not in names:
             raise ConfigError(f"--roads {path} has no layer {layer!r}; it has {listed(found)}")
         read = partial(geopandas.read_file, file, layer=layer or names[0], where=where, rows=rows)
-        features, _ = in_its_encoding(read)
+        features, encoding = in_its_encoding(read)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, ValueError, OSError) as error:
         raise ConfigError(
             f"--roads {path} cannot be read as polygons, raster or mesh: {error}; also check --roads-where"
@@ -232,4 +246,5 @@ def _read(path: Path, layer: str | None, where: str | None, rows: int | None = N
     if features.empty:
         condition = f" where {where}" if where else ""
         raise ConfigError(f"{path} has no feature{condition} in layer {layer or names[0]!r}")
+    features.attrs[ENCODING] = encoding
     return features

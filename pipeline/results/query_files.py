@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import numpy as np
 import shapely
 
 from flexroad.catalog.crs import in_plan, is_geographic, same, short, transformer
-from flexroad.catalog.headers.open_vector import ERRORS, vector_name
+from flexroad.catalog.headers.open_vector import ERRORS, encoding_note, in_its_encoding, vector_name
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.lazy import lazy
 from flexroad.catalog.text import reason, shown
@@ -82,7 +83,7 @@ def read_points(path: Path, given: str | None = None, layer: str | None = None) 
         If ``given`` is no CRS.
     """
     if path.suffix.lower() in VECTOR_SUFFIXES:
-        return _points(read_features(path, given, layer), path)
+        return _points(*read_features(path, given, layer), path)
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -185,8 +186,8 @@ def _numbers(values: Sequence[str], lines: Sequence[int], where: str, comma: boo
     return numbers
 
 
-def read_features(path: Path, given: str | None, layer: str | None) -> Any:
-    """Return the features of a vector file as a GeoDataFrame with a CRS.
+def read_features(path: Path, given: str | None, layer: str | None) -> tuple[Any, str]:
+    """Return the features of a vector file as a GeoDataFrame with a CRS, and a note if there is one.
 
     Raises
     ------
@@ -201,30 +202,33 @@ def read_features(path: Path, given: str | None, layer: str | None) -> Any:
             raise ConfigError(f"{path}: no layer {layer!r}; it has {', '.join(spatial) or 'no features'}")
         if layer is None and len(spatial) > 1:
             raise ConfigError(f"{path}: has the layers {', '.join(spatial)}; name one with --layer")
-        table = pyogrio.read_dataframe(file, layer=layer or spatial[0], force_2d=True)
+        read = partial(pyogrio.read_dataframe, file, layer=layer or spatial[0], force_2d=True)
+        table, encoding = in_its_encoding(read)
     except Refused as error:
         raise ConfigError(f"{path} {error}") from error
     except ERRORS as error:
         text = error.strerror if isinstance(error, OSError) and error.strerror else reason(error)
         raise ConfigError(f"{path}: cannot be read as a vector file: {text}") from error
+    note = encoding_note(path.name, encoding) if encoding else ""
     if table.crs is None:
         if given is None:
             raise ConfigError(f"{path}: carries no CRS; give it with --crs, such as --crs EPSG:25832")
-        return table.set_crs(in_plan(given))
+        return table.set_crs(in_plan(given)), note
     crs = table.crs.to_wkt()
     if given is not None and not same(crs, given):
         raise ConfigError(f"{path}: is in {short(crs)}, not {short(given)}; leave the CRS out")
-    return table
+    return table, note
 
 
-def _points(table: Any, path: Path) -> Points:
+def _points(table: Any, note: str, path: Path) -> Points:
     table = table.explode(index_parts=False, ignore_index=True)
     shapes = table.geometry.to_numpy()
     others = [shape.geom_type for shape in shapes if shape is not None and shape.geom_type != "Point"]
     if others:
         raise ConfigError(f"{path}: has features of the type {others[0]}, not points; lines go to --line")
     attributes = pd.DataFrame(table.drop(columns=table.geometry.name))
-    return Points(attributes, shapely.get_x(shapes), shapely.get_y(shapes), table.crs.to_wkt(), vector=True)
+    x, y, notes = shapely.get_x(shapes), shapely.get_y(shapes), (note,) if note else ()
+    return Points(attributes, x, y, table.crs.to_wkt(), vector=True, notes=notes)
 
 
 def read_lines(given: str, crs: str | None, layer: str | None, run_crs: str) -> list[Floats]:
@@ -274,7 +278,7 @@ def _vertices(text: str) -> Floats:
 
 def _features(path: Path, crs: str | None, layer: str | None) -> tuple[list[Floats], str]:
     """Return the vertices of the lines of a vector file, and their CRS."""
-    table = read_features(path, crs, layer)
+    table, _ = read_features(path, crs, layer)
     shapes = [shape for shape in table.geometry if shape is not None and not shape.is_empty]
     others = [shape.geom_type for shape in shapes if not shape.geom_type.endswith("LineString")]
     if others:

@@ -27,7 +27,13 @@ from flexroad.catalog.crs import short, transformer
 from flexroad.catalog.crs_checks import crs_of
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import FARTHEST, Bounds
-from flexroad.catalog.headers.open_vector import ERRORS, in_its_encoding, vector_name
+from flexroad.catalog.headers.open_vector import (
+    ERRORS,
+    encoding_note,
+    in_its_encoding,
+    layer_info,
+    vector_name,
+)
 from flexroad.catalog.headers.refused import Refused
 from flexroad.catalog.headers.source_files import source_stat
 from flexroad.catalog.headers.vectors import bounds_of, listed
@@ -129,10 +135,7 @@ def encoding_notes(table: Any, path: Location) -> tuple[str, ...]:
     encoding = table.attrs.get(ENCODING)
     if not encoding:
         return ()
-    return (
-        f"roads: the text of {path.name} is not in the encoding that it declares, and was read as "
-        f"{encoding}; write it as UTF-8, or name its encoding in the .cpg of a Shapefile",
-    )
+    return (f"roads: {encoding_note(path.name, encoding)}",)
 
 
 def _error(request: Query, message: str) -> TaskError:
@@ -169,7 +172,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
             )
         # Only where the file's CRS may be replaced: the bounds of a GeoJSON take a reading of all of it.
         bounds = bool(request.bare_crs) and set(names) != set(OSM)
-        infos = (pyogrio.read_info(file, layer=name, force_total_bounds=bounds) for name in names)
+        infos = (layer_info(file, name, force_total_bounds=bounds) for name in names)
         return tuple(_described(request, name, info) for name, info in zip(names, infos, strict=True))
     except ERRORS as error:
         raise _error(request, f"cannot be read as vectors: {reason(error)}") from error
@@ -177,7 +180,7 @@ def _layers(request: Query, version: FileStat) -> tuple[_Layer, ...]:
 
 def _listed(file: str, kinds: Mapping[str, str | None]) -> str:
     """Return the layers of an opened file for a message, with type and number of features."""
-    numbers = {name: pyogrio.read_info(file, layer=name)["features"] for name in kinds}
+    numbers = {name: layer_info(file, name)["features"] for name in kinds}
     return listed(
         {name: f"{kinds[name] or 'no geometry'}, {count(n, 'feature')}" for name, n in numbers.items()}
     )

@@ -11,6 +11,7 @@ from pyproj import Transformer
 from flexroad.catalog import Grid
 from flexroad.catalog.area import Area
 from flexroad.catalog.errors import CatalogError
+from tests import make_roads
 
 GRIDS = [Grid("EPSG:25832", 500000.0 + 100 * i, 5600100.0, 1.0, 100, 100) for i in range(5)]
 """Five tiles in a row."""
@@ -32,6 +33,13 @@ def test_area_of_each_format_and_crs_touches_the_tiles_under_it(tmp_path, suffix
         pytest.skip("GeoJSON has longitude and latitude")
     path = written(tmp_path / f"area{suffix}", rectangle(150, 250), rectangle(401, 420), crs=crs)
     assert Area.read(path).touched(GRIDS) == [False, True, True, False, True]
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp"])
+def test_area_with_columns_in_another_encoding_than_declared_is_read(tmp_path, suffix):
+    path = make_roads.write(tmp_path / f"area{suffix}", [rectangle(150, 250)], xxxxxxx=["stone"])
+    make_roads.in_cp1252(path, "xxxxxxx", "Straßen")
+    assert Area.read(path).touched(GRIDS) == [False, True, True, False, False]
 
 
 def test_area_that_ends_on_an_edge_does_not_touch_the_tile_beyond_it(tmp_path):

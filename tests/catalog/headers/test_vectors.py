@@ -7,11 +7,12 @@ import pytest
 from shapely import LineString, box
 
 from flexroad.catalog import Catalog, CatalogError
+from flexroad.catalog.headers.vectors import layers
 from flexroad.catalog.sources import nrw, rasters
 from flexroad.tasks.io.vectors import Query, read_near
 from tests.make_rasters import write
+from tests.make_roads import in_cp1252, write_osm
 from tests.make_roads import write as write_roads
-from tests.make_roads import write_osm
 
 HEIGHTS = np.full((250, 750), 100, np.float32)
 """Three tiles side by side, from 295500 to 296250 east."""
@@ -45,6 +46,15 @@ def test_roads_file_is_listed_by_tiles_in_reach(survey, tmp_path):
     (again, *_) = Catalog.read(survey / "catalog.parquet").tiles
     assert again.layer("roads").files == ("a.gpkg",)
     assert again.paths(again.layer("roads"))[0].is_file()
+
+
+@pytest.mark.parametrize("suffix", ["shp", "gpkg", "fgb", "geojson"])
+def test_roads_file_with_columns_in_another_encoding_than_declared_is_listed(survey, suffix):
+    road = LineString([(295_500, 5_629_300), (295_600, 5_629_300)])
+    path = write_roads(survey / f"a.{suffix}", [road], xxxxxxx=["stone"])
+    in_cp1252(path, "xxxxxxx", "Straßen")
+    assert layers(path) == {"a": "LineString, 1 feature"}
+    assert named(indexed(survey, path)) == [[path.name], [path.name], []]
 
 
 def test_roads_file_outside_folder_in_other_crs_is_used(survey, tmp_path):

@@ -15,6 +15,8 @@ from shapely import LineString, MultiLineString, MultiPoint, Point
 from flexroad import open_run
 from tests import command_line
 from tests.make_rasters import UTM, write
+from tests.make_roads import in_cp1252
+from tests.make_roads import write as write_roads
 
 WEST, SOUTH, SIZE = 500_000.0, 5_600_000.0, 40
 EAST_SLOPE, NORTH_SLOPE = 0.05, -0.02
@@ -198,6 +200,20 @@ def test_profile_of_several_lines_counts_them(run, flexroad, tmp_path):
     assert list(table.line) == [1] * 4 + [2] * 3 + [3] * 4
     assert list(table.distance_m) == [0, 1, 2, 3, 0, 1, 2, 0, 1, 2, 3]
     assert set(table.grade_percent.round(2)) == {5.0, -2.0}
+
+
+@pytest.mark.parametrize("suffix", ["shp", "gpkg"])
+def test_query_of_vector_text_in_another_encoding_than_declared_is_read_with_a_note(
+    run, flexroad, tmp_path, suffix
+):
+    path = write_roads(tmp_path / f"a.{suffix}", [Point(*POINTS[0])], xxxxxxx=["yyyyyyy"])
+    in_cp1252(in_cp1252(path, "xxxxxxx", "Straßen"), "yyyyyyy", "königli")
+    said = flexroad("query", run, "--points", path).expected(0)
+    (row,) = pd.read_csv(io.StringIO(said.out)).to_dict("records")
+    assert row["Straßen"] == "königli"
+    assert row["height_m"] == pytest.approx(ground(*POINTS[0]), abs=1e-3)
+    (note,) = [line for line in said.err.splitlines() if "encoding" in line]
+    assert f"the text of {path.name} is not in the encoding that it declares, and was read as cp1252" in note
 
 
 def test_query_of_points_beyond_the_survey_gives_no_heights(flexroad, tmp_path):

@@ -59,6 +59,11 @@ def test_burn_reads_text_in_another_encoding_than_declared(tmp_path):
     path.with_suffix(".cpg").write_text("UTF-8")
     check_roads(PrepareOptions(roads=path))
     assert burn(path, None, None, GRID).sum() == 1000
+    _, notes = published(tmp_path / "out", path)
+    assert [note for note in notes if "encoding" in note] == [
+        "--roads: the text of a.shp is not in the encoding that it declares, and was read as cp1252; "
+        "write it as UTF-8, or name its encoding in the .cpg of a Shapefile"
+    ]
 
 
 @pytest.mark.parametrize("suffix", ["shp", "fgb", "geojson"])

@@ -11,7 +11,7 @@ import shapely
 from flexroad.tasks.roads.centre_lines import from_table, read_centre_lines
 from flexroad.tasks.roads.rasterise import Options
 from flexroad.tasks.types import Source
-from tests.make_roads import GRID, on_grid, write
+from tests.make_roads import GRID, in_cp1252, on_grid, write
 
 ALONG = shapely.LineString([(0, 0), (10, 0), (20, 5)])
 
@@ -97,6 +97,17 @@ def with_name(path, data):
             file.execute("UPDATE a SET name = CAST(? AS TEXT)", (data,))
             file.commit()
     return path
+
+
+@pytest.mark.parametrize("suffix", ["shp", "gpkg", "fgb", "geojson"])
+def test_names_of_columns_in_another_encoding_than_declared_are_read_with_a_note(suffix, tmp_path):
+    line = shapely.LineString(on_grid((0, 20), (90, 20)))
+    path = write(tmp_path / f"a.{suffix}", [line], name=["Lane"], width_m=[6.0], xxxxxxx=["stone"])
+    in_cp1252(path, "xxxxxxx", "Straßen")
+    found = read_centre_lines(Source("roads", (path,)), GRID.bounds, GRID.crs, Options())
+    assert [(line.name, line.width_m) for line in found.lines] == [("Lane", 6.0)]
+    (note,) = [note for note in found.notes if "encoding" in note]
+    assert "was read as cp1252;" in note
 
 
 @pytest.mark.parametrize("suffix", ["shp", "gpkg"])
