@@ -1,19 +1,23 @@
-"""DSM against DTM on tiles of a catalog, before a run: units, vertical references, steps between sheets."""
+"""DSM against DTM on tiles, before and after a run: units, vertical references, steps between sheets."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from statistics import median
+from typing import Any
 
 from flexroad.catalog.text import count, some
 from flexroad.pipeline.check.finding import Finding
 from flexroad.pipeline.check.trial import Trial
-from flexroad.tasks.io.height_offset import on_tiles
+from flexroad.tasks.io.height_offset import FAR_M, on_tiles
 
 STEP_M = 0.3
 """Change of the offset between tiles that is taken for another vertical reference (m)."""
 CALM_M = 0.1
 """Largest spread of the offset of a tile that is compared with those of others (m)."""
+MOST_ROAD = 0.9
+"""Share of a tile's road from which it lies off the DTM as a whole."""
 
 
 def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
@@ -30,6 +34,33 @@ def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
     yield from (Finding(line, fault=True) for line in lines)
     if not lines and (step := _step(trials)):
         yield Finding(step, fault=True)
+
+
+def road_is_off(row: Mapping[str, Any]) -> bool:
+    """Return whether nearly all road of a tile, by its metrics, lies off the DTM, and by less than `FAR_M`.
+
+    Then DSM or DTM may have another vertical reference; `load` notes an offset from `FAR_M` on.
+    """
+    return (row.get("off_dtm_road") or 0.0) >= MOST_ROAD and abs(row.get("off_dtm_m") or FAR_M) < FAR_M
+
+
+def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
+    """Yield a line if the road of some tiles lies above the DTM as a whole, and one if it lies below.
+
+    Parameters
+    ----------
+    rows : iterable of Mapping
+        Metrics of these tiles (`road_is_off`).
+    tiles : int
+        Number of tiles of the run.
+    """
+    off = [row["off_dtm_m"] for row in rows]
+    for side, metres in (("above", [m for m in off if m > 0]), ("below", [-m for m in off if m < 0])):
+        if metres:
+            yield (
+                f"the road lies {median(metres):.2f} m {side} the DTM on {len(metres)} of "
+                f"{count(tiles, 'tile')}: files of two vertical references?"
+            )
 
 
 def _step(trials: Sequence[Trial]) -> str | None:

@@ -16,6 +16,7 @@ from rich.console import Console
 from flexroad.catalog.area import Area
 from flexroad.catalog.storage.paths import parse_location
 from flexroad.catalog.text import count
+from flexroad.pipeline.check.heights import road_is_off, road_step
 from flexroad.pipeline.cli import options
 from flexroad.pipeline.cli.command import Command, group
 from flexroad.pipeline.cli.dry_run import plan
@@ -34,6 +35,7 @@ from flexroad.pipeline.run.progress import FIRST_S, ProgressDisplay, said_repeat
 from flexroad.pipeline.run.record import Run
 from flexroad.pipeline.run.status import progress, summary
 from flexroad.pipeline.run.summary import Summary
+from flexroad.pipeline.store.records import MetricsRow
 from flexroad.pipeline.worker.tile import TileResult
 from flexroad.tasks.io.height_offset import is_offset, on_tiles
 
@@ -213,6 +215,8 @@ class Shown(Observer):
         """Progress of the tiles, from the first one on until the block ends."""
         self.offsets: list[str] = []
         """Notes of tiles whose DSM lies off the DTM as a whole."""
+        self.rows: list[MetricsRow] = []
+        """Metrics of tiles, of any variant, whose road lies off the DTM as a whole."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Shown:
@@ -253,6 +257,7 @@ class Shown(Observer):
     def tile(self, result: TileResult) -> None:
         """Add a tile to the progress and to the file for Prometheus."""
         self.offsets += filter(is_offset, result.notes)
+        self.rows += filter(road_is_off, result.rows)
         if self.display:
             self.display(result)
         if self.outcome.textfile is not None:
@@ -278,6 +283,9 @@ def _process(prepared: Prepared, verify: bool, shown: Shown) -> None:
         echo("nothing had changed; `flexroad rerun RUN --from load` recomputes everything")
     for line in on_tiles(shown.offsets, summary.tiles):
         warn(f"{line} `flexroad catalog check` compares them")
+    main = prepared.run.config.export.variants[0]
+    for line in road_step([row for row in shown.rows if row["variant"] == main], summary.tiles):
+        warn(f"{line} `flexroad catalog check` compares them", "note")
     if summary.done and summary.without_roads == summary.done and not shown.offsets:
         warn(
             "no tile of this run has a road that the filter keeps; if there are roads, check the road source "

@@ -100,10 +100,12 @@ def _resampled_together(groups: Sequence[Sequence[RasterWindow]], grid: Grid) ->
     # The coarsest first: its cells beyond its border are farthest from the borders of the others, and these
     # then interpolate up to their own borders.
     for number in sorted(range(len(sheets)), key=lambda number: -_cell_m2(sheets[number].lattice, grid)):
-        if not sheets[number].lattice.fits(grid):
-            others = [*known[:number], *known[number + 1 :]]
-            known[number] = _extended(known[number], sheets[number], others, grid)
-    return [resample_to(sheet, grid, Resampling.bilinear) for sheet in known]
+        others = [*known[:number], *known[number + 1 :]]
+        known[number] = _extended(known[number], sheets[number], others, grid)
+    return [
+        resample_to(sheet if sheet.lattice.fits(grid) else wide, grid, Resampling.bilinear)
+        for sheet, wide in zip(sheets, known, strict=True)
+    ]
 
 
 def _on_grid(group: Sequence[RasterWindow], grid: Grid) -> RasterWindow:

@@ -104,5 +104,30 @@ def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
     assert line.startswith("DSM minus DTM is -0.50 m on 1 tile (dtm 2.tif) and 0.00 m on 3 tiles (")
 
 
+@pytest.mark.parametrize(
+    ("step", "line"),
+    [
+        (0.4, "note: the road lies 0.40 m below the DTM on 1 of 2 tiles: files of two vertical references? "),
+        (
+            -0.7,
+            "note: the road lies 0.70 m above the DTM on 1 of 2 tiles: files of two vertical references? ",
+        ),
+        (0.2, ""),
+    ],
+)
+def test_run_names_a_step_between_tiles(tmp_path, flexroad, step, line):
+    write(tmp_path / "dsm.tif", PLANE, WEST, NORTH)
+    write(tmp_path / "dtm.tif", (PLANE + step * EAST).astype(np.float32), WEST, NORTH)
+    road = np.zeros(PLANE.shape, np.uint8)
+    road[26:34] = 1
+    write(tmp_path / "road.tif", road, WEST, NORTH)
+    layers = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
+    Catalog(index(tmp_path, layers, tile_size_m=60).tiles).write(tmp_path / "catalog.json")
+    run = ["run", "--catalog", tmp_path / "catalog.json", "--out", tmp_path / "run", "--executor", "serial"]
+    for _ in ("computed", "up to date"):
+        notes = [text for text in flexroad(*run).expected(0).err.splitlines() if text.startswith("note: ")]
+        assert notes == ([f"{line}`flexroad catalog check` compares them"] if line else [])
+
+
 def test_synthetic_survey_is_clean(survey):
     assert list(expected_failures(Catalog.read(survey).tiles, load_config("paper"), LAYERS)) == []
