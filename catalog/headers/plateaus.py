@@ -46,19 +46,20 @@ def plateau_notes(
         Where the files that a VRT names may lie; None: anywhere on disk.
     """
     step = -(-len(files) // MOST_FILES) or 1
-    by_value: dict[float, list[str]] = defaultdict(list)
+    by_value: dict[tuple[float, float], list[str]] = defaultdict(list)
     for name in list(files)[::step]:
-        for value, share in _plateaus(files[name], allowed):
-            by_value[value].append(f"{name} ({share:.1%})")
+        for height, value, share in _plateaus(files[name], allowed):
+            by_value[height, value].append(f"{name} ({share:.1%})")
+    # GDAL takes the value in the file, before its scale and offset, and all its digits.
     return [
-        f"{layer}: many cells have the exact height {value:g}: {some(names)}; if they are voids, "
-        f"declare it, e.g. gdal_translate -a_nodata {value:g} FILE NEW.tif"
-        for value, names in by_value.items()
+        f"{layer}: many cells have the exact height {height:g}: {some(names)}; if they are voids, "
+        f"declare it, e.g. gdal_translate -a_nodata {value:.17g} FILE NEW.tif"
+        for (height, value), names in by_value.items()
     ]
 
 
-def _plateaus(path: Location, allowed: AllowedFolders | None) -> Iterable[tuple[float, float]]:
-    """Return the values that many cells of a raster have, and the share of its cells (0 to 1)."""
+def _plateaus(path: Location, allowed: AllowedFolders | None) -> Iterable[tuple[float, float, float]]:
+    """Return heights that many cells of a raster have, their values in the file, and their shares (0 to 1)."""
     suffix = Path(str(path)).suffix.lower()
     try:
         if suffix == ".gz" or (suffix in AS_TEXT and Path(str(path)).stat().st_size > MAX_TEXT_BYTES):
@@ -74,7 +75,7 @@ def _plateaus(path: Location, allowed: AllowedFolders | None) -> Iterable[tuple[
         # A file of one height, and no other, has no voids in it.
         return []
     return [
-        (float(values[n] * scale + offset), float(counts[n] / cells))
+        (float(values[n] * scale + offset), float(values[n]), float(counts[n] / cells))
         for n in np.flatnonzero((counts > SHARE * cells) & np.isfinite(values))
         if not np.issubdtype(values.dtype, np.integer) or _is_alone(values, counts, int(n))
     ]

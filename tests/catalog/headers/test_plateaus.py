@@ -42,11 +42,19 @@ def test_heights_in_whole_metres_are_no_plateaus_but_voids_among_them_are(tmp_pa
     assert "many cells have the exact height 0: a.tif (12.5%);" in note
 
 
-def test_value_of_a_scaled_band_is_its_height(tmp_path):
+def test_value_of_a_scaled_band_is_its_height_and_the_remedy_has_the_stored_one(tmp_path):
     stored = np.round(PLANE * 100).astype(np.int32)
-    stored[:5] = 0
+    stored[:5] = 7
     (note,) = notes(write(tmp_path / "a.tif", stored, scale=(0.01, -50.0)))
-    assert "many cells have the exact height -50: a.tif (12.5%);" in note
+    assert "many cells have the exact height -49.93: a.tif (12.5%);" in note
+    assert note.endswith("gdal_translate -a_nodata 7 FILE NEW.tif")
+
+
+def test_remedy_has_all_digits_of_the_value(tmp_path):
+    heights = PLANE.astype(np.float32)
+    heights[:5] = np.finfo(np.float32).min
+    (note,) = notes(write(tmp_path / "a.tif", heights))
+    assert note.endswith("gdal_translate -a_nodata -3.4028234663852886e+38 FILE NEW.tif")
 
 
 def test_files_with_the_same_value_are_one_note(tmp_path):
