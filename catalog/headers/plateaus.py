@@ -59,7 +59,7 @@ def plateau_notes(
 
 
 def _plateaus(path: Location, allowed: AllowedFolders | None) -> Iterable[tuple[float, float, float]]:
-    """Return heights that many cells of a raster have, their values in the file, and their shares (0 to 1)."""
+    """Return heights that many cells of a raster have, the values in the file, and the shares (0 to 1)."""
     suffix = Path(str(path)).suffix.lower()
     try:
         if suffix == ".gz" or (suffix in AS_TEXT and Path(str(path)).stat().st_size > MAX_TEXT_BYTES):

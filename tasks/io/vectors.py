@@ -61,6 +61,8 @@ OTHER_TAGS = "other_tags"
 """Column in which GDAL's OSM driver packs the tags it has no column for: ``"lanes"=>"2","width"=>"7"``."""
 ENCODING = "encoding"
 """Attribute of a table whose text is not in the encoding that its file declares: the one it was read in."""
+MOST_NAMED = 12
+"""Number of columns that an error names."""
 WHOLE = 8
 """Memory that all features of a file take, as a multiple of its size."""
 TAG = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
@@ -88,7 +90,10 @@ class _Layer:
     name: str
     crs: str
     indexed: bool
+    fields: tuple[str, ...]
+    """All columns."""
     columns: tuple[str, ...]
+    """Those that are read."""
     where: str | None
     tested: tuple[str, ...]
     """Further columns that ``where`` may name: most drivers filter only by columns that are read."""
@@ -227,6 +232,7 @@ def _described(request: Query, name: str, info: Any) -> _Layer:
         name=name,
         crs=crs,
         indexed=info["capabilities"]["fast_spatial_filter"],
+        fields=tuple(info["fields"]),
         columns=read,
         where=where,
         tested=tuple(field for field in info["fields"] if field not in read and field.lower() in named),
@@ -243,7 +249,7 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
         table = table.set_crs(layer.crs, allow_override=True).to_crs(request.crs)
     except (RuntimeError, ValueError, ProjError, CatalogError) as error:
         # A failed transformation also raises RuntimeError.
-        hint = "; check segment.where" if request.where else ""
+        hint = f"; check segment.where: its columns are {_names(layer)}" if request.where else ""
         # SQLite's error follows GDAL's complete query, which has the square.
         why = reason(error).rpartition(f"({layer.where}): ")[2]
         raise _error(request, f"cannot be read as roads: {why}{hint}") from error
@@ -254,6 +260,12 @@ def _part(request: Query, version: FileStat, layer: _Layer, square: Bounds | Non
     table = _unpacked(table if square is None else _touching(table, square), request.columns)
     table.attrs = attributes
     return table
+
+
+def _names(layer: _Layer) -> str:
+    """Return the names of a layer's columns for a message."""
+    more = len(layer.fields) - MOST_NAMED
+    return ", ".join(layer.fields[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def has_place(features: NDArray[np.object_]) -> Bools:

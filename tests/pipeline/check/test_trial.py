@@ -100,7 +100,11 @@ def two_layers(path):
         (without_crs, {}, "carries no CRS; give it one, e.g. ogr2ogr -a_srs EPSG:25832 NEW "),
         (two_layers, {}, "has 2 layers: "),
         (None, {"layer": "streets"}, "has no layer 'streets'; it has "),
-        (None, {"where": "lanes > 2"}, "cannot be read as roads: no such column: lanes; check segment.where"),
+        (
+            None,
+            {"where": "lanes > 2"},
+            "cannot be read as roads: no such column: lanes; check segment.where: its columns are highway",
+        ),
     ],
 )
 def test_roads_that_cannot_be_read_are_named_for_all_tiles(survey, config, told, change, segment, message):
