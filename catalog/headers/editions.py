@@ -27,6 +27,8 @@ DATE = re.compile(
     r"(?<!\d)(19[5-9]\d|20\d\d)(?:[-_.]?(0[1-9]|1[0-2])(?:[-_.]?(0[1-9]|[12]\d|3[01]))?)?(?!\d)"
 )
 """A year in a file's name, with month and day if it has them."""
+DAY_FIRST = re.compile(r"(?<![\d.])(\d\d)\.(\d\d)\.(\d{4})(?!\d)")
+"""A date as in ``31.12.2023``."""
 APART = timedelta(days=1)
 """Least difference of the files' times that tells their age: an archive is unpacked in one go."""
 MOST_COMPARED = 4
@@ -118,7 +120,8 @@ def _aged(files: Sequence[RasterFile], one: int, other: int) -> _Pair:
 
 def _dates(name: str) -> set[str]:
     """Return the dates in a file's name as digits: ``2020``, ``202005`` or ``20200501``."""
-    return {"".join(part or "" for part in parts) for parts in DATE.findall(name)}
+    dated = DAY_FIRST.sub(r"\3-\2-\1", name)
+    return {"".join(part or "" for part in parts) for parts in DATE.findall(dated)}
 
 
 def _some(pairs: Sequence[_Pair]) -> list[_Pair]:

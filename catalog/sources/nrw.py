@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from flexroad.catalog.crs import short
 from flexroad.catalog.errors import CatalogError
 from flexroad.catalog.grid import Bounds
+from flexroad.catalog.headers.editions import newest_first
 from flexroad.catalog.headers.mask_values import mask_notes
 from flexroad.catalog.headers.open_raster import ERRORS, open_raster
 from flexroad.catalog.headers.plateaus import plateau_notes
@@ -90,7 +91,7 @@ def index(
     roads_layer: str | None = None,
     reproject: bool = False,
 ) -> TilingResult:
-    """Cut the downloads below a folder into tiles; where years overlap, the newest one is used.
+    """Cut the downloads below a folder into tiles; of files of the same ground the newest is used first.
 
     Parameters
     ----------
@@ -122,7 +123,7 @@ def index(
     ------
     CatalogError
         If there is no usable surface model, no usable file matches the pattern of the mask or the roads, or
-        no tile is left.
+        no tile is left; or as of `newest_first`.
     """
     root = root.resolve()
     downloads, left_out = _downloads(root)
@@ -137,12 +138,15 @@ def index(
         files, misplaced = _placed(root, files, named)
         left_out += [*skipped, *misplaced]
         if files:
-            layer_files[layer] = files
+            layer_files[layer], lines = newest_first(root, layer, files)
+            notes += lines
     if "dsm" not in layer_files:
         why = left_out[0] if left_out else there(root)
         raise CatalogError(f"no usable dom1_32_E_N_1_nw*.tif, .xyz or .xyz.gz below {root}; {why}")
     if road_mask is not None:
-        layer_files["road_mask"], skipped = scan(root, "road_mask", road_mask, CRS, allow)
+        masks, skipped = scan(root, "road_mask", road_mask, CRS, allow)
+        layer_files["road_mask"], lines = newest_first(root, "road_mask", masks)
+        notes += lines
         left_out += skipped
         notes += mask_notes(root, "road_mask", [file.name for file in layer_files["road_mask"]], road_values)
     for layer in (heights for heights in HEIGHTS if heights in layer_files):

@@ -1,4 +1,5 @@
 import gzip
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -102,9 +103,25 @@ def test_index_several_years_uses_newest(tmp_path):
     for year in (2016, 2022, 2019):
         write(tmp_path / f"dom1_32_356_5699_1_nw_{year}.tif", np.full((250, 250), year - 2000.0), WEST, NORTH)
     write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
-    (tile,) = index(tmp_path).tiles
+    result = index(tmp_path)
+    (tile,) = result.tiles
     assert tile.datetime.year == 2022
     assert (load(tile, Options()).dsm == 22).all()
+    (note,) = (note for note in result.notes if "same ground" in note)
+    assert note.startswith(
+        "dsm: 3 pairs of files cover the same ground; by the dates in their names, "
+        "dom1_32_356_5699_1_nw_2022.tif is used before "
+    )
+
+
+def test_index_files_of_unknown_age_that_differ_are_refused(tmp_path):
+    for folder, height in (("a", 20.0), ("b", 21.0)):
+        path = tmp_path / folder / "dom1_32_356_5699_1_nw.tif"
+        write(path, np.full((250, 250), height), WEST, NORTH)
+        os.utime(path, (1.7e9, 1.7e9))
+    write(tmp_path / "dgm1_32_356_5699_1_nw_2016.tif", np.zeros((250, 250)), WEST, NORTH)
+    with pytest.raises(CatalogError, match="dsm: a/dom1_32_356_5699_1_nw.tif and b/.* cover the same ground"):
+        index(tmp_path)
 
 
 def test_index_date_tag_in_year_of_name_is_used(tmp_path):
