@@ -96,7 +96,7 @@ def experiment(tile, store: ArtefactStore) -> list[dict[str, float | str]]:
         for name, kept in roads.items():
             surface = function(data, kept, options["fit"])
             mesh = sample.sample(surface, road, kept, options["sample"])
-            metrics = evaluate.evaluate(mesh, data, road, options["evaluate"])
+            metrics = evaluate.evaluate(mesh, data, road, surface, options["evaluate"])
             rows.append(
                 {
                     "fit": fit_name,

@@ -75,7 +75,7 @@ def results_of(tile, store: ArtefactStore) -> Iterator[dict[str, Any]]:
                 options = nurbs.Options.model_validate(chain["fit"].model_dump() | {option: value})
                 surface = nurbs.fit(data, clusters, options)
                 mesh = sample.sample(surface, road, clusters, chain["sample"])
-                metrics = evaluate.evaluate(mesh, data, road, chain["evaluate"])
+                metrics = evaluate.evaluate(mesh, data, road, surface, chain["evaluate"])
                 figures = {figure: getattr(metrics, figure) for figure in FIGURES}
                 yield {"option": option, "value": value, "variant": variant} | figures
     print(tile.id, file=sys.stderr, flush=True)

@@ -104,7 +104,7 @@ def figures_of(surface, data, road, clusters, chain) -> dict[str, float]:
     folds = folded(surface) if isinstance(surface, MovingNurbs) else 0.0
     try:
         mesh = sample.sample(surface, road, clusters, chain["sample"])
-        metrics = evaluate.evaluate(mesh, data, road, chain["evaluate"])
+        metrics = evaluate.evaluate(mesh, data, road, surface, chain["evaluate"])
     except TaskError as error:
         print(data.tile_id, error, file=sys.stderr)
         return dict.fromkeys(FIGURES, float("nan")) | {"folded": folds}

@@ -247,6 +247,12 @@ class Metrics:
     """Share of the core's reference cells that are road by the evaluation mask."""
     completeness: float
     """Share of the core's reference cells the mesh has a height for."""
+    mesh_p95_road_m: float
+    """95th percentile of the vertical distance of the mesh from the surface that it samples, over the road
+    cells of the raw mask."""
+    mesh_max_road_m: float
+    mesh_p95_terrain_m: float
+    mesh_max_terrain_m: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,6 +123,7 @@ def _written(
         "title": kind.title,
         "version": kind.version,
         "precision_m": kind.precision_m,
+        **({"mesh_distances": source.mesh_distances} if kind.of_meshes else {}),
         "files": len(files),
         "bytes": sum(files.values()),
         **({"datum": options.datum.text} if kind.needs_datum and options.datum else {}),

@@ -168,6 +168,8 @@ class Format:
     """Whether heights above the ellipsoid are needed."""
     check: Check | None = None
     """Raises an error, before anything is written, if the format cannot be."""
+    of_meshes: bool = False
+    """Whether it has the run's meshes; the manifest then says how far they are from their surfaces."""
 
 
 def write_landxml(
@@ -250,10 +252,16 @@ def _along_roads(title: str, version: int, write: Write) -> Format:
 
 
 FORMATS = {
-    "3dtiles": Format("3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True),
-    "landxml": Format("LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001),
-    "cityjson": Format("CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001),
-    "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001),
+    "3dtiles": Format(
+        "3D Tiles 1.1, for globes", tiles3d.write_tilesets, tiles3d.VERSION, 0.002, True, of_meshes=True
+    ),
+    "landxml": Format(
+        "LandXML 1.2, for civil engineering", write_landxml, landxml.VERSION, 0.0001, of_meshes=True
+    ),
+    "cityjson": Format(
+        "CityJSONSeq 2.0, for city models", write_cityjson, cityjson.VERSION, 0.001, of_meshes=True
+    ),
+    "obj": Format("OBJ, for modelling", write_obj, obj.VERSION, 0.0001, of_meshes=True),
     "heightfield": Format(
         "16-bit height fields, for game engines", height_fields.write_fields, height_fields.VERSION, None
     ),

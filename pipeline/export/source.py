@@ -125,6 +125,13 @@ class Source:
         return self.run.origin
 
     @property
+    def mesh_distances(self) -> dict[str, float]:
+        """The largest distances of the meshes from their surfaces (m), by column of metrics.parquet."""
+        tiles = [snapshot.mesh_distances for snapshot in self.snapshots]
+        names = dict.fromkeys(name for tile in tiles for name in tile)
+        return {name: max(tile[name] for tile in tiles if name in tile) for name in names}
+
+    @property
     def place(self) -> Georeference:
         """What local coordinates of files are relative to: the run's origin, at the height 0."""
         return Georeference(self.crs, (*self.origin, 0.0), self.vertical)

@@ -27,7 +27,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "ecsrc": ("load", "segment"),
     "fit": ("load", "ecsrc"),
     "sample": ("fit", "segment", "ecsrc"),
-    "evaluate": ("sample", "load", "segment"),
+    "evaluate": ("sample", "load", "segment", "fit"),
     "assess": ("load", "segment", "ecsrc", "fit"),
 }
 """The stages of the paper, in its order, and the stages whose results their functions take, in that order."""

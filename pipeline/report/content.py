@@ -33,6 +33,8 @@ FURTHER = {
     "rmse_terrain_m": "RMSE terrain (m)",
     "nmad_road_m": "NMAD road (m)",
     "p95_road_m": "p95 road (m)",
+    "mesh_p95_road_m": "mesh distance road p95 (m)",
+    "mesh_p95_terrain_m": "mesh distance terrain p95 (m)",
     "completeness": "completeness",
     "seconds": "seconds",
 }

@@ -7,8 +7,9 @@ is kept of a tile are fingerprints, not its graph: 10,000 graphs would be large.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
@@ -28,7 +29,7 @@ from flexroad.pipeline.run.status import Folders, TileStatus, peek_statuses
 from flexroad.pipeline.store import checked_json
 from flexroad.pipeline.store.artefacts import ArtefactStore
 from flexroad.pipeline.store.products import TileProducts
-from flexroad.pipeline.store.records import DONE, MarkerStat, from_item
+from flexroad.pipeline.store.records import DONE, MarkerStat, MeshDistances, from_item, with_distances
 from flexroad.pipeline.worker.evaluator import Evaluator, StageError
 from flexroad.tasks.quality import assess
 from flexroad.tasks.quality.estimate import compare
@@ -78,12 +79,19 @@ class Snapshot:
     """Name, size and version of its marker; None if it had none."""
     files: bytes = b""
     """Hash of the sizes and times of all its files (`FileStates`); empty if they are not to be compared."""
+    mesh_distances: dict[str, float] = field(default_factory=dict)
+    """Distances of its mesh from its surface (m) by column; empty if it is of an older version."""
 
     @classmethod
     def of(cls, status: TileStatus, variant: str, files: bytes = b"") -> Snapshot:
         """Return that of a tile whose state has just been checked."""
         graph, record = status.graph, status.last_record
-        return cls(graph.fingerprint, graph.variants[variant], record.marker if record else None, files)
+        if record is None:
+            return cls(graph.fingerprint, graph.variants[variant], None, files)
+        distances = MeshDistances()
+        deque(with_distances(record.rows, distances), maxlen=0)
+        own = distances.get(variant, {})
+        return cls(graph.fingerprint, graph.variants[variant], record.marker, files, own)
 
 
 class FileStates:

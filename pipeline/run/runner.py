@@ -40,7 +40,15 @@ from flexroad.pipeline.run.status import (
 )
 from flexroad.pipeline.run.summary import Summary, read_summary, summarise, write_summary
 from flexroad.pipeline.store.database import RunDatabase
-from flexroad.pipeline.store.records import DONE, Failure, TileRecord, TileState, utc_now
+from flexroad.pipeline.store.records import (
+    DONE,
+    Failure,
+    MeshDistances,
+    TileRecord,
+    TileState,
+    utc_now,
+    with_distances,
+)
 from flexroad.pipeline.store.tables import METRICS, PREVIOUS, write_tables
 from flexroad.pipeline.worker.shared_files import SharedFiles
 from flexroad.pipeline.worker.tile import (
@@ -252,6 +260,7 @@ def _close(
     """
     refused = str(error) if isinstance(error, ConfigError) else ""
     interrupted = isinstance(error, KeyboardInterrupt)
+    distances = MeshDistances()
     summary = replace(
         _final_summary(run, database, start, plan, interrupted),
         interrupted=interrupted,
@@ -261,12 +270,19 @@ def _close(
         summary = replace(summary, new=plan.new, changed=plan.changed, vanished=plan.vanished)
         if plan.todo:
             _keep_previous(run.path, run.config.cluster.flush)
-        write_tables(run.path, database.rows(), database.failures(), run.config.cluster.flush)
+        rows = with_distances(database.rows(), distances)
+        write_tables(run.path, rows, database.failures(), run.config.cluster.flush)
         states = zip(run.catalog.tiles, database.states(), strict=True)
         write_collection(run, [tile for tile, state in states if state in ("done", "cached")])
     summary = replace(summary, seconds=round(time.perf_counter() - start_s, 3))
     log.note("end", **{name: value for name, value in asdict(summary).items() if name != "failures"})
-    about = {"start": start, "end": utc_now(), "config": run.config.name, "origin": list(run.origin)}
+    about = {
+        "start": start,
+        "end": utc_now(),
+        "config": run.config.name,
+        "origin": list(run.origin),
+        "mesh_distances": distances,
+    }
     write_summary(run.path, summary, run.config.cluster.flush, **about)
     if run.config.cluster.flush:
         flush_names(run.path)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from flexroad.tasks.metrics.mesh_distance import FIGURES
 from flexroad.tasks.quality.assess import NO_ROAD
 
 MetricsRow = dict[str, Any]
 """One row of metrics.parquet, by column."""
+MeshDistances = dict[str, dict[str, float]]
+"""Largest distances of meshes from their surfaces (m), by variant and column of metrics.parquet."""
 TileState = Literal["cached", "done", "failed", "pending"]
 """cached: already done when the last run started; pending: no result for the current files and options."""
 MarkerStat = tuple[str, int, int | str]
@@ -135,6 +138,20 @@ def from_failed(content: dict[str, Any], marker: MarkerStat | None) -> TileRecor
         marker=marker,
         stale=tuple(content.get("stale", ())),
     )
+
+
+def with_distances(rows: Iterable[MetricsRow], largest: MeshDistances) -> Iterator[MetricsRow]:
+    """Yield the rows, and put the largest distances in them into ``largest``.
+
+    Rows of failed tiles and of older versions have none.
+    """
+    for row in rows:
+        for name in FIGURES:
+            value = row.get(name)
+            if isinstance(value, float | int):
+                own = largest.setdefault(row["variant"], {})
+                own[name] = max(value, own.get(name, 0.0))
+        yield row
 
 
 def no_nan(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,12 +17,13 @@ from pydantic import Field
 from flexroad.tasks import options as base
 from flexroad.tasks.metrics import mesh_check
 from flexroad.tasks.metrics.dihedral import mean_angles
+from flexroad.tasks.metrics.mesh_distance import mesh_distances
 from flexroad.tasks.metrics.point_to_mesh import nearest
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.metrics.vertical_distance import drape
-from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, TileData
+from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, Surface, TileData
 
-VERSION = 2
+VERSION = 3
 
 
 class Options(base.Options):
@@ -36,8 +37,8 @@ class Options(base.Options):
     )
 
 
-def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Metrics:
-    """Measure accuracy, smoothness (Eq. mad) and size of a mesh.
+def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, options: Options) -> Metrics:
+    """Measure accuracy, smoothness (Eq. mad) and size of a mesh, and its distance from its surface.
 
     Parameters
     ----------
@@ -45,6 +46,9 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
         Reference heights, else the DTM, are the truth.
     road : RoadMask
         Its raw mask classes the cells with ``classes: segmented``, or if the tile has no reference mask.
+        The distance from the surface is always by the raw mask, by which the mesh was sampled.
+    surface : Surface
+        The surface that the mesh samples.
     options : Options
         Whether to measure 3-D distances, and which mask classes the cells.
 
@@ -89,6 +93,7 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, options: Options) -> Me
         triangles=len(mesh.faces),
         road_fraction=mean(is_road[window][has_truth]),
         completeness=mean(has_both[has_truth]),
+        **mesh_distances(mesh, surface, road),
     )
 
 

@@ -56,7 +56,8 @@ def measure(tile: Tile) -> Mapping[str, float]:
         "RGT": (cells, sample.Options(method="uniform")),
     }
     for name, (surface, sampling) in surfaces.items():
-        metrics = evaluate.evaluate(sample.sample(surface, road, clusters, sampling), data, road, CLASSES)
+        mesh = sample.sample(surface, road, clusters, sampling)
+        metrics = evaluate.evaluate(mesh, data, road, surface, CLASSES)
         figures |= {
             f"{name} road L2 (m)": metrics.l2_road_m,
             f"{name} terrain L2 (m)": metrics.l2_terrain_m,

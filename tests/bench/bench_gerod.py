@@ -62,7 +62,7 @@ def measure(place: Place) -> Mapping[str, float]:
     }
     for name, (surface, sampling) in surfaces.items():
         mesh = sample.sample(surface, road, clusters, sampling)
-        metrics = evaluate.evaluate(mesh, data, road, CLASSES)
+        metrics = evaluate.evaluate(mesh, data, road, surface, CLASSES)
         figures |= {
             f"{name} road L2 (m)": metrics.l2_road_m,
             f"{name} terrain L2 (m)": metrics.l2_terrain_m,

@@ -106,7 +106,7 @@ def surface_of(heights: Floats, core: Grid) -> RasterSurface:
 def show(name: str, seconds: float, ours: float, case: Case, surface: Surface) -> None:
     """Print one row; the surface is meshed and evaluated."""
     mesh = sample.sample(surface, case.road, case.clusters, sample.Options())
-    metrics = evaluate.evaluate(mesh, case.data, case.road, evaluate.Options())
+    metrics = evaluate.evaluate(mesh, case.data, case.road, surface, evaluate.Options())
     print(
         f"{name:34}{seconds:8.3f}{seconds / ours:8.1f}{metrics.l2_road_m:11.4f}{metrics.mad_road_deg:14.2f}",
         flush=True,

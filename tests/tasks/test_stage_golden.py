@@ -94,7 +94,7 @@ def test_sample_output_with_lines_is_pinned_to_version(clusters):
 
 def test_evaluate_output_is_pinned_to_version(tile, clusters):
     mesh = sample.sample(Hills(), tile[1], clusters, sample.Options())
-    metrics = asdict(evaluate.evaluate(mesh, *tile, evaluate.Options(nearest=True)))
+    metrics = asdict(evaluate.evaluate(mesh, *tile, Hills(), evaluate.Options(nearest=True)))
     golden = {
         "l2_road_m": 0.128801681877,
         "l2_terrain_m": 0.143542308943,
@@ -109,6 +109,10 @@ def test_evaluate_output_is_pinned_to_version(tile, clusters):
         "triangles": 3378,
         "road_fraction": 0.229583333333,
         "completeness": 1.0,
+        "mesh_p95_road_m": 0.00253916405075,
+        "mesh_max_road_m": 0.0152919662056,
+        "mesh_p95_terrain_m": 0.21038798138,
+        "mesh_max_terrain_m": 0.311839098646,
     }
-    assert evaluate.VERSION == 2
+    assert evaluate.VERSION == 3
     assert metrics == pytest.approx(golden, rel=1e-9)

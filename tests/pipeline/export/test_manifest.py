@@ -11,11 +11,14 @@ from flexroad.pipeline.execute import SerialExecutor
 from flexroad.pipeline.export.driver import export
 from flexroad.pipeline.export.formats import FORMATS
 from flexroad.pipeline.export.source import select
+from flexroad.pipeline.store.tables import read_metrics
+from flexroad.tasks.metrics.mesh_distance import FIGURES
 
 from .conftest import OPTIONS
 
 DOCS = Path(__file__).parents[3] / "docs" / "export.md"
 MEASURED = {"landxml", "cityjson", "obj", "heightfield"}
+OF_MESHES = {"3dtiles", "landxml", "cityjson", "obj"}
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,16 @@ def test_formats_are_as_declared(manifest):
         )
         assert ("height_error_m" in entry) == (name in MEASURED)
         assert ("datum" in entry) == kind.needs_datum
+        assert ("mesh_distances" in entry) == kind.of_meshes == (name in OF_MESHES)
+
+
+def test_mesh_distances_are_the_largest_of_the_tiles(made_city, manifest):
+    rows = read_metrics(made_city.path)
+    expected = {name: rows[name].max() for name in FIGURES}
+    assert manifest["formats"]["obj"]["mesh_distances"] == pytest.approx(expected)
+    assert 0 < expected["mesh_p95_road_m"] < expected["mesh_max_road_m"]
+    summary = json.loads((made_city.path / "summary.json").read_text())
+    assert summary["mesh_distances"]["flexroad"] == pytest.approx(expected)
 
 
 def test_height_error_of_obj_is_that_of_its_vertices(made_city, exported, manifest):

@@ -34,10 +34,18 @@ def on_lattice(grid: Grid, height_at, bounds=None, step=1.0) -> Mesh:
     return Mesh(grid.crs, origin, vertices, faces, np.zeros(len(faces), bool))
 
 
+class Level:
+    """A surface at 160 m."""
+
+    def lattice(self, eastings, northings):
+        return np.full((len(northings), len(eastings)), 160.0)
+
+
 def figures(mesh, grid, truth, is_road=None, options=None, **layers) -> Metrics:
     is_road = np.zeros(grid.shape, bool) if is_road is None else is_road
     data = TileData("t", grid, grid, truth, truth, **layers)
-    return evaluate(mesh, data, RoadMask(grid, grid, is_road, np.zeros_like(is_road)), options or Options())
+    road = RoadMask(grid, grid, is_road, np.zeros_like(is_road))
+    return evaluate(mesh, data, road, Level(), options or Options())
 
 
 def centres(grid: Grid):
@@ -158,7 +166,7 @@ def test_evaluate_class_without_cells_is_nan():
         on_lattice(grid, tilt(0.0)), grid, np.full(grid.shape, 160.0), options=Options(nearest=True)
     )
     road = [value for name, value in vars(metrics).items() if "_road_" in name]
-    assert len(road) == 6
+    assert len(road) == 8
     assert all(math.isnan(value) for value in road)
     assert (metrics.road_fraction, metrics.l2_terrain_m, metrics.mad_terrain_deg) == (0, 0, 0)
 
@@ -173,7 +181,7 @@ def test_evaluate_ignores_halo():
     data = TileData("t", grid, core, truth, truth)
     mesh = on_lattice(core, tilt(0.0), bounds=core.bounds)
     road = RoadMask(grid, core, is_road, np.zeros_like(is_road))
-    metrics = evaluate(mesh, data, road, Options(nearest=True))
+    metrics = evaluate(mesh, data, road, Level(), Options(nearest=True))
     assert (metrics.l2_road_m, metrics.nearest_road_m) == pytest.approx((1, 1))
     assert (metrics.completeness, metrics.road_fraction) == (1, 0.5)
 
