@@ -9,9 +9,9 @@ import numpy as np
 
 from flexroad.catalog.grid import Bounds
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.metrics.statistics import least_squares_plane
 from flexroad.tasks.options import Options as BaseOptions
 from flexroad.tasks.roads.road_height import with_road_heights
+from flexroad.tasks.spline.space import least_squares_plane
 from flexroad.tasks.types import Floats, RoadClusters, TileData
 
 VERSION = 1

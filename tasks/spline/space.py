@@ -1,4 +1,4 @@
-"""The spline space of a tile, and the control heights that a fit starts from."""
+"""The spline space of a tile, and the control heights or the plane that a fit starts from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import scipy
 
 from flexroad.catalog.grid import Bounds, Grid
 from flexroad.tasks.errors import TaskError
-from flexroad.tasks.metrics.statistics import least_squares_plane
 from flexroad.tasks.roads.distances import filled
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, greville
 from flexroad.tasks.types import Bools, Floats
@@ -143,3 +142,14 @@ def start_heights(
         level, by_col, by_row = least_squares_plane(c.astype(float), r.astype(float), ground[r, c])
         heights = level + by_col * cols[None, :] + by_row * rows[:, None]
     return heights, float(heights.mean())
+
+
+def least_squares_plane(easting: Floats, northing: Floats, height: Floats) -> tuple[float, float, float]:
+    """Return (c, a, b) of ``z = c + a * easting + b * northing`` with the least squared vertical error.
+
+    Points that do not span a plane (one point, points on a line) give the plane through them that is level in
+    the undetermined direction. Coordinates should be local, so that c keeps its digits.
+    """
+    e, n, z = easting.mean(), northing.mean(), height.mean()
+    (a, b), *_ = np.linalg.lstsq(np.column_stack([easting - e, northing - n]), height - z, rcond=1e-9)
+    return float(z - a * e - b * n), float(a), float(b)
