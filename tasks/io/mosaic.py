@@ -29,7 +29,7 @@ from flexroad.tasks.io.height_units import (
 )
 from flexroad.tasks.io.raster import RasterWindow, misalignment, read_raster, read_window
 from flexroad.tasks.io.raster_header import header
-from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights
+from flexroad.tasks.io.sheets import Coverage, lay_classes, lay_heights, reach_m
 from flexroad.tasks.types import Bools, Floats
 
 
@@ -133,8 +133,33 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
     around : bool
         Whether the grid is ground around tiles: then it is not checked whether files have moved.
     """
-    heights = layer.name in HEIGHTS
     files = _files(tile, layer)
+    read, left_out, absurd_cells = _read(tile, layer, files, grid, core, around)
+    patches = [patch for _, patch in read]
+    if layer.name not in HEIGHTS:
+        values = lay_classes(patches, grid)
+    elif around or (margin_m := reach_m(patches, grid) - (core.west - grid.west)) <= 0:
+        values = lay_heights(patches, grid)
+    else:
+        wide = grid.buffered(margin_m)
+        more, _, _ = _read(tile, layer, files, wide, core, around=True)
+        values = lay_heights([patch for _, patch in more], wide)[wide.window(grid)]
+    notes = _notes(layer, patches, grid)
+    notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
+    in_part = [(file, patch.fault) for file, patch in read if patch.fault]
+    notes += [f"a part of a file that the tile does not need was left out: {error}" for _, error in in_part]
+    if absurd_cells:
+        notes.append(absurd_note(layer.name, absurd_cells))
+    return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), (*left_out, *in_part))
+
+
+def _read(
+    tile: Tile, layer: Layer, files: Iterable[SourceFile], grid: Grid, core: Grid, around: bool
+) -> tuple[list[tuple[SourceFile, RasterWindow]], list[tuple[SourceFile, Unusable]], int]:
+    """Return the parts of files until the grid is covered, those left out, and the number of absurd heights.
+
+    The other parameters are those of `read_mosaic`.
+    """
     read: list[tuple[SourceFile, RasterWindow]] = []
     left_out: list[tuple[SourceFile, Unusable]] = []
     absurd_cells = 0
@@ -144,7 +169,7 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
             patch = _window(tile, layer, file, grid, core)
             if not around:
                 _check_place(tile, layer, file, patch)
-            if patch and heights:
+            if patch and layer.name in HEIGHTS:
                 patch, absurd = in_metres(with_unit(patch, layer))
                 absurd_cells += absurd
         except Unusable as error:
@@ -155,15 +180,7 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
         read.append((file, patch))
         if coverage.completed_by(patch):
             break
-    patches = [patch for _, patch in read]
-    values = lay_heights(patches, grid) if heights else lay_classes(patches, grid)
-    notes = _notes(layer, patches, grid)
-    notes += [f"a file that the tile does not need was left out: {error}" for _, error in left_out]
-    in_part = [(file, patch.fault) for file, patch in read if patch.fault]
-    notes += [f"a part of a file that the tile does not need was left out: {error}" for _, error in in_part]
-    if absurd_cells:
-        notes.append(absurd_note(layer.name, absurd_cells))
-    return Mosaic(values, grid, layer, files, tuple(patches), tuple(notes), (*left_out, *in_part))
+    return read, left_out, absurd_cells
 
 
 def _files(tile: Tile, layer: Layer) -> tuple[SourceFile, ...]:

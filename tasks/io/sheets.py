@@ -49,6 +49,19 @@ class Coverage:
         return not self._missing.any()
 
 
+def reach_m(patches: Sequence[RasterWindow], grid: Grid) -> float:
+    """Return how far beyond a grid the heights are needed for those at its edge (m); 0 for one lattice.
+
+    Cells beyond a file's border are interpolated in files of other lattices, and these in further ones.
+    """
+    lattices = [group[0].lattice for group in same_lattice(patches)]
+    if len(lattices) < 2:
+        return 0.0
+    cells = [(lattice, *lattice.cell_of(grid)) for lattice in lattices]
+    coarsest = max(max(lattice.dx / across, lattice.dy / along) for lattice, across, along in cells)
+    return len(lattices) * coarsest * grid.cell
+
+
 def lay_classes(patches: Sequence[RasterWindow], grid: Grid) -> Floats:
     """Return the parts of files of classes on a grid's cells; see `lay_heights`."""
     return _filled(sorted(patches, key=_is_warped), grid, Resampling.nearest)

@@ -15,8 +15,6 @@ from tests.make_rasters import UTM, write
 
 GRID = Grid(UTM, 500_000.0, 5_600_040.0, 1.0, 40, 40)
 OFF = Options(min_valid=0)
-HALO = Options(min_valid=0, halo_m=8)
-"""Files that coincide with the grid are read within it: beyond, neighbours may lack."""
 TOLERANCE_M = 1e-6
 
 
@@ -80,7 +78,7 @@ SHEETS = {
 @pytest.mark.parametrize("sheets", SHEETS.values(), ids=SHEETS)
 def test_sheets_of_a_plane_have_its_heights_at_their_borders(sheets, tmp_path):
     names = [sheet(tmp_path, number, *each) for number, each in enumerate(sheets)]
-    assert_plane(load(tile(tmp_path, names), HALO))
+    assert_plane(load(tile(tmp_path, names), OFF))
 
 
 def rough(x, y):
@@ -111,8 +109,8 @@ def test_incomplete_step_beside_another_lattice_has_no_rim(others, tmp_path):
     names = [
         sheet(tmp_path, number, *each) for number, each in enumerate([(-10, 10, 0.2, 153, 300), *others])
     ]
-    loaded = load(tile(tmp_path, names), HALO)
-    whole = load(tile(tmp_path, [sheet(tmp_path, "whole", -10, 10, 0.2, 300, 300)]), HALO)
+    loaded = load(tile(tmp_path, names), OFF)
+    whole = load(tile(tmp_path, [sheet(tmp_path, "whole", -10, 10, 0.2, 300, 300)]), OFF)
     np.testing.assert_allclose(core(loaded), core(whole), rtol=0, atol=0.002)
 
 
@@ -138,7 +136,7 @@ def test_void_of_all_sheets_keeps_its_size(tmp_path):
     heights = plane(*centres(-10, 10, 1.0, 30, 60))
     heights[25:30, 15:20] = -9999
     write(tmp_path / "fine.tif", heights, GRID.west - 10, GRID.north + 10, nodata=-9999)
-    loaded = load(tile(tmp_path, ["fine.tif", sheet(tmp_path, "coarse", 20, 10, 5, 6, 12)]), HALO)
+    loaded = load(tile(tmp_path, ["fine.tif", sheet(tmp_path, "coarse", 20, 10, 5, 6, 12)]), OFF)
     want = expected(GRID)
     want[15:20, 5:10] = np.nan
     np.testing.assert_allclose(core(loaded), want, rtol=0, atol=TOLERANCE_M)
