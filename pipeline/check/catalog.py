@@ -24,6 +24,7 @@ from flexroad.catalog.storage.paths import Location
 from flexroad.catalog.text import access_reason, count, some
 from flexroad.catalog.tile import HEIGHTS
 from flexroad.catalog.trust import AllowedFolders
+from flexroad.pipeline.check.decks import deck_findings
 from flexroad.pipeline.check.finding import Finding
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
@@ -45,8 +46,15 @@ MAX_PHOTO_TILES = 12
 """Number of tiles whose photo is compared with the heights, spread evenly over the catalog."""
 
 
-def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
-    """Yield the contents of a catalog, and what would fail in a run with a configuration.
+def check(catalog: Catalog, config: Config, path: Path, every_deck: bool = False) -> Iterator[Finding]:
+    """Yield the contents of a catalog, what would fail in a run with a configuration, and unnamed decks.
+
+    Parameters
+    ----------
+    path : Path
+        File of the catalog: the map of decks is written beside it (`deck_findings`).
+    every_deck : bool
+        Whether to look for decks on all tiles of a large catalog.
 
     Raises
     ------
@@ -67,6 +75,7 @@ def check(catalog: Catalog, config: Config) -> Iterator[Finding]:
     yield from expected_failures(catalog.tiles, config, LAYERS)
     yield from _plateaus(tiles)
     yield from _photos([tile for tile in tiles if tile.layer("dop")])
+    yield from deck_findings(tiles, config, path, every_deck)
 
 
 def _plateaus(tiles: Sequence[Tile]) -> Iterator[Finding]:

@@ -291,14 +291,18 @@ def catalog_check(
             rich_help_panel=INPUTS,
         ),
     ] = None,
+    decks: Annotated[
+        bool, typer.Option("--decks", help="Look for decks on all tiles, not only on 200 of them.")
+    ] = False,
     allow: options.Allow = None,
 ) -> None:
     """Check a catalog before a long run.
 
-    Prints layers, what would fail in a run, and the shift between photo and heights.
+    Prints layers, what would fail in a run, the shift between photo and heights, and how many places look
+    like decks that no road names. These are written to decks.geojson beside the catalog.
     """
     catalog, faults = Catalog.read(path, allow or ()), 0
-    for remark in check(catalog, load_config(config or fitting_config(catalog))):
+    for remark in check(catalog, load_config(config or fitting_config(catalog)), path, decks):
         echo(f"warning: {remark.text}" if remark.fault else remark.text)
         faults += remark.fault
     if faults:

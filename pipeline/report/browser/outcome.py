@@ -44,7 +44,7 @@ MEANINGS = {
     ),
     "patch": _Meaning(
         "{value} m² of road in one piece are far from both DSM and DTM (limit {limit} m²)",
-        "look for a bridge, a tree or a gap in the data{there}",
+        "look for a bridge (`flexroad catalog check` maps unnamed ones), a tree or a gap in the data{there}",
     ),
     "spike": _Meaning(
         "the surface bends more than a road can ({value} 1/m, limit {limit} 1/m)",
@@ -60,7 +60,8 @@ MEANINGS = {
     ),
     "off-dtm": _Meaning(
         "{value} of the road lie off the DTM (limit {limit})",
-        "a bridge is right; otherwise the DTM is wrong or older{there}",
+        "a bridge is right (`flexroad catalog check` maps unnamed ones); otherwise the DTM is wrong or "
+        "older{there}",
         percent=True,
     ),
     "inferred": _Meaning(

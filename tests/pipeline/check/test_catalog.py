@@ -132,7 +132,9 @@ def test_check_names_heights_that_many_cells_share(survey):
 
     tile = Catalog.read(survey).tiles[0]
     change(tile, "dtm", flood)
-    notes = [f for f in check(Catalog.read(survey), load_config("production")) if "exact height" in f.text]
+    notes = [
+        f for f in check(Catalog.read(survey), load_config("production"), survey) if "exact height" in f.text
+    ]
     (name,) = tile.layer("dtm").reaching(tile.grid.bounds).files
     share = 9 / tile.grid.height
     assert [note.fault for note in notes] == [False]
@@ -141,13 +143,15 @@ def test_check_names_heights_that_many_cells_share(survey):
 
 def test_check_shifted_photo_and_missing_file_are_faults(tmp_path):
     path = write_scenes(tmp_path, 2, seed=3, size_m=120, dop=True)
-    assert not any(finding.fault for finding in check(Catalog.read(path), load_config("production")))
+    assert not any(finding.fault for finding in check(Catalog.read(path), load_config("production"), path))
     for photo in (tmp_path / "dop").glob("*.tif"):
         with rasterio.open(photo, "r+") as raster:
             raster.transform = Affine.translation(2.0, 0.0) @ raster.transform
     (missing := next((tmp_path / "dtm").glob("*.tif"))).unlink()
     faults = [
-        finding.text for finding in check(Catalog.read(path), load_config("production")) if finding.fault
+        finding.text
+        for finding in check(Catalog.read(path), load_config("production"), path)
+        if finding.fault
     ]
     assert any(f"missing: {missing} (1 tile)" in text for text in faults)
     assert any("dop lies 2.0 m east" in text for text in faults)

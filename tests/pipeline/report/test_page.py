@@ -254,3 +254,8 @@ def test_viewer_is_found_in_the_run_or_given_and_its_address_is_relative(run, tm
         (folder / "index.html").touch()
     assert _viewer_address(run, None) == "viewer/index.html"
     assert _viewer_address(run, tmp_path / "3D & more") == "../3D%20%26%20more/index.html"
+
+
+def test_flags_of_decks_name_the_command_that_finds_them():
+    for flag in ("patch", "off-dtm"):
+        assert "`flexroad catalog check` maps unnamed ones" in MEANINGS[flag].remedy
