@@ -10,11 +10,15 @@ the points on the border and their heights are those of the neighbours too: the 
 
 A dynamic mesh has edges along the limit of the survey and ends there (`tasks.meshing.survey_limit`). If the
 roads are polygons, it has edges along their outlines, too (`tasks.meshing.road_outline`).
+
+With levels, dynamic and adaptive meshes have one part per level, which share no vertex. A deck or tube ends
+at its outline, and meets level 0 on its joints (`tasks.meshing.joint_lines`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -27,6 +31,13 @@ from flexroad.tasks import options as base
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.meshing.adaptive import Area, adaptive, free_sides, thinned
 from flexroad.tasks.meshing.breaklines import breaklines
+from flexroad.tasks.meshing.joint_lines import (
+    JoinedGround,
+    JoinedOutline,
+    LevelOutline,
+    level_outline,
+    without_joints,
+)
 from flexroad.tasks.meshing.lines import (
     apart_from,
     divided,
@@ -34,12 +45,13 @@ from flexroad.tasks.meshing.lines import (
     parts_of,
     points_and_segments,
 )
-from flexroad.tasks.meshing.parts import middles
+from flexroad.tasks.meshing.parts import middles, with_levels
 from flexroad.tasks.meshing.positions import DECIMALS, axis, without_duplicates
 from flexroad.tasks.meshing.road_outline import RoadOutline, road_outline
 from flexroad.tasks.meshing.survey_limit import SurveyLimit, survey_limit
 from flexroad.tasks.meshing.triangulate import Faces, constrained, delaunay
 from flexroad.tasks.spline.frame import Frame
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.mesh_border import (
     NUDGE,
     SAME_M,
@@ -136,6 +148,8 @@ def sample(
     if isinstance(surface, SteppedSurface) and not options.breaklines:
         on_road = road.mask[road.grid.window(road.core)]
         surface = surface.without_steps_near(on_road, SMOOTH_M, frame)
+    if isinstance(surface, LevelledSurface) and options.method in ("dynamic", "adaptive"):
+        return _levels(surface, road, mask, local, options, frame)
     if options.method == "dynamic":
         return _dynamic(surface, road, mask, local, options, frame)
     if options.method == "adaptive":
@@ -186,10 +200,98 @@ def _regular(
     return points, np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
 
 
-def _dynamic(
-    surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
+def _levels(
+    surface: LevelledSurface,
+    road: RoadMask,
+    mask: Bools,
+    local: Bounds,
+    options: Options,
+    frame: Frame | None,
 ) -> Mesh:
-    """Return the mesh of road, terrain and border points, with the limit of the survey and roads as edges."""
+    """Return the mesh of all levels; they meet on joints and share no vertex."""
+    every = (level_outline(own.level, road.core, local, options.road_m) for own in surface.levels)
+    outlines = [outline for outline in every if outline]
+    method = _dynamic if options.method == "dynamic" else _adaptive
+    first = method(surface, road, mask, local, options, frame, outlines)
+    meshes, ground = {0: first}, first.vertices + np.array([0.0, 0.0, first.origin[2]])
+    for outline in outlines:
+        if not outline.area.is_empty:
+            held = frame.at(outline.number) if frame else None
+            of_level = surface.at(outline.number)
+            points, faces = _other_level(of_level, outline, ground, road, local, options, held)
+            if len(faces):
+                meshes[outline.number] = _mesh(points, faces, road, np.ones_like(mask))
+    return with_levels(meshes)
+
+
+def _other_level(
+    surface: Surface,
+    outline: LevelOutline,
+    ground: Floats,
+    road: RoadMask,
+    local: Bounds,
+    options: Options,
+    frame: Frame | None,
+) -> tuple[Floats, Faces]:
+    """Return points and faces of a deck or tube, which ends at its outline and with the survey.
+
+    Parameters
+    ----------
+    ground : ndarray, (n, 3)
+        The vertices of level 0: on joints at the border of the tile, the level has the same ones.
+    """
+    limit, lines, area = _limit(road, local, frame), [outline.lines], outline.area
+    if limit:
+        area = shapely.intersection(area, limit.covered)
+        lines.append(parts_of(limit.lines))
+    part = Area(
+        origin=road.core.origin,
+        local=local,
+        outline=RoadOutline(area, outline.lines),
+        limit=None,
+        lines=lines,
+        step=options.road_m / PROBES,
+        tolerance_m=options.tolerance_m,
+        terrain_tolerance_m=options.terrain_tolerance_m,
+    )
+    adapted = options.method == "adaptive"
+    border = (
+        _thinned_border(surface, road, part, options, frame)
+        if adapted
+        else _dynamic_border(surface, road, local, options, frame, lines)
+    )
+    border = outline.with_shared(border, ground, local)
+    plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
+    covered = SurveyLimit(
+        shapely.multilinestrings(plan[segments]), outline.covered(area, plan[segments], local)
+    )
+    if adapted:
+        return adaptive(surface, replace(part, limit=covered), border, SAME_M)
+    free = _lattice(surface, road, np.ones_like(road.mask), local, options.road_m)
+    free = free[covered.covers(free) & ~on_border(free, local)]
+    free = free[apart_from(free, lines, options.road_m / 2)]
+    z = surface.height(*(plan + road.core.origin).T)
+    points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
+    faces = constrained(points, number[len(free) + len(border) + segments])
+    return points, faces[covered.covers(middles(points, faces))]
+
+
+def _dynamic(
+    surface: Surface,
+    road: RoadMask,
+    mask: Bools,
+    local: Bounds,
+    options: Options,
+    frame: Frame | None,
+    others: Sequence[LevelOutline] = (),
+) -> Mesh:
+    """Return the mesh of road, terrain and border points, with the limit of the survey and roads as edges.
+
+    Parameters
+    ----------
+    others : sequence of LevelOutline
+        The other levels: their joints are edges, too.
+    """
     fine = _lattice(surface, road, mask, local, options.road_m)
     coarse = _lattice(surface, road, ~mask, local, options.terrain_m)
     limit, outline = _limit(road, local, frame), None
@@ -197,22 +299,24 @@ def _dynamic(
     breaks = None
     if isinstance(surface, SteppedSurface) and options.breaklines:
         breaks = breaklines(surface, local)
-        lines.append(_divided(breaks.lines, road, mask, options))
+        lines.append(without_joints(_divided(breaks.lines, road, mask, options), others))
     if road.areas is not None and options.mask == "raw":
         outline = road_outline(road.areas, local, options.road_m)
-        lines.append(outline.lines)
+        lines.append(without_joints(outline.lines, others))
         fine = fine[outline.contains(fine)]
-    free = np.concatenate([fine, coarse])
+    lines += [part for other in others for part in (other.joints, other.feet)]
+    free, joined = np.concatenate([fine, coarse]), _joined_ground(surface, road, others)
     if frame:
         free = free[~on_border(free, local)]
-        border = _shared_border(surface, road.core, local, options, frame)
-    else:
-        border = _border(surface, road.core.origin, local, options, lines)
+    border = _dynamic_border(joined or surface, road, local, options, frame, lines)
     free = free[apart_from(free, lines, options.road_m / 2)]
     if limit:
         free = free[limit.covers(free)]
     plan, segments = points_and_segments(lines, border[:, :2], local, SAME_M)
-    z = breaks.height(plan) if breaks else surface.height(*(plan + road.core.origin).T)
+    place = (plan + road.core.origin).T
+    z = breaks.height(plan) if breaks else surface.height(*place)
+    if joined:
+        z = joined.on_joints(place[0], place[1], z)
     if isinstance(surface, MovingNurbs):
         free, border = (_in_space(part, surface, road.core.origin) for part in (free, border))
     points, number = without_duplicates(np.concatenate([free, border, np.column_stack([plan, z])]))
@@ -224,6 +328,13 @@ def _dynamic(
     if limit:
         faces = faces[limit.covers(middles(points, faces))]
     return _mesh(points, faces, road, mask, outline)
+
+
+def _joined_ground(surface: Surface, road: RoadMask, others: Sequence[LevelOutline]) -> JoinedGround | None:
+    """Return the surface with the heights of other levels on joints, None if no other level is near."""
+    if not others or not isinstance(surface, LevelledSurface):
+        return None
+    return JoinedGround(surface, road.core.origin, others)
 
 
 def _in_space(points: Floats, surface: MovingNurbs, origin: tuple[float, float]) -> Floats:
@@ -250,29 +361,58 @@ def _outline(
 
 
 def _adaptive(
-    surface: Surface, road: RoadMask, mask: Bools, local: Bounds, options: Options, frame: Frame | None
+    surface: Surface,
+    road: RoadMask,
+    mask: Bools,
+    local: Bounds,
+    options: Options,
+    frame: Frame | None,
+    others: Sequence[LevelOutline] = (),
 ) -> Mesh:
-    """Return the mesh of few points within the tolerances, with roads and the survey's limit as edges."""
+    """Return the mesh of few points within the tolerances, with roads and the survey's limit as edges.
+
+    Parameters
+    ----------
+    others : sequence of LevelOutline
+        The other levels: their joints are edges, too.
+    """
     limit, outline = _limit(road, local, frame), _outline(road, mask, local, options, frame)
+    if others:
+        outline = JoinedOutline.of(outline, others)
     lines = [outline.lines] if limit is None else [outline.lines, parts_of(limit.lines)]
-    tolerances = options.tolerance_m, options.terrain_tolerance_m
-    area = Area(road.core.origin, local, outline, limit, lines, options.road_m / PROBES, *tolerances)
+    lines += [part for other in others for part in (other.joints, other.feet)]
+    step, joined = options.road_m / PROBES, _joined_ground(surface, road, others)
+    area = Area(road.core.origin, local, outline, limit, lines, step, *_tolerances(options))
+    border = _thinned_border(joined or surface, road, area, options, frame)
+    points, faces = adaptive(joined or surface, area, border, SAME_M)
+    return _mesh(points, faces, road, mask, outline)
+
+
+def _tolerances(options: Options) -> tuple[float, float]:
+    """Return the tolerances of an adaptive mesh (m), on roads and elsewhere."""
+    return options.tolerance_m, options.terrain_tolerance_m
+
+
+def _thinned_border(
+    surface: Surface, road: RoadMask, area: Area, options: Options, frame: Frame | None
+) -> Floats:
+    """Return the border points of an adaptive mesh, ``(n, 3)``."""
+    local = area.local
     if frame:
         dense = [axis(0.0, local[i + 2] - local[i], area.step, to_end=True) for i in (0, 1)]
         raw = options.mask == "raw"
         crossed = raw and road.areas is not None
         sides = border_sides(frame, local, road.core.cell, dense, raw, crossed, area.step / 2)
     else:
-        sides = free_sides(area, ends_at_border(lines, local))
-    height = border_heights if frame else type(surface).height
+        sides = free_sides(area, ends_at_border(area.lines, local))
     border = []
     for plan, needed, on_road in sides:
-        z = height(surface, *(plan + road.core.origin).T)
+        place = (plan + road.core.origin).T
+        z = border_heights(surface, *place) if frame else surface.height(*place)
         along = np.abs(plan - plan[0]).sum(axis=1)
-        kept = thinned(along, z, np.where(on_road, *tolerances), needed)
+        kept = thinned(along, z, np.where(on_road, *_tolerances(options)), needed)
         border.append(np.column_stack([plan, z])[kept])
-    points, faces = adaptive(surface, area, np.concatenate(border), SAME_M)
-    return _mesh(points, faces, road, mask, outline)
+    return np.concatenate(border)
 
 
 def _limit(road: RoadMask, local: Bounds, frame: Frame | None) -> SurveyLimit | None:
@@ -308,6 +448,20 @@ def _lattice(surface: Surface, road: RoadMask, where: Bools, local: Bounds, step
     row, col = road.grid.cells(eastings + nudge, northings - nudge)
     i, j = np.nonzero(where[np.ix_(row, col)])
     return np.stack([x[j], y[i], z[i, j]], axis=1)
+
+
+def _dynamic_border(
+    surface: Surface,
+    road: RoadMask,
+    local: Bounds,
+    options: Options,
+    frame: Frame | None,
+    lines: Sequence[NDArray[np.object_]],
+) -> Floats:
+    """Return the border points of a dynamic mesh, ``(n, 3)``."""
+    if frame:
+        return _shared_border(surface, road.core, local, options, frame)
+    return _border(surface, road.core.origin, local, options, lines)
 
 
 def _border(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -218,6 +218,26 @@ class Mesh:
     level: NDArray[np.int8] | None = None
     """Level of each face, ``(F,)``; None: all are on level 0. Faces of different levels share no vertex: on a
     joint both have vertices at the same places."""
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of the levels that it has, 0 first."""
+        others = [] if self.level is None else np.unique(self.level[self.level != 0]).tolist()
+        return 0, *others
+
+    def at(self, number: int) -> Mesh:
+        """Return the part of it that is of one level, with the same origin."""
+        if self.level is None:
+            return self
+        chosen = self.level == number
+        used, faces = np.unique(self.faces[chosen], return_inverse=True)
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            faces=faces.reshape(-1, 3).astype(np.int32),
+            road=self.road[chosen],
+            level=None,
+        )
 
 
 @dataclass(frozen=True)

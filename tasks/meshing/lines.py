@@ -70,7 +70,7 @@ def points_and_segments(
         The vertices on the border of the tile. Lines that reach the border end in the nearest one, or before
         the border if none is near.
     local : tuple of float
-        West, south, east and north of the tile (m).
+        West, south, east and north of the tile (m). Segments along this border are left out.
     same_m : float
         Largest distance of such a vertex (m).
     """
@@ -80,17 +80,20 @@ def points_and_segments(
     points, number = np.unique(segments.reshape(-1, 2), axis=0, return_inverse=True)
     _, at_border = _moved(points, local)
     reached = np.flatnonzero(at_border)
-    away = np.linalg.norm(points[reached, None] - border, axis=2)
-    nearest = away.argmin(axis=1)
-    points[reached] = border[nearest]
     lost = np.zeros(len(points), np.bool_)
-    lost[reached[away.min(axis=1) > same_m]] = True
+    lost[reached] = True
+    if len(border):
+        away = np.linalg.norm(points[reached, None] - border, axis=2)
+        points[reached] = border[away.argmin(axis=1)]
+        lost[reached] = away.min(axis=1) > same_m
     pairs = number.reshape(-1, 2)
     pairs = pairs[~lost[pairs].any(axis=1)]
     points, number = np.unique(points, axis=0, return_inverse=True)
     pairs = np.unique(np.sort(number.reshape(-1)[pairs], axis=1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    return points, pairs
+    # Along the border, its vertices alone count: those of the neighbour are the same.
+    along = (points[pairs][..., [0, 1, 0, 1]] == np.array(local)).all(axis=1).any(axis=1)
+    return points, pairs[~along]
 
 
 def _noded(lines: Sequence[NDArray[np.object_]]) -> shapely.Geometry:

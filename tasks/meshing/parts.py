@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,35 @@ def part(mesh: Mesh, faces: Bools) -> tuple[Indices, Indices]:
     is_used[chosen] = True
     number = np.cumsum(is_used) - 1
     return np.flatnonzero(is_used), number[chosen]
+
+
+def with_levels(meshes: Mapping[int, Mesh]) -> Mesh:
+    """Return the meshes of several levels of a tile as one; they share no vertex.
+
+    Parameters
+    ----------
+    meshes : Mapping of int to Mesh
+        By number of the level; level 0 is the first.
+    """
+    first, *others = meshes.values()
+    if not others:
+        return first
+    east, north, _ = first.origin
+    datum = min(mesh.origin[2] for mesh in meshes.values())
+    counts = [len(mesh.vertices) for mesh in meshes.values()]
+    starts = np.cumsum([0, *counts[:-1]], dtype=np.int32)
+    return Mesh(
+        crs=first.crs,
+        origin=(east, north, datum),
+        vertices=np.concatenate(
+            [mesh.vertices + np.array([0.0, 0.0, mesh.origin[2] - datum]) for mesh in meshes.values()]
+        ),
+        faces=np.concatenate(
+            [mesh.faces + start for mesh, start in zip(meshes.values(), starts, strict=True)]
+        ),
+        road=np.concatenate([mesh.road for mesh in meshes.values()]),
+        level=np.repeat(np.array([*meshes], np.int8), [len(mesh.faces) for mesh in meshes.values()]),
+    )
 
 
 def middles(points: Floats, faces: NDArray[np.int32]) -> Floats:

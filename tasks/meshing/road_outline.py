@@ -81,7 +81,7 @@ def road_outline(areas: NDArray[np.uint8], local: Bounds, spacing_m: float) -> R
     """
     united = shapely.from_wkb(areas.tobytes())
     inside = shapely.intersection(shapely.boundary(united), shapely.box(*local))
-    parts = shapely.get_parts(shapely.line_merge(_lines_of(inside)))
+    parts = shapely.get_parts(shapely.line_merge(lines_of(inside)))
     simple = shapely.simplify(shapely.multilinestrings(parts), TOLERANCE_M)
     return RoadOutline(united, shapely.get_parts(shapely.segmentize(simple, spacing_m)))
 
@@ -117,7 +117,7 @@ def _polygons(geometries: Any) -> NDArray[np.object_]:
     return np.asarray(parts[(shapely.get_type_id(parts) == 3) & ~shapely.is_empty(parts)])
 
 
-def _lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:
+def lines_of(geometry: shapely.Geometry) -> shapely.MultiLineString:
     """Return the lines of a geometry that may have points as well."""
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return shapely.multilinestrings(parts[shapely.get_type_id(parts) == 1])

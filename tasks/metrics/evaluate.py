@@ -5,6 +5,9 @@ and faces by the cell under their centroid, as road or terrain. It is the refere
 segmented one; the paper uses the segmented one.
 
 Only a mesh without faults (`tasks.metrics.mesh_check`) is measured, so that a tile with a broken mesh fails.
+
+Of a mesh with levels each one is checked, and level 0 is measured, without the cells below decks: no layer
+has their height.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from flexroad.tasks.metrics.mesh_distance import mesh_distances
 from flexroad.tasks.metrics.point_to_mesh import nearest
 from flexroad.tasks.metrics.statistics import mean, nmad
 from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.roads.rasterise import cells
 from flexroad.tasks.types import Bools, Floats, Mesh, Metrics, RoadMask, Surface, TileData
 
 VERSION = 3
@@ -61,18 +65,22 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
     Raises
     ------
     MeshFault
-        If the mesh is no height field triangulated once.
+        If the mesh of a level is no height field triangulated once.
     """
-    mesh_check.check(mesh)
+    for number in mesh.numbers:
+        mesh_check.check(mesh.at(number))
+    triangles, mesh = len(mesh.faces), mesh.at(0)
     truth = data.dtm if data.reference is None else data.reference
     reference_road = data.reference_road if options.classes == "reference" else None
     is_road = road.mask if reference_road is None else reference_road
     window = data.grid.window(data.core)
     heights = np.ascontiguousarray(truth[window]) - mesh.origin[2]
+    if road.levels:
+        heights[_below_decks(road)] = np.nan
     difference = drape(mesh, data.core) - heights
     has_truth, has_both = np.isfinite(heights), np.isfinite(difference)
     classes = is_road[window], ~is_road[window]
-    on_road, on_terrain = (difference[has_both & cells] for cells in classes)
+    on_road, on_terrain = (difference[has_both & of_class] for of_class in classes)
     distances_3d = (
         _distances_3d(mesh, data, heights, difference)
         if options.nearest
@@ -90,11 +98,17 @@ def evaluate(mesh: Mesh, data: TileData, road: RoadMask, surface: Surface, optio
         nearest_terrain_m=mean(distances_3d[has_both & classes[1]]),
         mad_road_deg=angles[0],
         mad_terrain_deg=angles[1],
-        triangles=len(mesh.faces),
+        triangles=triangles,
         road_fraction=mean(is_road[window][has_truth]),
         completeness=mean(has_both[has_truth]),
         **mesh_distances(mesh, surface, road),
     )
+
+
+def _below_decks(road: RoadMask) -> Bools:
+    """Return the core's cells below decks, ``(H, W)``."""
+    decks = [level.areas for level in road.levels if level.number > 0]
+    return cells(np.array(decks, object), road.core)
 
 
 def _distances_3d(mesh: Mesh, data: TileData, heights: Floats, difference: Floats) -> Floats:
@@ -117,8 +131,8 @@ def _angles(mesh: Mesh, data: TileData, is_road: Bools) -> tuple[float, float]:
     face_is_road = is_road[data.grid.cells(x, y)]
     core_is_road = is_road[data.grid.window(data.core)]
     means = []
-    for faces, cells in ((face_is_road, core_is_road), (~face_is_road, ~core_is_road)):
+    for faces, of_class in ((face_is_road, core_is_road), (~face_is_road, ~core_is_road)):
         chosen = per_face[faces] if faces.any() else per_face
         chosen = chosen[np.isfinite(chosen)]
-        means.append(mean(chosen) if cells.any() else float("nan"))
+        means.append(mean(chosen) if of_class.any() else float("nan"))
     return means[0], means[1]

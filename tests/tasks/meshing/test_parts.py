@@ -1,6 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 
-from flexroad.tasks.meshing.parts import part, texture_coordinates
+from flexroad.tasks.meshing.parts import part, texture_coordinates, with_levels
 from flexroad.tasks.types import Mesh
 
 VERTICES = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3], [0, 10, 4], [5, 15, 5]], float)
@@ -22,3 +24,22 @@ def test_part_without_faces_is_empty():
 def test_texture_coordinates_run_from_the_south_west():
     uv = texture_coordinates(MESH, (295495.0, 5629250.0, 295515.0, 5629290.0))
     np.testing.assert_allclose(uv, [[0.25, 0], [0.75, 0], [0.75, 0.25], [0.25, 0.25], [0.5, 0.375]])
+
+
+def test_meshes_of_levels_as_one_can_be_taken_apart():
+    deck = replace(MESH, origin=(295500.0, 5629250.0, 148.0), faces=FACES[:2], road=np.ones(2, bool))
+    every = with_levels({0: MESH, -1: MESH, 2: deck})
+    assert every.numbers == (0, -1, 2)
+    assert every.level.tolist() == [0, 0, 0, -1, -1, -1, 2, 2]
+    for number, mesh in ((0, MESH), (-1, MESH), (2, deck)):
+        own = every.at(number)
+        np.testing.assert_array_equal(
+            own.vertices[own.faces] + own.origin, mesh.vertices[mesh.faces] + mesh.origin
+        )
+        np.testing.assert_array_equal(own.road, mesh.road)
+
+
+def test_mesh_without_levels_is_that_of_level_0():
+    assert with_levels({0: MESH}) is MESH
+    assert MESH.numbers == (0,)
+    assert MESH.at(0) is MESH

@@ -9,11 +9,15 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
 from flexroad.catalog.grid import Grid
+from flexroad.tasks.errors import MeshFault
 from flexroad.tasks.metrics.dihedral import mean_angles
 from flexroad.tasks.metrics.evaluate import Options, evaluate
 from flexroad.tasks.metrics.point_to_mesh import nearest
 from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.sample import Options as SampleOptions
+from flexroad.tasks.sample import sample
 from flexroad.tasks.types import Mesh, Metrics, RoadMask, TileData
+from tests.crossing import GROUND_M, Crossing
 
 
 def ground(width=40, height=30, cell=1.0, west=295500.0, north=5629500.0) -> Grid:
@@ -347,3 +351,26 @@ def test_evaluate_nearest_is_mean_of_class():
         _brute_force(mesh.vertices, mesh.faces, points[~is_road]).mean()
     )
     assert metrics.nearest_road_m < metrics.l2_road_m
+
+
+def test_figures_of_mesh_with_deck_are_those_of_the_ground_beside_it():
+    tile = next(Crossing((40.0, 30.0)).tiles())
+    grid, level = tile.road.core, tile.road.levels[0]
+    mesh = sample(*tile[:3], SampleOptions(), tile.frame)
+    below = level.covers(*centres(grid))
+    truth = np.where(below, -100.0, tile.surface.height(*centres(grid)))
+    result = evaluate(mesh, TileData("t", grid, grid, truth, truth), tile.road, tile.surface, Options())
+    assert result.l2_road_m < 0.05
+    assert result.completeness == 1
+    assert result.triangles == len(mesh.faces)
+
+
+def test_fault_of_a_deck_is_an_error():
+    tile = next(Crossing((40.0, 30.0)).tiles())
+    mesh = sample(*tile[:3], SampleOptions(), tile.frame)
+    last = mesh.faces.copy()
+    last[-1] = last[-1, ::-1]
+    truth = np.full(tile.road.core.shape, GROUND_M)
+    data = TileData("t", tile.road.core, tile.road.core, truth, truth)
+    with pytest.raises(MeshFault, match="inverted faces"):
+        evaluate(replace(mesh, faces=last), data, tile.road, tile.surface, Options())

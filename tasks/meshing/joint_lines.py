@@ -1,0 +1,223 @@
+"""The outlines of decks and tubes as lines of meshes, and their joints with the ground.
+
+A joint is an edge of two meshes: of level 0, and of the level that begins there. Both have the same vertices
+on it, with the heights of the other level. Below a deck, level 0 has a second line beside it, with heights of
+its own, at the foot of the abutment. So the wall there is steep, and level 0 stays below the deck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flexroad.catalog.grid import Bounds, Grid
+from flexroad.tasks.meshing.lines import AT_BORDER_M, GRID_M, parts_of
+from flexroad.tasks.meshing.road_outline import NEAR_M, RoadOutline, encoded, lines_of
+from flexroad.tasks.spline.levelled import LevelledSurface
+from flexroad.tasks.spline.mesh_border import SAME_M, on_border
+from flexroad.tasks.types import Bools, Floats, Level
+
+WALL_M = 0.25
+"""Distance of the foot of an abutment from the joint (m)."""
+CLEAR_M = 0.3
+"""Other lines of level 0 are left out within this distance of a joint (m): crossings would be vertices that
+the other level does not have."""
+LEAST_M2 = 1e-3
+"""Smaller parts of a level on a tile have no mesh (m2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelOutline:
+    """The areas of a level on a tile, and their outline; metres from the whole-metre origin of the tile."""
+
+    number: int
+    area: shapely.Geometry
+    """The decks or tubes on the tile."""
+    joints: NDArray[np.object_]
+    """The lines of their outline that are joints."""
+    rim: NDArray[np.object_]
+    """The other lines."""
+    feet: NDArray[np.object_]
+    """Lines at the feet of the abutments."""
+    on_joints: shapely.MultiLineString
+    """The joints as in the level, on and around the tile."""
+
+    @property
+    def lines(self) -> NDArray[np.object_]:
+        """All lines of the outline."""
+        return np.concatenate([self.joints, self.rim])
+
+    def has_joint_at(self, points: Floats) -> Bools:
+        """Return which points, ``(n, 2 or more)``, lie on joints, ``(n,)``."""
+        return np.asarray(shapely.dwithin(self.on_joints, shapely.points(points[:, :2]), SAME_M))
+
+    def with_shared(self, border: Floats, ground: Floats, local: Bounds) -> Floats:
+        """Return the vertices of the level on the border of a tile, on joints those of level 0.
+
+        Parameters
+        ----------
+        border : ndarray, (n, 3)
+            Vertices along the complete border.
+        ground : ndarray, (m, 3)
+            The vertices of level 0.
+        """
+        shared = ground[on_border(ground, local) & self.has_joint_at(ground)]
+        every = np.concatenate([border[~self.has_joint_at(border)], shared])
+        near = shapely.dwithin(self.area, shapely.points(every[:, :2]), GRID_M)
+        return np.asarray(every[near])
+
+    def covered(self, area: shapely.Geometry, segments: Floats, local: Bounds) -> shapely.Geometry:
+        """Return an area with the segments, ``(n, 2, 2)``, as its outline, which differs by rounding.
+
+        Faces between vertices of the outline can be slivers; which of them lie inside follows from this.
+        """
+        lines = shapely.union_all([*shapely.linestrings(segments), shapely.box(*local).exterior])
+        parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
+        inside = shapely.union_all(parts[shapely.intersects(area, shapely.point_on_surface(parts))])
+        return shapely.intersection(inside, shapely.buffer(area, SAME_M))
+
+
+def level_outline(level: Level, core: Grid, local: Bounds, spacing_m: float) -> LevelOutline | None:
+    """Return the outline of a level on a tile, None if nothing of it lies there.
+
+    Parameters
+    ----------
+    core : Grid
+        The tile.
+    local : tuple of float
+        West, south, east and north of the tile, from its origin (m).
+    spacing_m : float
+        Largest distance of points (m).
+    """
+    areas = encoded(np.array([level.areas], object), core)
+    if areas is None:
+        return None
+    tile, united = shapely.box(*local), shapely.from_wkb(areas.tobytes())
+    joints = shapely.transform(level.joints, lambda points: points - core.origin)
+    area = shapely.intersection(united, tile)
+    reaches = area.area >= LEAST_M2
+    if not reaches and not shapely.dwithin(joints, tile, SAME_M):
+        return None
+    merged = shapely.line_merge(lines_of(shapely.intersection(shapely.boundary(united), tile)))
+    pieces = [piece for part in shapely.get_parts(merged) for piece in _pieces(part, joints)]
+    on_joint = np.array([is_joint for _, is_joint in pieces], np.bool_)
+    lines = np.array([_divided(line, spacing_m, local) for line, _ in pieces], object)
+    feet = _feet(united, lines[on_joint], tile)
+    return LevelOutline(
+        number=level.number,
+        area=area if reaches else shapely.Polygon(),
+        joints=lines[on_joint],
+        rim=lines[~on_joint],
+        feet=np.array([_divided(line, spacing_m, local) for line in feet], object),
+        on_joints=joints,
+    )
+
+
+def _pieces(line: shapely.LineString, joints: shapely.Geometry) -> list[tuple[shapely.LineString, bool]]:
+    """Return a line in pieces that are joints or not, and which they are."""
+    corners = shapely.get_coordinates(line)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+    ends = shapely.get_parts(shapely.boundary(joints))
+    ends = shapely.line_locate_point(line, ends[shapely.dwithin(ends, line, SAME_M)])
+    ends = ends[np.abs(ends[:, None] - along).min(axis=1, initial=np.inf) >= SAME_M]
+    added = shapely.get_coordinates(shapely.line_interpolate_point(line, ends))
+    points = np.concatenate([corners, added])[np.argsort(np.concatenate([along, ends]), kind="stable")]
+    middles = shapely.points((points[1:] + points[:-1]) / 2)
+    is_joint = np.asarray(shapely.dwithin(joints, middles, SAME_M))
+    bounds = [0, *(np.flatnonzero(is_joint[1:] != is_joint[:-1]) + 1), len(is_joint)]
+    return [
+        (shapely.LineString(points[first : last + 1]), bool(is_joint[first]))
+        for first, last in pairwise(bounds)
+    ]
+
+
+def _divided(line: shapely.LineString, spacing_m: float, local: Bounds) -> shapely.LineString:
+    """Return a line with points at most a distance (m) apart, on the grid of lines.
+
+    Ends on the border of the tile stay where they are, and no other point is so near to it that it would be
+    moved there.
+    """
+    points = shapely.get_coordinates(shapely.segmentize(line, spacing_m))
+    at_border = (np.abs(points[:, [0, 1, 0, 1]] - np.array(local)) <= AT_BORDER_M).any(axis=1)
+    points[~at_border] = np.round(points[~at_border] / GRID_M) * GRID_M
+    kept = ~at_border
+    kept[[0, -1]] = True
+    return shapely.LineString(points[kept])
+
+
+def _feet(areas: shapely.Geometry, joints: NDArray[np.object_], tile: shapely.Polygon) -> NDArray[np.object_]:
+    """Return the lines within areas that run beside joints."""
+    if not len(joints):
+        return joints
+    inner = shapely.boundary(shapely.buffer(areas, -WALL_M, join_style="mitre"))
+    beside = shapely.buffer(shapely.multilinestrings(joints), WALL_M + SAME_M, cap_style="flat")
+    inside = shapely.intersection(inner, shapely.intersection(beside, tile))
+    return parts_of(shapely.line_merge(lines_of(inside)))
+
+
+def without_joints(lines: NDArray[np.object_], outlines: Sequence[LevelOutline]) -> NDArray[np.object_]:
+    """Return the parts of lines that are not beside joints."""
+    joints = [outline.joints for outline in outlines if len(outline.joints)]
+    if not joints or not len(lines):
+        return lines
+    beside = shapely.buffer(shapely.multilinestrings(np.concatenate(joints)), CLEAR_M)
+    return parts_of(lines_of(shapely.difference(shapely.multilinestrings(lines), beside)))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedGround:
+    """The surface of level 0, of which points on joints have the heights of the level that begins there."""
+
+    surface: LevelledSurface
+    origin: tuple[float, float]
+    """Easting and northing that the outlines are relative to (m)."""
+    outlines: Sequence[LevelOutline]
+
+    @property
+    def bounds(self) -> Bounds:
+        """The domain: west, south, east, north (m)."""
+        return self.surface.bounds
+
+    def height(self, easting: Floats, northing: Floats) -> Floats:
+        """Return heights (m) at scattered points, ``(n,)``."""
+        return self.on_joints(easting, northing, self.surface.height(easting, northing))
+
+    def on_joints(self, easting: Floats, northing: Floats, heights: Floats) -> Floats:
+        """Return heights of points, ``(n,)``, with those on joints replaced."""
+        points, result = np.column_stack([easting, northing]), heights.copy()
+        for outline in self.outlines:
+            at = outline.has_joint_at(points - self.origin)
+            result[at] = self.surface.at(outline.number).height(*points[at].T)
+        return result
+
+    def lattice(self, eastings: Floats, northings: Floats) -> Floats:
+        """Return heights (m) of level 0 at every pair, ``(len(northings), len(eastings))``."""
+        return self.surface.lattice(eastings, northings)
+
+    def normal(self, easting: Floats, northing: Floats) -> Floats:
+        """Return upward unit normals of level 0 at scattered points, ``(..., 3)``."""
+        return self.surface.normal(easting, northing)
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedOutline(RoadOutline):
+    """The outline of the roads of level 0, of which joints are a part."""
+
+    joints: shapely.MultiLineString
+
+    @classmethod
+    def of(cls, outline: RoadOutline, outlines: Sequence[LevelOutline]) -> JoinedOutline:
+        """Return the outline of roads without what is beside joints."""
+        lines = without_joints(outline.lines, outlines)
+        joints = shapely.multilinestrings(np.concatenate([own.joints for own in outlines]))
+        return cls(outline.areas, lines, joints)
+
+    def touches(self, points: Floats) -> Bools:
+        """Return which points, ``(n, 2)``, are on the road or near it, or near a joint, ``(n,)``."""
+        at_joint = shapely.dwithin(self.joints, shapely.points(points), NEAR_M)
+        return np.asarray(super().touches(points) | at_joint)

@@ -1,0 +1,126 @@
+"""A street on a deck over another one, in two by two tiles: surfaces, road masks and frames."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from shapely.affinity import rotate
+
+from flexroad.catalog.borders import border_of
+from flexroad.catalog.grid import Grid
+from flexroad.tasks.meshing.road_outline import crossings, encoded
+from flexroad.tasks.roads.rasterise import cells
+from flexroad.tasks.spline.frame import Corner, Edge, Frame
+from flexroad.tasks.spline.lattice import Lattice
+from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
+from flexroad.tasks.spline.space import surface_on
+from flexroad.tasks.types import Level, RoadClusters, RoadMask
+
+WEST, SOUTH = 500000.0, 5600000.0
+GROUND_M, DECK_M, RISE = 100.0, 107.0, 0.03
+
+
+class Tile(NamedTuple):
+    """What a tile is sampled from."""
+
+    surface: LevelledSurface
+    road: RoadMask
+    clusters: RoadClusters
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A street that rises to the east and crosses another one on a deck (a tube if the number is below 0)."""
+
+    middle: tuple[float, float] = (40.0, 35.0)
+    """Middle of the deck, from the south-western corner of the tiles (m)."""
+    angle: float = 0.0
+    """Direction of the street, from east to north (degrees)."""
+    length: float = 20.0
+    width: float = 8.0
+    number: int = 1
+    size: int = 60
+    """Side of a tile (m)."""
+
+    def _placed(self, *areas: shapely.Geometry) -> list[shapely.Geometry]:
+        place = np.array([WEST, SOUTH]) + self.middle
+        turned = [rotate(area, self.angle, origin=(0, 0)) for area in areas]
+        return [shapely.transform(area, lambda points: points + place) for area in turned]
+
+    @property
+    def level(self) -> Level:
+        """The deck with its two joints and approaches."""
+        half, side = self.length / 2, self.width / 2
+        deck = shapely.box(-half, -side, half, side)
+        joints = [shapely.LineString([(x, -side), (x, side)]) for x in (-half, half)]
+        approaches = [shapely.box(-half - 16, -side, -half, side), shapely.box(half, -side, half + 16, side)]
+        deck, *parts = self._placed(deck, *joints, *approaches)
+        return Level(
+            self.number,
+            shapely.MultiPolygon([deck]),
+            shapely.MultiLineString(parts[:2]),
+            shapely.MultiPolygon(parts[2:]),
+        )
+
+    @property
+    def streets(self) -> np.ndarray:
+        """The streets of level 0: before and behind the deck, with a path beside, and below it."""
+        half, side = self.length / 2, self.width / 2
+        return np.array(
+            self._placed(
+                shapely.box(-200, -side, -half, side),
+                shapely.box(half, -side, 200, side + 2.5),
+                shapely.box(-4, -200, 4, 200),
+            )
+        )
+
+    def tiles(self) -> Iterator[Tile]:
+        """Yield the four tiles, from west to east, from south to north."""
+        for row in range(2):
+            for col in range(2):
+                west, north = WEST + col * self.size, SOUTH + (row + 1) * self.size
+                yield self.tile(Grid("EPSG:25832", west, north, 1.0, self.size, self.size))
+
+    def tile(self, grid: Grid) -> Tile:
+        """Return one tile."""
+        nowhere = np.zeros(grid.shape, np.bool_)
+        mask = cells(self.streets, grid)
+        road = RoadMask(grid, grid, mask, nowhere, areas=encoded(self.streets, grid), levels=(self.level,))
+        parts = [self._part(border) for border in border_of(grid, 20.0)]
+        return Tile(self.surface(grid), road, RoadClusters(grid, mask.astype(np.int32)), Frame(*parts))
+
+    def surface(self, grid: Grid) -> LevelledSurface:
+        """Return the plane of the ground, and that of the deck."""
+        lattice = Lattice.of((grid.width, grid.height), 1.0, 3, 3.6)
+        n, m = lattice.intervals
+        space, _ = lattice.part(grid.shape, (grid.height, 0), (0, n), (0, m))
+        n, m = space.points
+        ground = np.full((m, n), GROUND_M)
+        spline = surface_on(space, grid, grid.exact_bounds, ground, np.ones_like(ground), 0.0)
+        above = np.sign(self.number) * (DECK_M - GROUND_M)
+        east = grid.west - WEST + (np.arange(n) - 1.0) * lattice.unit_m[0]
+        deck = GROUND_M + above + RISE * east + np.zeros((m, 1))
+        return LevelledSurface.of(spline, (LevelSpline(self.level, deck),), grid)
+
+    def _part(self, border) -> Corner | Edge:
+        if border.kind == "corner":
+            return Corner(np.zeros((3, 3)), np.zeros((2, 2), np.bool_))
+        own, level = self._edge(border, self.streets), self.level
+        deck = self._edge(border, shapely.get_parts(level.areas))
+        (east, north), along = border.start, deck.crossings
+        places = (
+            (east + along, north + 0 * along) if border.kind == "east" else (east + 0 * along, north + along)
+        )
+        on_joint = shapely.dwithin(level.joints, shapely.points(*places), 0.05)
+        every = np.union1d(own.crossings, deck.crossings[on_joint])
+        return replace(own, crossings=every, levels=((self.number, deck),))
+
+    def _edge(self, border, areas) -> Edge:
+        road = border.along(cells(areas, border.grid))
+        inside = np.zeros_like(road)
+        return Edge(
+            np.zeros((3, 0)), road[1], road[1], inside, crossings(encoded(areas, border.grid), border)
+        )

@@ -1,0 +1,127 @@
+"""Meshes of tiles with several levels meet on joints, and on the borders of tiles."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import shapely
+
+from flexroad.tasks.metrics.mesh_check import faults
+from flexroad.tasks.metrics.vertical_distance import drape
+from flexroad.tasks.sample import Options, sample
+from tests.crossing import GROUND_M, RISE, WEST, Crossing
+from tests.mesh_union import Union
+
+METHODS = pytest.mark.parametrize("method", ["dynamic", "adaptive"])
+PLACES = {
+    "in one tile": Crossing(),
+    "over a border": Crossing((60.0, 30.0)),
+    "over a corner": Crossing((60.0, 60.0), angle=45.0),
+    "acute": Crossing((61.0, 30.0), angle=83.0),
+    "joint on a border": Crossing((50.0, 30.0)),
+    "joint near a border": Crossing((53.0, 30.0)),
+    "joint crosses a border": Crossing((30.0, 59.0), width=8.0),
+    "side on a border": Crossing((30.0, 56.0)),
+    "tube": Crossing((58.0, 33.0), angle=20.0, number=-1),
+}
+CASES = pytest.mark.parametrize("crossing", PLACES.values(), ids=PLACES.keys())
+
+
+@cache
+def meshes(crossing, method):
+    options = Options(method=method)
+    return [sample(*tile[:3], options, tile.frame) for tile in crossing.tiles()]
+
+
+def absolute(mesh):
+    """Vertices of a mesh in coordinates that float32 holds, and its faces."""
+    places = mesh.vertices.astype(np.float32).astype(np.float64)
+    np.testing.assert_allclose(places, mesh.vertices, atol=1e-4)
+    return mesh.vertices + mesh.origin, mesh.faces
+
+
+def at_joints(mesh, level):
+    """Vertices on the joints: their place in plan and their height, as a GLB has it."""
+    near = shapely.dwithin(level.joints, shapely.points(mesh.vertices[:, :2] + mesh.origin[:2]), 0.02)
+    return {tuple(vertex) for vertex in mesh.vertices[near].astype(np.float32).tolist()}
+
+
+@METHODS
+@CASES
+def test_levels_are_height_fields_with_common_vertices_on_joints(crossing, method):
+    number, level, count = crossing.number, crossing.level, 0
+    for mesh in meshes(crossing, method):
+        assert all(faults(mesh.at(k)) == () for k in mesh.numbers)
+        if number in mesh.numbers:
+            of_ground, of_deck = (at_joints(mesh.at(k), level) for k in (0, number))
+            assert of_ground == of_deck
+            count += len(of_deck)
+    assert count >= 4
+
+
+@METHODS
+@CASES
+def test_levels_have_no_open_edge_over_borders(crossing, method):
+    parts, number = meshes(crossing, method), crossing.number
+    for k in (0, number):
+        whole = Union.of(absolute(mesh.at(k)) for mesh in parts if k in mesh.numbers)
+        start, side = np.array([500000.0, 5600000.0]), crossing.size
+        open_edges = whole.middles[whole.uses == 1] - start
+        inner = np.abs(open_edges - side).min(axis=1) < 1e-9
+        outline = shapely.boundary(crossing.level.areas)
+        if k:
+            inner &= ~shapely.dwithin(outline, shapely.points(open_edges + start), 0.02)
+        assert open_edges[inner].tolist() == []
+        assert whole.uses.max() <= 2
+        assert whole.area == pytest.approx((2 * side) ** 2 if k == 0 else crossing.level.areas.area, abs=0.1)
+
+
+@METHODS
+@CASES
+def test_edges_of_deck_on_joints_are_edges_of_ground(crossing, method):
+    level = crossing.level
+
+    def edges_on_joints(mesh, most):
+        pairs = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+        pairs, uses = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+        ends = mesh.vertices[pairs[uses <= most]] + mesh.origin
+        middles = shapely.points(ends[..., :2].mean(axis=1))
+        on_joint = shapely.dwithin(level.joints, middles, 0.02)
+        return {frozenset(map(tuple, pair)) for pair in ends[on_joint].tolist()}
+
+    parts = meshes(crossing, method)
+    ground = set().union(*(edges_on_joints(mesh.at(0), 2) for mesh in parts))
+    deck = set().union(*(edges_on_joints(mesh.at(crossing.number), 1) for mesh in parts))
+    assert deck
+    assert deck <= ground
+
+
+@METHODS
+def test_heights_of_meshes_are_those_of_levels(method):
+    crossing = Crossing((40.0, 30.0), angle=10.0)
+    tile = next(crossing.tiles())
+    grid, level = tile.road.core, crossing.level
+    mesh = sample(*tile[:3], Options(method=method), tile.frame)
+    ground, deck = (drape(mesh.at(k), grid) + mesh.origin[2] for k in (0, 1))
+    x, y = np.meshgrid(grid.eastings, grid.northings)
+    inside = shapely.intersects_xy(level.areas, x, y)
+    np.testing.assert_array_equal(np.isfinite(deck), inside)
+    np.testing.assert_allclose(deck[inside], (107 + RISE * (x - WEST))[inside], atol=0.003)
+    away = inside & ~shapely.dwithin(level.joints, shapely.points(x, y), 1.0)
+    np.testing.assert_allclose(ground[away], GROUND_M, atol=0.003)
+    assert (ground[inside] < deck[inside] - 0.05).all()
+    assert mesh.road[mesh.level == 1].all()
+
+
+@METHODS
+def test_mesh_of_tile_far_from_decks_is_that_without_levels(method):
+    crossing = Crossing((30.0, 30.0))
+    *_, tile = crossing.tiles()
+    options = Options(method=method)
+    mesh = sample(*tile[:3], options, tile.frame)
+    spline = replace(tile.surface, levels=())
+    plain = sample(spline, replace(tile.road, levels=()), tile.clusters, options, tile.frame)
+    assert mesh.level is None
+    np.testing.assert_array_equal(mesh.vertices, plain.vertices)
+    np.testing.assert_array_equal(mesh.faces, plain.faces)
