@@ -80,7 +80,7 @@ def _written(path: Path, found: Sequence[tuple[Tile, Deck]]) -> Iterator[Finding
                 yield Finding(f"{_told(found)}; {path} was edited and is not replaced: {remedy}")
         elif found:
             write(path, _map(found))
-            yield Finding(f"{_told(found)}: check them in {path}, and add what is right to the roads")
+            yield Finding(f"{_told(found)}: check {path}, then give roads there a level")
         elif is_old:
             remove(path)
     except OSError as error:

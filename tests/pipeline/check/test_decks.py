@@ -44,7 +44,7 @@ def told(flexroad):
 def test_deck_over_a_border_is_mapped_once(unnamed, told, config):
     path = unnamed.with_name("decks.geojson")
     (line,) = told(unnamed, "--config", config)
-    assert line == f"{LINE}: check them in {path}, and add what is right to the roads"
+    assert line == f"{LINE}: check {path}, then give roads there a level"
     found = geopandas.read_file(path)
     assert found.crs == "EPSG:4326"
     (row,) = found.to_crs("EPSG:25832").to_dict("records")
@@ -80,7 +80,7 @@ def test_edited_map_is_kept(unnamed, told):
     path = unnamed.with_name("decks.geojson")
     told(unnamed)
     before = path.read_bytes()
-    assert told(unnamed)[0].startswith(f"{LINE}: check them")
+    assert told(unnamed)[0].startswith(f"{LINE}: check {path}")
     assert path.read_bytes() == before
     edited = json.loads(before)
     del edited["generator"]
@@ -109,7 +109,7 @@ def test_large_catalog_is_mapped_if_asked_for(unnamed, told, monkeypatch):
     (line,) = told(unnamed)
     assert line == f"{LINE}, on 3 of 4 tiles: look at all with --decks"
     assert not path.exists()
-    assert told(unnamed, "--decks")[0].startswith(f"{LINE}: check them")
+    assert told(unnamed, "--decks")[0].startswith(f"{LINE}: check {path}")
     assert path.exists()
 
 
