@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from datetime import timedelta
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -135,16 +137,25 @@ def _some(pairs: Sequence[_Pair]) -> list[_Pair]:
 
 def _ordered(number: int, pairs: Sequence[_Pair]) -> list[int]:
     """Return the numbers of files in their order, but newer ones before older ones of the same ground."""
-    newer: dict[int, set[int]] = {}
+    older, blocked = defaultdict[int, set[int]](set), defaultdict[int, set[int]](set)
     for pair in pairs:
-        newer.setdefault(pair.older, set()).add(pair.newer)
-    moved = sorted({pair.newer for pair in pairs} | set(newer))
-    left, order = list(moved), list[int]()
-    while left:
+        older[pair.newer].add(pair.older)
+        blocked[pair.older].add(pair.newer)
+    moved = sorted(older.keys() | blocked)
+    # Files without a newer one that is not yet in order, and all that are left: each the first by name first.
+    free, left, order = [one for one in moved if not blocked[one]], deque(moved), dict[int, None]()
+    while len(order) < len(moved):
+        while left[0] in order:
+            left.popleft()
         # Rules that contradict each other in a circle leave the first by name first.
-        first = next((one for one in left if not newer.get(one, set()) & set(left)), left[0])
-        left.remove(first)
-        order.append(first)
+        first = heappop(free) if free else left[0]
+        if first in order:
+            continue
+        order[first] = None
+        for one in older[first]:
+            blocked[one].discard(first)
+            if not blocked[one]:
+                heappush(free, one)
     result = list(range(number))
     for place, file in zip(moved, order, strict=True):
         result[place] = file

@@ -287,7 +287,9 @@ def _driver(path: Path) -> str:
 
 def _side_cars(path: Path) -> list[Path]:
     """Return the side-car files of a raster that GDAL may open; refuse those that lead to other files."""
-    found = [side for side in candidates(path) if side.exists() or side.is_symlink()]
+    folder = path.parent
+    # Links that lead nowhere are refused, too.
+    found = [folder / name for name in side_car_names(path.name) if os.path.lexists(f"{folder}/{name}")]
     for side in found:
         try:
             require_beside(side, path)
@@ -311,11 +313,16 @@ def _check_side_car(side: Path) -> None:
         raise Refused("is of Erdas Imagine and may name other files; remove it")
 
 
-def candidates(path: Path) -> Iterator[Path]:
-    """Yield the names of side-car files that GDAL looks for."""
+@lru_cache(maxsize=65536)
+def side_car_names(name: str) -> tuple[str, ...]:
+    """Return the names of side-car files that GDAL looks for beside a file of this name."""
+    path = Path(name)
     end = path.suffix[1:]
     worlds = {f".{end}w", f".{end[:1]}{end[-1:]}w"} if end else set()
-    for text in APPENDED:
-        yield from (path.with_name(path.name + case) for case in (text, text.upper()))
-    for text in sorted({*REPLACED, *worlds}):
-        yield from (path.with_suffix(case) for case in dict.fromkeys((text, text.lower(), text.upper())))
+    appended = [name + case for text in APPENDED for case in (text, text.upper())]
+    replaced = [
+        path.with_suffix(case).name
+        for text in sorted({*REPLACED, *worlds})
+        for case in dict.fromkeys((text, text.lower(), text.upper()))
+    ]
+    return (*appended, *replaced)

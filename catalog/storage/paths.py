@@ -151,18 +151,23 @@ def stat(where: Location) -> FileStat | None:
         If the storage does not answer. A file on disk that cannot be accessed gives None.
     """
     if isinstance(where, Path):
-        try:
-            stats = where.stat()
-        except (OSError, ValueError):
-            return None
-        if not S_ISREG(stats.st_mode):
-            return None
-        return FileStat(stats.st_size, stats.st_mtime_ns)
+        return file_stat(where)
     try:
         with named(where):
             return _entry_stat(where.fs.info(where.path))
     except FileNotFoundError:
         return None
+
+
+def file_stat(path: str | Path) -> FileStat | None:
+    """Return `stat` of a path on disk, which may be a text."""
+    try:
+        stats = os.stat(path)  # noqa: PTH116 (Path is slow)
+    except (OSError, ValueError):
+        return None
+    if not S_ISREG(stats.st_mode):
+        return None
+    return FileStat(stats.st_size, stats.st_mtime_ns)
 
 
 def listing(folder: Location) -> dict[str, FileStat]:

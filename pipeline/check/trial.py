@@ -113,7 +113,7 @@ def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
 def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:
     """Return doubtful tiles, the first of each set of files, then others; each spread evenly."""
     tiles = [tile for tile in tiles if all(map(tile.layer, load.NEEDS))]
-    first = {_sheets(tile, LAYERS): tile for tile in reversed(tiles)}
+    first = {_files(tile, LAYERS): tile for tile in reversed(tiles)}
     kinds = [
         [tile for tile in tiles if tile.id in doubtful],
         sorted(first.values(), key=lambda tile: tile.id),
@@ -131,7 +131,12 @@ def _evenly(tiles: Sequence[Tile], most: int) -> list[Tile]:
     return [tiles[k * len(tiles) // number] for k in range(number)]
 
 
+def _files(tile: Tile, names: Collection[str]) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Return the files of some layers that lie on a tile, with the name of the layer."""
+    layers = (layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in names)
+    return tuple((layer.name, layer.files) for layer in layers if layer)
+
+
 def _sheets(tile: Tile, names: Collection[str]) -> frozenset[str]:
-    """Return the files of some layers that lie on a tile."""
-    layers = [layer.reaching(tile.grid.bounds) for layer in tile.layers if layer.name in names]
-    return frozenset(f"{layer.name} {Path(file).name}" for layer in layers if layer for file in layer.files)
+    """Return the names of these files."""
+    return frozenset(f"{layer} {Path(file).name}" for layer, files in _files(tile, names) for file in files)

@@ -35,6 +35,7 @@ from flexroad.pipeline.worker.exports import GLB, file_name
 from flexroad.tasks.export import glb, tiles3d
 from flexroad.tasks.meshing import aerial, relief
 from flexroad.tasks.meshing.aerial import Aerial
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.meshing.relief import Relief
 
 RECORDS, MESHES = ".coarse", "coarse"
@@ -313,7 +314,8 @@ def _glb(tile: FinishedTile, own: bool, place: Place, texture: glb.Texture | Non
         data = read(file)
         tile.check_unchanged()
         return data
-    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, tile.surface, tile.id)
+    normals = mesh_normals(tile.mesh, tile.surface)
+    return glb.encode(tile.mesh, (*place.origin, 0.0), texture, normals, tile.id)
 
 
 def _without_photo(ids: Sequence[str]) -> str:

@@ -34,6 +34,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import glb, viewer
 from flexroad.tasks.io.vertical import vertical_crs
 from flexroad.tasks.load import layer_source
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.roads import rasterise
 from flexroad.tasks.roads.centre_lines import read_centre_lines
 from flexroad.tasks.roads.rasterise import DEFAULTS
@@ -351,7 +352,7 @@ def piece(item: TileItem, look: Look) -> Piece:
         seen = base64.b64encode(small).decode("ascii")
     scene = viewer.TileScene(
         tile.id,
-        glb.encode(tile.mesh, (*look.origin, 0.0), photo, surface),
+        glb.encode(tile.mesh, (*look.origin, 0.0), photo, mesh_normals(tile.mesh, surface)),
         source.grid,
         corners(source),
         quality.support,

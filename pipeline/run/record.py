@@ -29,7 +29,7 @@ import yaml
 
 from flexroad.catalog import Catalog, Tile
 from flexroad.catalog.allowlist import needed
-from flexroad.catalog.headers.source_files import source_stat
+from flexroad.catalog.headers.source_files import RecentStates, source_stat
 from flexroad.catalog.storage.links import links_out
 from flexroad.catalog.storage.listed_files import StatCache
 from flexroad.catalog.storage.paths import (
@@ -212,9 +212,8 @@ class Run:
 
     def stat_cache(self) -> Stat:
         """Return a stat function for many source files; in a bucket it lists each folder once."""
-        remote = StatCache()
-        # On disk a stat is cheap and always current, so it is not cached.
-        return lambda file: remote(file) if is_remote(file) else source_stat(file)
+        remote, local = StatCache(), RecentStates()
+        return lambda file: remote(file) if is_remote(file) else local(file)
 
     def job(self, graph: TileGraph, force: frozenset[str] = frozenset()) -> TileJob:
         """Return the job that a worker needs to process one tile."""

@@ -18,8 +18,10 @@ from flexroad.pipeline.graph.graph import TileGraph
 from flexroad.pipeline.store.products import file_entry
 from flexroad.tasks.export import cog, glb, npz, ply
 from flexroad.tasks.io.vertical import vertical_crs
+from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.quality.support import of_faces
 from flexroad.tasks.spline.surface import NurbsSurface
+from flexroad.tasks.types import Floats
 
 rasterio = lazy("rasterio")
 
@@ -105,12 +107,16 @@ def products(
     vertical = vertical_crs(graph.tile) if "cog" in graph.export.formats else None
     files: dict[str, Product] = {}
     for variant in graph.export.variants:
+        nodes = graph.variants[variant]
+        normals = None
+        if not {"glb", "ply"}.isdisjoint(graph.export.formats):
+            normals = mesh_normals(evaluate(nodes["sample"]), evaluate(nodes["fit"]))
         for name in graph.export.formats:
-            nodes = graph.variants[variant]
             if name == "glb":
-                encoded = _glb(graph.tile.id, nodes, evaluate, origin, texture)
+                mesh = evaluate(nodes["sample"])
+                encoded = {GLB: glb.encode(mesh, (*origin, 0.0), texture, normals, graph.tile.id)}
             elif name == "ply":
-                encoded = _ply(nodes, evaluate)
+                encoded = _ply(nodes, evaluate, normals)
             elif name == "cog":
                 encoded = _cog(graph.tile.grid, nodes, evaluate, vertical)
             else:
@@ -121,21 +127,10 @@ def products(
     return files
 
 
-def _glb(
-    tile_id: str,
-    nodes: dict[str, str],
-    evaluate: Callable[[str], Any],
-    origin: tuple[float, float],
-    texture: glb.Texture | None,
-) -> dict[Kind, bytes]:
-    mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
-    return {GLB: glb.encode(mesh, (*origin, 0.0), texture, surface, tile_id)}
-
-
-def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any]) -> dict[Kind, bytes]:
-    mesh, surface = evaluate(nodes["sample"]), evaluate(nodes["fit"])
+def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any], normals: Floats | None) -> dict[Kind, bytes]:
+    mesh = evaluate(nodes["sample"])
     support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
-    return {PLY: ply.encode(mesh, support, surface)}
+    return {PLY: ply.encode(mesh, support, normals)}
 
 
 def _cog(

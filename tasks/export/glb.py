@@ -25,7 +25,7 @@ from flexroad.catalog.lazy import lazy
 from flexroad.tasks.meshing.normals import mesh_normals, vertex_normals
 from flexroad.tasks.meshing.parts import part, texture_coordinates
 from flexroad.tasks.meshing.relief import Sheet
-from flexroad.tasks.types import Floats, Mesh, Orthophoto, Surface
+from flexroad.tasks.types import Floats, Mesh, Orthophoto
 
 Image = lazy("PIL.Image")
 
@@ -83,7 +83,7 @@ def encode(
     mesh: Mesh,
     run_origin: tuple[float, float, float],
     texture: Texture | None = None,
-    surface: Surface | None = None,
+    normals: Floats | None = None,
     name: str = "tile",
 ) -> bytes:
     """Return a mesh as GLB.
@@ -97,8 +97,8 @@ def encode(
     texture : Texture, optional
         The image seen from above; by default road and terrain have one colour each. Positions, normals and
         faces do not depend on it.
-    surface : Surface, optional
-        That of the mesh, for the normals on the border of the tile (`mesh_normals`).
+    normals : ndarray, (V, 3), optional
+        Unit normals of the vertices (`mesh_normals`); by default those of the faces alone.
     name : str
         Name of the node of the tile, as its id.
 
@@ -108,7 +108,7 @@ def encode(
         A node translated by the tile's origin minus the run's, with child nodes ``road`` and ``terrain`` (a
         class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
-    normals = mesh_normals(mesh, surface)
+    normals = mesh_normals(mesh) if normals is None else normals
     uv = texture_coordinates(mesh, texture.bounds) if texture else None
     file = _File()
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()

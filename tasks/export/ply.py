@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexroad.tasks.meshing.normals import mesh_normals
 from flexroad.tasks.quality.support import Support
-from flexroad.tasks.types import Mesh, Surface
+from flexroad.tasks.types import Floats, Mesh
 
 VERSION = 3
 NAME = ".ply"
@@ -48,7 +48,7 @@ end_header
 """
 
 
-def encode(mesh: Mesh, support: NDArray[np.uint8], surface: Surface | None = None) -> bytes:
+def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None) -> bytes:
     """Return a mesh as PLY with the support of each face (`tasks.quality.support.Support`, ``(F,)``).
 
     Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is, and has the
@@ -57,8 +57,8 @@ def encode(mesh: Mesh, support: NDArray[np.uint8], surface: Surface | None = Non
 
     Parameters
     ----------
-    surface : Surface, optional
-        That of the mesh, for the normals on the border of the tile (`mesh_normals`).
+    normals : ndarray, (V, 3), optional
+        Unit normals of the vertices (`mesh_normals`); by default those of the faces alone.
     """
     header = HEADER.format(
         crs=" ".join(mesh.crs.split()),  # WKT may hold line breaks, which would end the comment
@@ -76,7 +76,7 @@ def encode(mesh: Mesh, support: NDArray[np.uint8], surface: Surface | None = Non
     faces["support"] = support
     vertices = np.zeros(len(mesh.vertices), VERTEX)
     vertices["place"] = mesh.vertices + np.asarray(mesh.origin, np.float64)
-    vertices["normal"] = mesh_normals(mesh, surface)
+    vertices["normal"] = mesh_normals(mesh) if normals is None else normals
     vertices["class"] = GROUND
     vertices["class"][mesh.faces[mesh.road]] = ROAD
     for kind in sorted(Support):

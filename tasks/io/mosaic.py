@@ -154,7 +154,7 @@ def read_mosaic(tile: Tile, layer: Layer, grid: Grid, core: Grid, around: bool =
 
 
 def _read(
-    tile: Tile, layer: Layer, files: Iterable[SourceFile], grid: Grid, core: Grid, around: bool
+    tile: Tile, layer: Layer, files: Sequence[SourceFile], grid: Grid, core: Grid, around: bool
 ) -> tuple[list[tuple[SourceFile, RasterWindow]], list[tuple[SourceFile, Unusable]], int]:
     """Return the parts of files until the grid is covered, those left out, and the number of absurd heights.
 
@@ -178,7 +178,7 @@ def _read(
         if patch is None:
             continue
         read.append((file, patch))
-        if coverage.completed_by(patch):
+        if file is not files[-1] and coverage.completed_by(patch):
             break
     return read, left_out, absurd_cells
 

@@ -109,6 +109,17 @@ def test_older_edition_fills_the_voids_of_the_newest(tmp_path):
     np.testing.assert_array_equal(above[:, 10:], 0)
 
 
+def test_each_sheet_of_three_years_is_in_the_order_of_its_years(tmp_path):
+    for year in (2019, 2022, 2016):
+        for number in range(2):
+            write(tmp_path / f"dsm/{year}/{number}.tif", PLANE, WEST + 60 * number, NORTH)
+    write(tmp_path / "dtm.tif", np.tile(PLANE, (1, 2)), WEST, NORTH)
+    tile = index(tmp_path, {"dsm": "dsm/**/*.tif", "dtm": "dtm.tif"}, tile_size_m=60).tiles[-1]
+    for number in range(2):
+        own = [name for name in tile.layer("dsm").files if name.endswith(f"{number}.tif")]
+        assert own == [f"dsm/{year}/{number}.tif" for year in (2022, 2019, 2016)]
+
+
 def test_sheets_side_by_side_are_no_editions(tmp_path):
     """They overlap by a rim of 5 cells, and keep their order."""
     edition(tmp_path / "dsm" / "b_2016.tif")

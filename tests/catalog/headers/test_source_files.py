@@ -3,6 +3,7 @@
 import os
 import shutil
 from datetime import UTC, datetime
+from pathlib import Path
 
 import geopandas
 import numpy as np
@@ -12,7 +13,7 @@ from shapely import LineString
 
 from flexroad.catalog.headers import source_files
 from flexroad.catalog.headers.open_vector import vector_name
-from flexroad.catalog.headers.source_files import files_of, source_stat
+from flexroad.catalog.headers.source_files import RecentStates, files_of, source_stat
 from flexroad.catalog.storage.paths import stat
 from flexroad.catalog.tile import Layer, Tile
 from flexroad.pipeline.config.loading import load_config
@@ -113,6 +114,30 @@ def test_state_of_vrt_changes_with_each_file_that_it_names(tmp_path):
     assert len(set(states)) == 4
     outer.write_text("<VRTDataset damaged")
     assert source_stat(outer) == stat(outer)
+
+
+@pytest.mark.parametrize("kept_s", [0.0, 3600.0])
+def test_states_of_one_pass_are_current_but_for_the_time_that_a_vrt_is_kept(kept_s, tmp_path, monkeypatch):
+    monkeypatch.setattr(source_files, "KEPT_S", kept_s)
+    member, vrt = write(tmp_path / "a.tif", np.ones((20, 20), np.float32)), tmp_path / "a.vrt"
+    rasterio.shutil.copy(member, vrt, driver="VRT")
+    states = RecentStates()
+    before = {path: states(path) for path in (member, vrt)}
+    assert before == {path: source_stat(path) for path in before}
+    touched(member)
+    assert states(member) == source_stat(member) != before[member]
+    assert source_stat(vrt) != before[vrt]
+    assert states(vrt) == (before[vrt] if kept_s else source_stat(vrt))
+    assert RecentStates()(vrt) == source_stat(vrt)
+
+
+def test_parts_have_the_same_names_by_any_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    member = write(tmp_path / "data" / "a.tif", np.ones((20, 20), np.float32))
+    (tmp_path / "data" / "a.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
+    rasterio.shutil.copy(member, tmp_path / "a.vrt", driver="VRT")
+    for name in ("a.vrt", "data/a.tif"):
+        assert source_stat(Path(name)) == source_stat(tmp_path / name)
 
 
 def test_empty_wal_that_a_reader_leaves_changes_nothing(tmp_path):

@@ -151,7 +151,7 @@ def test_encode_normals_on_the_border_are_those_of_the_surface():
     border = (x == 0) | (x == 10) | (y == 0) | (y == 10)
     truth = surface.normal(x + west, y + south)
     np.testing.assert_array_equal(normals, np.where(border[:, None], truth, faces_alone))
-    written = attribute(glb.encode(mesh, RUN_ORIGIN, surface=surface), "road", "NORMAL")
+    written = attribute(glb.encode(mesh, RUN_ORIGIN, normals=normals), "road", "NORMAL")
     used, _ = part(mesh, mesh.road)
     east, north, up = normals[used].T
     np.testing.assert_allclose(written, np.c_[east, up, -north], atol=1e-6)

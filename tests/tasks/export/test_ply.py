@@ -56,6 +56,9 @@ def test_encode_vertices_have_normals_class_and_support():
     np.testing.assert_array_equal(vertices["support"], [2, 1, 3, 3, 3])
     normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    up = np.tile([0.0, 0.0, 1.0], (5, 1))
+    given = parse(ply.encode(roof(), SUPPORT, up))[1]
+    np.testing.assert_array_equal([given[name] for name in ("nx", "ny", "nz")], up.T)
     # Vertex 1 is a corner of the first face alone.
     a, b, c = roof().vertices[:3]
     face = np.cross(b - a, c - a)
