@@ -323,6 +323,12 @@ class Quality:
     """Names of problems, from `tasks.quality.assess.FLAGS`."""
     support: NDArray[np.uint8]
     """Class of the core's cells by `tasks.quality.support.Support`, ``(H, W)``."""
+    levels: tuple[tuple[int, Quality], ...] = ()
+    """Number and quality of each other level, on its decks or tubes: beyond them its support is none."""
+
+    def at(self, number: int) -> Quality:
+        """Return the quality of a level, that of level 0 if it has none."""
+        return dict(self.levels).get(number, self)
 
 
 @dataclass(frozen=True, eq=False)

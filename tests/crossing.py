@@ -12,11 +12,12 @@ from flexroad.catalog.borders import border_of
 from flexroad.catalog.grid import Grid
 from flexroad.tasks.meshing.road_outline import crossings, encoded
 from flexroad.tasks.roads.rasterise import cells
+from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.spline.frame import Corner, Edge, Frame
 from flexroad.tasks.spline.lattice import Lattice
 from flexroad.tasks.spline.levelled import LevelledSurface, LevelSpline
 from flexroad.tasks.spline.space import surface_on
-from flexroad.tasks.types import Level, RoadClusters, RoadMask
+from flexroad.tasks.types import Level, Mesh, RoadClusters, RoadMask
 
 WEST, SOUTH = 500000.0, 5600000.0
 GROUND_M, DECK_M, RISE = 100.0, 107.0, 0.03
@@ -83,6 +84,11 @@ class Crossing:
             for col in range(2):
                 west, north = WEST + col * self.size, SOUTH + (row + 1) * self.size
                 yield self.tile(Grid("EPSG:25832", west, north, 1.0, self.size, self.size))
+
+    def mesh(self) -> tuple[Mesh, LevelledSurface]:
+        """Return the mesh and the surface of the first tile."""
+        tile = next(self.tiles())
+        return sample(*tile[:3], Options(), tile.frame), tile.surface
 
     def tile(self, grid: Grid) -> Tile:
         """Return one tile."""

@@ -129,7 +129,8 @@ def products(
 
 def _ply(nodes: dict[str, str], evaluate: Callable[[str], Any], normals: Floats | None) -> dict[Kind, bytes]:
     mesh = evaluate(nodes["sample"])
-    support = of_faces(evaluate(nodes["assess"]).support, evaluate(nodes["segment"]), mesh)
+    quality = evaluate(nodes["assess"])
+    support = of_faces(quality.support, evaluate(nodes["segment"]), mesh, quality.levels)
     return {PLY: ply.encode(mesh, support, normals)}
 
 

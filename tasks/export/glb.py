@@ -1,4 +1,4 @@
-"""The paper's final mesh as binary glTF with two nodes, road and terrain.
+"""The paper's final mesh as binary glTF with two nodes, road and terrain, and a node for each other level.
 
 glTF is Y up and viewers compute in float32. Vertices are therefore relative to the tile's whole-metre origin,
 and the parent node moves the tile to its place in the run. Origin and CRS are in the scene's ``extras``.
@@ -106,7 +106,8 @@ def encode(
     -------
     bytes
         A node translated by the tile's origin minus the run's, with child nodes ``road`` and ``terrain`` (a
-        class without faces has no node). Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
+        class without faces has no node). A deck or tube is the child ``road`` of a node ``level 1``, by the
+        number of its level. Axes: x east, y up, z south; metres. Equal inputs give equal bytes.
     """
     normals = mesh_normals(mesh) if normals is None else normals
     uv = texture_coordinates(mesh, texture.bounds) if texture else None
@@ -114,12 +115,22 @@ def encode(
     shift = _y_up(np.subtract(mesh.origin, run_origin)).tolist()
     tile = file.add("nodes", {"name": name, "children": [], "matrix": [*IDENTITY, *shift, 1.0]})
     image = file.add_image(texture.jpeg) if texture else None
-    for kind, faces, colour in (("road", mesh.road, ROAD_COLOUR), ("terrain", ~mesh.road, TERRAIN_COLOUR)):
-        if faces.any():
-            used, corners = part(mesh, faces)
-            vertices = _Vertices(mesh.vertices[used], normals[used], None if uv is None else uv[used])
-            node = file.add_mesh(vertices, corners, _material(kind, colour, image, image is not None))
-            file.tree["nodes"][tile]["children"].append(node)
+    for number in mesh.numbers:
+        parent = tile
+        if number:
+            parent = file.add("nodes", {"name": f"level {number}", "children": []})
+            file.tree["nodes"][tile]["children"].append(parent)
+        of_level = mesh.level == number if mesh.level is not None else np.ones(len(mesh.faces), np.bool_)
+        for kind, is_kind, colour in (
+            ("road", mesh.road, ROAD_COLOUR),
+            ("terrain", ~mesh.road, TERRAIN_COLOUR),
+        ):
+            faces = is_kind & of_level
+            if faces.any():
+                used, corners = part(mesh, faces)
+                vertices = _Vertices(mesh.vertices[used], normals[used], None if uv is None else uv[used])
+                node = file.add_mesh(vertices, corners, _material(kind, colour, image, image is not None))
+                file.tree["nodes"][parent]["children"].append(node)
     return file.encoded(tile, _georeference(mesh, run_origin))
 
 

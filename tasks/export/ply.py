@@ -40,19 +40,21 @@ property float ny
 property float nz
 property uchar class
 property uchar support
-element face {faces}
+{level}element face {faces}
 property list uchar int vertex_indices
 property uchar class
 property uchar support
-end_header
+{level}end_header
 """
+LEVEL = "property char level\n"
 
 
 def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None) -> bytes:
     """Return a mesh as PLY with the support of each face (`tasks.quality.support.Support`, ``(F,)``).
 
     Vertices are (easting, northing, height) in metres. A vertex is road if one of its faces is, and has the
-    highest code of support of its faces: the least certain one. Header comments give the CRS and, as
+    highest code of support of its faces: the least certain one. A mesh with levels has the property ``level``
+    of vertices and faces. Header comments give the CRS and, as
     ``origin``, the tile's whole-metre origin, which programs that compute in float32 can subtract.
 
     Parameters
@@ -68,18 +70,23 @@ def encode(mesh: Mesh, support: NDArray[np.uint8], normals: Floats | None = None
         support=", ".join(f"{kind} {kind.name.lower()}" for kind in Support),
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
+        level="" if mesh.level is None else LEVEL,
     )
-    faces = np.empty(len(mesh.faces), FACE)
+    levelled = [] if mesh.level is None else [("level", "i1")]
+    faces = np.empty(len(mesh.faces), [*FACE.descr, *levelled])
     faces["corners"] = 3
     faces["vertices"] = mesh.faces
     faces["class"] = np.where(mesh.road, ROAD, GROUND)
     faces["support"] = support
-    vertices = np.zeros(len(mesh.vertices), VERTEX)
+    vertices = np.zeros(len(mesh.vertices), [*VERTEX.descr, *levelled])
     vertices["place"] = mesh.vertices + np.asarray(mesh.origin, np.float64)
     vertices["normal"] = mesh_normals(mesh) if normals is None else normals
     vertices["class"] = GROUND
     vertices["class"][mesh.faces[mesh.road]] = ROAD
     for kind in sorted(Support):
         vertices["support"][mesh.faces[support == kind]] = kind
+    if mesh.level is not None:
+        faces["level"] = mesh.level
+        vertices["level"][mesh.faces] = mesh.level[:, None]
     # PLY headers are ASCII; names in WKT need not be.
     return header.encode("ascii", "backslashreplace") + vertices.tobytes() + faces.tobytes()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexroad.tasks.compiled import compiled
+from flexroad.tasks.spline.levelled import LevelledSurface
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Floats, Mesh, Surface
 
@@ -28,6 +29,12 @@ def mesh_normals(mesh: Mesh, surface: Surface | None = None) -> Floats:
     surface : Surface, optional
         That of the mesh. A spline over more than the tile has no border there, and other surfaces have none.
     """
+    if mesh.level is not None:
+        every = np.empty_like(mesh.vertices)
+        for number in mesh.numbers:
+            of_level = surface.at(number) if isinstance(surface, LevelledSurface) else surface
+            every[np.unique(mesh.faces[mesh.level == number])] = mesh_normals(mesh.at(number), of_level)
+        return every
     normals = vertex_normals(mesh.vertices, mesh.faces)
     if isinstance(surface, NurbsSurface):
         x, y = (mesh.vertices[:, :2] + mesh.origin[:2]).T

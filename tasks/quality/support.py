@@ -7,6 +7,7 @@ used if it agrees with the visible road beside (`tasks.roads.dtm_validity`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from flexroad.tasks.meshing.parts import middles
 from flexroad.tasks.roads.dtm_validity import AGREE_M, without_invalid_dtm
-from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
 
 
 class Support(IntEnum):
@@ -54,10 +55,23 @@ def support(
     return classes
 
 
-def of_faces(classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh) -> NDArray[np.uint8]:
+def of_faces(
+    classes: NDArray[np.uint8], road: RoadMask, mesh: Mesh, others: Sequence[tuple[int, Quality]] = ()
+) -> NDArray[np.uint8]:
     """Return the `Support` of the core cell under the centroid of each face, ``(F,)``.
 
-    Faces at the limit of the survey are inferred where the cell lies beyond it.
+    Faces at the limit of the survey, and at the outline of a deck, are inferred where the cell lies beyond.
+
+    Parameters
+    ----------
+    classes : ndarray
+        Those of the cells of level 0.
+    others : sequence of (int, Quality)
+        Number and quality of the other levels.
     """
-    kinds = classes[road.core.cells(*(middles(mesh.vertices, mesh.faces) + mesh.origin[:2]).T)]
+    cells = road.core.cells(*(middles(mesh.vertices, mesh.faces) + mesh.origin[:2]).T)
+    kinds = classes[cells]
+    if mesh.level is not None:
+        for number, of_level in others:
+            kinds = np.where(mesh.level == number, of_level.support[cells], kinds)
     return np.where(kinds == Support.NONE, np.uint8(Support.INFERRED), kinds)

@@ -16,6 +16,7 @@ from flexroad.tasks.meshing.parts import part
 from flexroad.tasks.meshing.relief import Relief, Sheet, sheet
 from flexroad.tasks.spline.surface import NurbsSurface
 from flexroad.tasks.types import Mesh, Orthophoto
+from tests.crossing import DECK_M, GROUND_M, RISE, WEST, Crossing
 from tests.validators.gltf import gltf_issues
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
@@ -310,9 +311,34 @@ def test_encoded_files_have_no_issue_by_the_khronos_validator(tmp_path):
         "road": glb.encode(hills(road_columns=20), RUN_ORIGIN),
         "textured": glb.encode(hills(), RUN_ORIGIN, image),
         "coarse": coarse(image.jpeg)[0],
+        "deck": glb.encode(Crossing((40.0, 30.0)).mesh()[0], RUN_ORIGIN),
     }
     for name, data in files.items():
         (tmp_path / f"{name}.glb").write_bytes(data)
     assert gltf_issues(tmp_path.iterdir()) == []
     (tmp_path / "damaged.glb").write_bytes(files["plain"][:-4])
     assert gltf_issues([tmp_path / "damaged.glb"])
+
+
+def test_encode_deck_is_a_node_of_its_own():
+    crossing = Crossing((40.0, 30.0))
+    mesh, surface = crossing.mesh()
+    data = glb.encode(mesh, (WEST, mesh.origin[1], 0.0), normals=mesh_normals(mesh, surface))
+    tree = gltf_json(data)
+    names = {node["name"]: node for node in tree["nodes"]}
+    level = names["level 1"]
+    assert [tree["nodes"][k]["name"] for k in names["tile"]["children"]] == ["road", "terrain", "level 1"]
+    (deck,) = (tree["nodes"][k] for k in level["children"])
+    accessor = tree["meshes"][deck["mesh"]]["primitives"][0]["attributes"]["POSITION"]
+    height = np.array([tree["accessors"][accessor][k][1] for k in ("min", "max")]) + mesh.origin[2]
+    np.testing.assert_allclose(height, DECK_M + RISE * np.array([30, 50]), atol=1e-3)
+    ground = mesh.at(0).vertices[:, 2].min() + mesh.origin[2]
+    assert ground == pytest.approx(GROUND_M)
+
+
+def test_encode_normals_of_deck_are_those_of_its_level():
+    mesh, surface = Crossing((60.0, 30.0)).mesh()
+    normals = mesh_normals(mesh, surface)
+    deck = np.unique(mesh.faces[mesh.level == 1])
+    plane = np.array([-RISE, 0.0, 1.0]) / np.hypot(RISE, 1.0)
+    np.testing.assert_allclose(normals[deck], np.broadcast_to(plane, (len(deck), 3)), atol=2e-3)

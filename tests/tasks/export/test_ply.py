@@ -7,6 +7,7 @@ import trimesh
 
 from flexroad.tasks.export import ply
 from flexroad.tasks.types import Mesh
+from tests.crossing import Crossing
 
 
 def roof(crs: str = "EPSG:25832") -> Mesh:
@@ -22,7 +23,7 @@ def parse(data: bytes) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Return header lines, vertices and faces, parsed by the PLY specification."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
-    kinds = {"double": "<f8", "float": "<f4", "uchar": "u1", "int": "<i4"}
+    kinds = {"double": "<f8", "float": "<f4", "uchar": "u1", "int": "<i4", "char": "i1"}
     counts, fields, element = {}, {}, ""
     for words in (line.split() for line in lines):
         if words[0] == "element":
@@ -100,3 +101,15 @@ def test_encode_is_read_by_vtk(tmp_path):
 
 def test_encode_equal_meshes_give_equal_bytes():
     assert ply.encode(roof(), SUPPORT) == ply.encode(roof(), SUPPORT)
+
+
+def test_encode_faces_and_vertices_have_their_level():
+    mesh, _ = Crossing((40.0, 30.0)).mesh()
+    data = ply.encode(mesh, np.ones(len(mesh.faces), np.uint8))
+    lines, vertices, faces = parse(data)
+    assert lines.count("property char level") == 2
+    np.testing.assert_array_equal(faces["level"], mesh.level)
+    np.testing.assert_array_equal(vertices["level"][faces["vertex_indices"]], np.stack([mesh.level] * 3, 1))
+    read = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert "level" not in ply.encode(roof(), SUPPORT).split(b"end_header")[0].decode()

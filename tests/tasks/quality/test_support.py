@@ -1,5 +1,7 @@
 """Support of the surface and validity of the DTM under a road, on synthetic data with known result."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,8 +16,10 @@ from flexroad.tasks.roads.dtm_validity import (
     invalid_dtm,
     without_invalid_dtm,
 )
-from flexroad.tasks.types import Mesh, RoadClusters, RoadMask, TileData
+from flexroad.tasks.types import Mesh, Quality, RoadClusters, RoadMask, TileData
+from tests.crossing import SOUTH, WEST, Crossing
 
+FIGURES = [name for name, kind in Quality.__annotations__.items() if kind == "float"]
 GRID = Grid("EPSG:25832", 295500.0, 5629500.0, 1.0, 60, 50)
 ROW, COL = np.indices(GRID.shape)
 NOWHERE = np.zeros(GRID.shape, bool)
@@ -150,3 +154,15 @@ def test_invalid_dtm_under_crown_on_bridge():
     deck, crown = STREET & (COL > 10) & (COL < 50), STREET & (COL > 27) & (COL < 34)
     invalid = invalid_dtm(tile(dsm=RAMP + 5 * deck), street(deck), deck & ~crown)
     np.testing.assert_array_equal(invalid, crown)
+
+
+def test_of_faces_of_a_deck_uses_its_own_classes():
+    mesh, _ = Crossing((40.0, 30.0)).mesh()
+    grid = Grid(GRID.crs, WEST, SOUTH + 60, 1.0, 60, 60)
+    road = RoadMask(grid, grid, np.zeros(grid.shape, bool), np.zeros(grid.shape, bool))
+    ground, deck = (np.full(grid.shape, kind, np.uint8) for kind in (Support.INFERRED, Support.MEASURED))
+    quality = Quality(**dict.fromkeys(FIGURES, 0.0), flags=(), support=deck)
+    kinds = of_faces(ground, road, mesh, ((1, quality),))
+    np.testing.assert_array_equal(kinds == Support.MEASURED, mesh.level == 1)
+    assert quality.at(1) is quality
+    assert replace(quality, levels=((2, quality),)).at(2) is quality
