@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from pyproj.exceptions import ProjError
 
 from flexroad.catalog import Tile
 from flexroad.catalog.crs import transformer
@@ -23,7 +24,7 @@ from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.options import Options
 from flexroad.tasks.quality.decks import Deck, likely_decks
 from flexroad.tasks.roads import level_numbers, rasterise
-from flexroad.tasks.types import Bools, TileData
+from flexroad.tasks.types import TileData
 
 FILE = "decks.geojson"
 MAKER = {"generator": "flexroad catalog check"}
@@ -83,6 +84,8 @@ def _written(path: Path, found: Sequence[tuple[Tile, Deck]]) -> Iterator[Finding
             yield Finding(f"{_told(found)}: check {path}, then give roads there a level")
         elif is_old:
             remove(path)
+    except ProjError:
+        yield Finding(f"{_told(found)}; no map of them, as their CRS has no place on the Earth")
     except OSError as error:
         remedy = "check a copy of the catalog in a folder that can be written"
         yield Finding(f"{_told(found)}; {path} cannot be written ({write_reason(error)}): {remedy}")
@@ -139,7 +142,7 @@ def _decks(tile: Tile, reading: load.Options, selection: Options) -> list[Deck]:
         if road is None:
             return []
         decks = likely_decks(data.dsm, data.dtm, road, data.grid)
-        named = _named(data, options) if decks else None
+        named = _named(data, options) if decks else np.empty(0, object)
     except TaskError:
         # What a run could not read has a line of its own.
         return []
@@ -150,20 +153,21 @@ def _decks(tile: Tile, reading: load.Options, selection: Options) -> list[Deck]:
         for deck in decks
         if west <= (centre := deck.area.centroid).x < east
         and south <= centre.y < north
-        and not (named is not None and (deck.cells & named).any())
+        and not shapely.intersects(named, deck.area).any()
     ]
 
 
-def _named(data: TileData, options: rasterise.Options) -> Bools | None:
-    """Return the cells on and near roads above level 0, ``(H, W)``; None if the tile has no vectors."""
-    if data.roads is None:
-        return None
-    layer, names = options.layer or data.roads.sublayer, level_numbers.columns()
-    shapes = []
-    for path in data.roads.paths:
-        query = Query(path, layer, options.where, names, data.roads.crs, data.grid.crs)
-        table = read_near(query, data.grid.bounds)
+def _named(data: TileData, options: rasterise.Options) -> NDArray[np.object_]:
+    """Return the roads of a tile that are above level 0, as areas, ``(n,)``; none without vectors."""
+    source = data.roads
+    if source is None:
+        return np.empty(0, object)
+    shapes, layer, names = [], options.layer or source.sublayer, level_numbers.columns()
+    for path in source.paths:
+        table = read_near(
+            Query(path, layer, options.where, names, source.crs, data.grid.crs), data.grid.bounds
+        )
         numbers, _ = level_numbers.level_numbers(table)
         shapes.append(table.geometry.to_numpy()[numbers > 0])
-    near: NDArray[np.object_] = shapely.buffer(np.concatenate(shapes), options.default_width_m / 2)
-    return rasterise.cells(near, data.grid)
+    areas: NDArray[np.object_] = shapely.buffer(np.concatenate(shapes), options.default_width_m / 2)
+    return areas

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label
 
 from flexroad.catalog.grid import Grid
 from flexroad.catalog.lazy import lazy
@@ -38,8 +39,6 @@ class Deck:
 
     area: shapely.Geometry
     """Outline of its flat cells."""
-    cells: Bools
-    """These cells, ``(H, W)``."""
     rise_m: float
     """Median height above the DTM."""
     ends: int
@@ -71,12 +70,23 @@ def likely_decks(dsm: Floats, dtm: Floats, road: Bools, grid: Grid) -> list[Deck
     parts, number = label(flat & (rise > RISE_M), EVERY_WAY)
     sizes = np.bincount(parts.ravel(), minlength=number + 1) * grid.cell**2
     decks = []
-    for k in np.flatnonzero(sizes >= AREA_M2):
-        if k:
-            own = parts == k
-            ends = _ends(own, street, dsm, grid.cell)
-            decks.append(Deck(_outline(own, grid), own, float(np.median(rise[own])), ends))
+    for k, box in enumerate(find_objects(parts), 1):
+        if sizes[k] >= AREA_M2:
+            # Only what is near matters: a tile may have millions of cells.
+            around = _grown(box, math.ceil(END_M / grid.cell) + 1, road.shape)
+            own, here = parts[around] == k, grid.part(*around)
+            ends = _ends(own, street[around], dsm[around], grid.cell)
+            decks.append(Deck(_outline(own, here), float(np.median(rise[around][own])), ends))
     return decks
+
+
+def _grown(box: tuple[slice, ...], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return the rows and columns of a box, and so many cells on each side of it."""
+    rows, cols = (
+        slice(max(side.start - cells, 0), min(side.stop + cells, length))
+        for side, length in zip(box, shape, strict=True)
+    )
+    return rows, cols
 
 
 def _ends(own: Bools, street: Bools, dsm: Floats, cell: float) -> int:

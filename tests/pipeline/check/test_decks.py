@@ -1,11 +1,14 @@
 import json
+from datetime import UTC, datetime
 
 import geopandas
 import pytest
 import shapely
 
+from flexroad.catalog import Grid, Tile
 from flexroad.pipeline.benchmark.scenes import write_scenes
 from flexroad.pipeline.check import decks
+from flexroad.tasks.quality.decks import Deck
 from flexroad.tasks.roads.level_numbers import level_numbers
 from flexroad.tasks.synthetic.crossings import Crossings
 from tests.permissions import permissions_enforced
@@ -101,6 +104,15 @@ def test_folder_that_cannot_be_written_is_one_line(unnamed, told):
         f"{LINE}; {path} cannot be written (Permission denied): "
         "check a copy of the catalog in a folder that can be written"
     )
+
+
+def test_tiles_in_local_coordinates_have_no_map(tmp_path):
+    site = 'LOCAL_CS["my site",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    deck = Deck(shapely.box(0, 0, 9, 9), 6.0, 2)
+    tile = Tile("a", Grid(site, 0, 60, 1.0, 60, 60), (), "", datetime.now(UTC))
+    (line,) = decks._written(tmp_path / "decks.geojson", [(tile, deck)])
+    assert line.text == f"{LINE}; no map of them, as their CRS has no place on the Earth"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_large_catalog_is_mapped_if_asked_for(unnamed, told, monkeypatch):
