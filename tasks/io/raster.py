@@ -305,8 +305,8 @@ def resample_to(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floa
         resampling=resampling,
         # GDAL would estimate the ratio of the cells from the window, and then give other values for a cell of
         # two overlapping windows.
-        XSCALE=lattice.dx / grid.cell,
-        YSCALE=lattice.dy / grid.cell,
+        XSCALE=_scale(lattice.dx / grid.cell),
+        YSCALE=_scale(lattice.dy / grid.cell),
     )
     return values
 
@@ -365,9 +365,10 @@ def _warped(patch: RasterWindow, grid: Grid, resampling: Resampling) -> Floats:
 def _scale(ratio: float) -> float:
     """Return the ratio of cells for GDAL, which averages below 0.95: only where two cells lie in one.
 
-    It is rounded, because it differs a little from window to window.
+    Averages over a whole number of cells alone are exact on a plane. The ratio of a warped file differs a
+    little from window to window, so that the number does not change near the sizes that files have.
     """
-    return 1.0 if ratio > 0.5 else round(ratio, 3)
+    return 1 / max(1, math.floor(1 / ratio + 0.2))
 
 
 def joined(patches: Sequence[RasterWindow]) -> list[RasterWindow]:

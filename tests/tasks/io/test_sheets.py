@@ -81,6 +81,12 @@ def test_sheets_of_a_plane_have_its_heights_at_their_borders(sheets, tmp_path):
     assert_plane(load(tile(tmp_path, names), OFF))
 
 
+@pytest.mark.parametrize("cell", [0.95, 0.8, 0.762, 0.6, 0.4, 0.3048, 0.27, 0.2, 0.17])
+def test_plane_of_cells_that_divide_none_of_the_tile_is_exact(cell, tmp_path):
+    side = int(60 / cell)
+    assert_plane(load(tile(tmp_path, [sheet(tmp_path, 0, -10.13, 10.31, cell, side, side)]), OFF))
+
+
 def rough(x, y):
     return 100 + 5 * np.sin(x * 1.3) * np.cos(y * 0.9)
 
