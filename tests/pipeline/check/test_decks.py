@@ -11,6 +11,7 @@ from flexroad.pipeline.check import decks
 from flexroad.tasks.quality.decks import Deck
 from flexroad.tasks.roads.level_numbers import level_numbers
 from flexroad.tasks.synthetic.crossings import Crossings
+from tests.make_town import make_town
 from tests.permissions import permissions_enforced
 
 SEED = 15
@@ -123,6 +124,15 @@ def test_large_catalog_is_mapped_if_asked_for(unnamed, told, monkeypatch):
     assert not path.exists()
     assert told(unnamed, "--decks")[0].startswith(f"{LINE}: check {path}")
     assert path.exists()
+
+
+@pytest.mark.parametrize("config", ["production", "production_vector"])
+def test_decks_and_tunnels_of_an_osm_file_are_named(tmp_path, told, config):
+    catalog = make_town(tmp_path, size_m=60)
+    assert told(catalog, "--config", config) == []
+    tags = catalog.with_name("town.osm")
+    tags.write_text(tags.read_text().replace('k="bridge"', 'k="note"'))
+    assert told(catalog, "--config", config)[0].startswith(f"{LINE}: check")
 
 
 def test_catalog_without_roads_or_decks_has_no_line(survey, told):

@@ -1,8 +1,12 @@
 import numpy as np
 import pandas
 import pytest
+import shapely
 
+from flexroad.tasks.io.vectors import Query, read_near
 from flexroad.tasks.roads.level_numbers import columns, level_numbers
+from flexroad.tasks.synthetic.crossings import Crossings
+from tests.make_town import CRS, OPTIONS, write_streets
 
 
 def numbers(rows: list[dict]) -> list[int]:
@@ -134,3 +138,20 @@ def test_level_numbers_mixed_rows_and_empty_table():
     assert levels.shape == (0,)
     assert levels.dtype == np.int64
     assert notes == ()
+
+
+def test_level_numbers_of_an_osm_file_are_those_of_its_decks_and_tunnels(tmp_path):
+    """GDAL packs most of the tags into one column."""
+    around = (500_000, 5_600_000, 500_500, 5_600_500)
+    query = Query(write_streets(tmp_path / "town.osm", around), None, None, columns(), None, CRS)
+    town = read_near(query, around)
+    levels, notes = level_numbers(town)
+    assert notes == ()
+    assert len(town) >= 30
+    assert set(levels) == {-1, 0, 1}
+    world = Crossings(1, OPTIONS)
+    for level in (-1, 1):
+        areas = world.areas(level, around)
+        on_it = [shapely.contains(areas, line.centroid).any() for line in town.geometry[levels == level]]
+        assert on_it
+        assert all(on_it)
