@@ -41,6 +41,11 @@ GDAL = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
     # Otherwise GDAL does not report the vertical CRS of GeoTIFF 1.0 files.
     "GTIFF_REPORT_COMPD_CS": "YES",
+    # The defaults, whatever an environment variable or GDAL's configuration file says: the first two move
+    # rasters, the last one hides side-car files.
+    "GTIFF_POINT_GEO_IGNORE": "FALSE",
+    "GTIFF_HONOUR_NEGATIVE_SCALEY": "NO",
+    "GDAL_PAM_ENABLED": "YES",
     # Do not write a file with the unpacked size beside a .gz file.
     "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
 }

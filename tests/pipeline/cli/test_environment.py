@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import rasterio
 
+from flexroad.catalog.sources.rasters import index
 from flexroad.pipeline.cli import environment
 from flexroad.pipeline.cli.environment import FOLDERS, PLACES, drop_foreign
+from flexroad.tasks.load import Options, load
 from tests.command_line import PROCESS
 from tests.make_rasters import write
 
@@ -30,6 +32,17 @@ def test_folders_of_the_own_environment_stay_where_rasterio_has_no_data(has_own_
     drop_foreign(variables)
     kept = set() if has_own_data else {*FOLDERS} - {"GDAL_DATA"}
     assert set(variables) == kept
+
+
+def test_library_reads_a_raster_where_it_lies_with_an_option_of_another_program(tmp_path):
+    heights = np.add.outer(np.arange(60.0), np.arange(60.0))
+    for layer in ("dsm", "dtm"):
+        with rasterio.open(write(tmp_path / f"{layer}.tif", heights), "r+") as raster:
+            raster.update_tags(AREA_OR_POINT="Point")
+    (tile,) = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=60).tiles
+    with rasterio.Env(GTIFF_POINT_GEO_IGNORE="YES"):
+        assert index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=60).tiles == (tile,)
+        np.testing.assert_array_equal(load(tile, Options()).dsm, heights)
 
 
 def test_catalog_is_the_same_with_variables_of_other_programs(tmp_path):
