@@ -107,7 +107,9 @@ def load(tile: Tile, options: Options) -> TileData:
         mosaics["dtm"].check_valid(tile, 0.0)
     offset_dsm, remarks = _offset(tile, options)
     models = mosaics["dsm"].values, mosaics["dtm"].values
-    if suspect := offset_note(*models) or below_ground_note(*models):
+    # Of the tile alone: the sheets of its neighbours may have other heights.
+    window = grid.window(tile.grid)
+    if suspect := offset_note(*(model[window] for model in models)) or below_ground_note(*models):
         remarks = [*remarks, suspect]
     return TileData(
         tile_id=tile.id,

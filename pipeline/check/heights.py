@@ -21,7 +21,7 @@ MOST_ROAD = 0.9
 
 
 def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Yield what DSM and DTM say of each other: one line each on units, an offset, and a step between sheets.
+    """Yield what DSM and DTM say of each other: a line on units, and one on an offset or a step.
 
     Parameters
     ----------
@@ -32,8 +32,13 @@ def height_findings(trials: Sequence[Trial]) -> Iterator[Finding]:
     yield from (Finding(f"{note}: if they are in metres, correct the unit") for note in converted)
     lines = on_tiles([tile.note for tile in trials if tile.note], len(trials))
     yield from (Finding(line, fault=True) for line in lines)
-    if not lines and (step := _step(trials)):
+    if lines:
+        return
+    if step := _step(trials):
         yield Finding(step, fault=True)
+        return
+    roads = [tile.road for tile in trials if road_is_off(tile.road)]
+    yield from map(Finding, road_step(roads, len(trials)))
 
 
 def road_is_off(row: Mapping[str, Any]) -> bool:
@@ -59,7 +64,7 @@ def road_step(rows: Iterable[Mapping[str, Any]], tiles: int) -> Iterator[str]:
         if metres:
             yield (
                 f"the road lies {median(metres):.2f} m {side} the DTM on {len(metres)} of "
-                f"{count(tiles, 'tile')}: files of two vertical references?"
+                f"{count(tiles, 'tile')}: another vertical reference?"
             )
 
 

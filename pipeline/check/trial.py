@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexroad.catalog import LAYERS, Tile
 from flexroad.catalog.text import some
 from flexroad.pipeline.check.finding import Finding
@@ -17,6 +19,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.io.height_offset import Offset, offset_note, open_offset
 from flexroad.tasks.io.height_units import is_conversion
 from flexroad.tasks.options import stage_function, stage_module
+from flexroad.tasks.types import Bools, Floats
 
 MOST_TILES = 48
 """Number of tiles that are read: those with a doubtful file first, then one of each set of files."""
@@ -36,6 +39,8 @@ class Trial:
     """That the DSM lies off the DTM as a whole; None if it does not."""
     units: tuple[str, ...]
     """Notes on heights that were converted to metres."""
+    road: Mapping[str, float]
+    """Median of DSM minus DTM on the road, and share of it off the DTM, as in metrics; empty if none."""
 
 
 def trials(
@@ -100,14 +105,30 @@ def _trial(tile: Tile, chain: Mapping[str, Any]) -> Trial:
         As of these stages.
     """
     data = load.load(tile, chain["load"])
+    road = data.road_mask
     if "roads" in getattr(stage_module(chain["segment"]), "READS", ()):
-        stage_function("segment", chain["segment"])(data, chain["segment"])
+        road = stage_function("segment", chain["segment"])(data, chain["segment"]).mask
     if space_of := getattr(stage_module(chain["fit"]), "space_of", None):
         space_of(data, chain["fit"])
     core = data.grid.window(data.core)
     models = data.dsm[core], data.dtm[core]
     units = tuple(filter(is_conversion, data.notes))
-    return Trial(tile.id, _sheets(tile, load.NEEDS), open_offset(*models), offset_note(*models), units)
+    return Trial(
+        tile.id,
+        _sheets(tile, load.NEEDS),
+        open_offset(*models),
+        offset_note(*models),
+        units,
+        {} if road is None else _on_road(models[0] - models[1], road[core], chain["assess"].agree_m),
+    )
+
+
+def _on_road(above: Floats, road: Bools, agree_m: float) -> dict[str, float]:
+    """Return how far the DSM is above the DTM on the road, as in metrics; empty without road."""
+    cells = above[road & np.isfinite(above)]
+    if not cells.size:
+        return {}
+    return {"off_dtm_m": float(np.median(cells)), "off_dtm_road": float(np.mean(np.abs(cells) > agree_m))}
 
 
 def _sample(tiles: Sequence[Tile], doubtful: Collection[str]) -> list[Tile]:

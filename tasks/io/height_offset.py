@@ -23,8 +23,10 @@ OPEN_M = 1.0
 """Open ground is smooth and within this of the lowest (m)."""
 SMOOTH_SHARE, OPEN_SHARE = 0.05, 0.25
 """Least share of smooth cells in those with both heights, and of open ones in the smooth."""
-FEET = {1 / 0.3048: "the DSM in feet, the DTM in metres?", 0.3048: "the DTM in feet, the DSM in metres?"}
-"""Ratio of DSM to DTM if one of them is in feet -> which."""
+UNITS = {"feet": 0.3048, "dm": 0.1, "cm": 0.01, "mm": 0.001}
+"""Units that one of the models may be in, in metres."""
+HIGH_M = 3 * FAR_M
+"""Height of the ground from which a ratio of heights tells more than that both are near 0 (m)."""
 ABOVE, RATIO = "the DSM lies ", "the heights of the DSM are "
 """Begin of notes on an offset, and on a ratio."""
 
@@ -66,7 +68,7 @@ def open_offset(dsm: Floats, dtm: Floats) -> Offset | None:
 def offset_note(dsm: Floats, dtm: Floats) -> str | None:
     """Return a note if hardly a cell of a DSM is near the DTM (m, same shape), and the offset is constant.
 
-    Or if the heights of one are those of the other in feet; else None.
+    Or if the heights of one are those of the other in another unit; else None.
     """
     most = LOWEST / 100
     # Every fourth row of most tiles has near cells enough for all of it.
@@ -77,15 +79,26 @@ def offset_note(dsm: Floats, dtm: Floats) -> str | None:
     if not known or near > most * known:
         return None
     offset = open_offset(dsm, dtm)
-    for ratio, which in FEET.items():
-        scaled = open_offset(dsm, ratio * dtm)
-        if scaled and abs(scaled.median_m) <= FAR_M and (not offset or scaled.spread_m <= offset.spread_m):
-            return f"{RATIO}{ratio:.2f} times those of the DTM: {which}"
+    for unit, metres in UNITS.items():
+        for ratio, which, scaled in (
+            (1 / metres, f"the DSM in {unit}, the DTM in metres?", (dsm * metres, dtm)),
+            (metres, f"the DTM in {unit}, the DSM in metres?", (dsm, dtm * metres)),
+        ):
+            if _agree(*scaled, offset):
+                return f"{RATIO}{ratio:.{2 if ratio > 0.05 else 3}f} times those of the DTM: {which}"
     if offset is None or abs(offset.median_m) < FAR_M or offset.spread_m > CONSTANT_M:
         return None
     if offset.median_m > 0:
         return f"{ABOVE}{offset.median_m:.1f} m above the DTM: ellipsoidal heights?"
     return f"{ABOVE}{-offset.median_m:.1f} m below the DTM: ellipsoidal heights, or are their files swapped?"
+
+
+def _agree(dsm: Floats, dtm: Floats, unscaled: Offset | None) -> bool:
+    """Return whether a DSM lies on a DTM after one of them was converted, and better than before."""
+    found = open_offset(dsm, dtm)
+    if not found or abs(found.median_m) > FAR_M or np.nanmedian(np.abs(dtm)) < HIGH_M:
+        return False
+    return not unscaled or found.spread_m <= unscaled.spread_m
 
 
 def is_offset(note: str) -> bool:

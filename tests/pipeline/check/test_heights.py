@@ -10,6 +10,7 @@ from flexroad.pipeline.check.catalog import expected_failures
 from flexroad.pipeline.check.heights import height_findings
 from flexroad.pipeline.check.trial import trials
 from flexroad.pipeline.config.loading import load_config
+from flexroad.tasks.load import Options, load
 from tests.make_rasters import write
 
 WEST, NORTH = 499_980.0, 5_600_040.0
@@ -107,10 +108,10 @@ def test_sample_has_a_tile_of_each_sheet(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("step", "line"),
     [
-        (0.4, "note: the road lies 0.40 m below the DTM on 1 of 2 tiles: files of two vertical references? "),
+        (0.4, "note: the road lies 0.40 m below the DTM on 1 of 2 tiles: another vertical reference? "),
         (
             -0.7,
-            "note: the road lies 0.70 m above the DTM on 1 of 2 tiles: files of two vertical references? ",
+            "note: the road lies 0.70 m above the DTM on 1 of 2 tiles: another vertical reference? ",
         ),
         (0.2, ""),
     ],
@@ -127,6 +128,31 @@ def test_run_names_a_step_between_tiles(tmp_path, flexroad, step, line):
     for _ in ("computed", "up to date"):
         notes = [text for text in flexroad(*run).expected(0).err.splitlines() if text.startswith("note: ")]
         assert notes == ([f"{line}`flexroad catalog check` compares them"] if line else [])
+
+
+def test_road_off_the_dtm_on_all_tiles_is_a_remark(tmp_path):
+    """Without a step, fields of crops would be off, too, but a road is not."""
+    write(tmp_path / "dsm.tif", PLANE + np.float32(0.6), WEST, NORTH)
+    write(tmp_path / "dtm.tif", PLANE, WEST, NORTH)
+    road = np.zeros(PLANE.shape, np.uint8)
+    road[26:34] = 1
+    write(tmp_path / "road.tif", road, WEST, NORTH)
+    layers = {"dsm": "dsm.tif", "dtm": "dtm.tif", "road_mask": "road.tif"}
+    findings = list(
+        expected_failures(index(tmp_path, layers, tile_size_m=60).tiles, load_config("paper"), LAYERS)
+    )
+    assert [(one.text, one.fault) for one in findings] == [
+        ("the road lies 0.60 m above the DTM on 2 of 2 tiles: another vertical reference?", False)
+    ]
+
+
+def test_neighbours_of_other_heights_do_not_hide_an_offset_from_the_run(tmp_path):
+    write(tmp_path / "dsm.tif", (PLANE + 20 * EAST).astype(np.float32), WEST, NORTH)
+    write(tmp_path / "dtm.tif", PLANE, WEST, NORTH)
+    west, east = index(tmp_path, {"dsm": "dsm.tif", "dtm": "dtm.tif"}, tile_size_m=60).tiles
+    options = Options(halo_m=50)
+    assert load(east, options).notes == ("the DSM lies 20.0 m above the DTM: ellipsoidal heights?",)
+    assert load(west, options).notes == ()
 
 
 def test_synthetic_survey_is_clean(survey):

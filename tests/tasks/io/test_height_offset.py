@@ -57,6 +57,38 @@ def test_feet_against_metres_is_a_ratio_on_flat_and_steep_ground():
         )
 
 
+@pytest.mark.parametrize(
+    ("unit", "metres", "ratios"),
+    [
+        ("feet", 0.3048, ("3.28", "0.30")),
+        ("dm", 0.1, ("10.00", "0.10")),
+        ("cm", 0.01, ("100.00", "0.010")),
+        ("mm", 0.001, ("1000.00", "0.001")),
+    ],
+)
+def test_other_unit_of_a_town_is_a_ratio(unit, metres, ratios):
+    """The difference of neighbouring cells is that many times as large, too."""
+    for models, ratio, which in (
+        ((town() / metres, GROUND), ratios[0], f"the DSM in {unit}, the DTM in metres?"),
+        ((town(), GROUND / metres), ratios[1], f"the DTM in {unit}, the DSM in metres?"),
+    ):
+        assert offset_note(*models) == f"the heights of the DSM are {ratio} times those of the DTM: {which}"
+
+
+@pytest.mark.parametrize("stratum", ["urban", "suburban", "rural"])
+def test_feet_of_a_survey_are_a_ratio(stratum):
+    """In feet its differences between neighbours are more than those of open ground in metres."""
+    scene = make_scene(GRID, 3, stratum)
+    assert offset_note(scene.dsm / 0.3048, scene.dtm) == (
+        "the heights of the DSM are 3.28 times those of the DTM: the DSM in feet, the DTM in metres?"
+    )
+
+
+def test_offset_over_a_coast_is_no_ratio():
+    coast = 0.5 + 0.004 * COL
+    assert offset_note(coast + 47, coast) == "the DSM lies 47.0 m above the DTM: ellipsoidal heights?"
+
+
 def test_wood_without_open_ground_has_no_offset():
     """Crowns of 10 to 30 m everywhere: there is no open cell to compare."""
     crowns = GROUND + np.random.default_rng(2).uniform(10, 30, GROUND.shape)
