@@ -102,6 +102,8 @@ def features(
 ) -> bytes:
     """Return the lines of one tile: its road and its terrain, or one of them if the other has no face.
 
+    A deck is a bridge, and a tube a tunnel, with the number of its level as attribute.
+
     Vertices that round to the same millimetres are one vertex, and faces that two of them share are left out:
     they have no area.
 
@@ -121,11 +123,16 @@ def features(
     whole = np.rint(points / SCALE_M).astype(np.int64)
     attributes = {"tile": tile_id} | ({"verticalCRS": vertical} if vertical else {})
     lines = []
-    for kind, faces in (("Road", mesh.road), ("TINRelief", ~mesh.road)):
+    ground = np.ones(len(mesh.faces), np.bool_) if mesh.level is None else mesh.level == 0
+    objects = [("Road", 0, ground & mesh.road), ("TINRelief", 0, ground & ~mesh.road)]
+    for number in mesh.numbers[1:]:
+        objects.append(("Bridge" if number > 0 else "Tunnel", number, mesh.level == number))
+    for kind, number, faces in objects:
         vertices, corners = _parts(whole, mesh.faces[faces])
         if len(corners):
-            name = f"{tile_id}-{kind.lower()}"
-            item = {"type": kind, "attributes": attributes, "geometry": [_geometry(kind, corners)]}
+            name = f"{tile_id}-{kind.lower()}" + (f"{abs(number)}" if number else "")
+            own = attributes | ({"level": number} if number else {})
+            item = {"type": kind, "attributes": own, "geometry": [_geometry(kind, corners)]}
             lines.append(
                 _line(
                     {
@@ -153,7 +160,8 @@ def _geometry(kind: str, corners: Whole) -> dict[str, Any]:
     surfaces = corners[:, None, :].tolist()
     if kind == "TINRelief":
         return {"type": "CompositeSurface", "lod": LOD, "boundaries": surfaces}
-    semantics = {"surfaces": [{"type": "TrafficArea"}], "values": [0] * len(corners)}
+    meaning = "TrafficArea" if kind == "Road" else "OuterFloorSurface"
+    semantics = {"surfaces": [{"type": meaning}], "values": [0] * len(corners)}
     return {"type": "MultiSurface", "lod": LOD, "boundaries": surfaces, "semantics": semantics}
 
 

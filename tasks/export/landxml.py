@@ -13,7 +13,7 @@ import gzip
 import io
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -64,6 +64,8 @@ POINT_START, POINT_END = b'<P id="%d">%b\n', "%.4f %.4f %.4f</P>\n"
 FACE = b"<F>%d %d %d</F>\n"
 CLASSES = (("road", "Road surface"), ("ground", "Ground beside the road"))
 """Name and meaning of the surfaces."""
+LEVEL = "level"
+"""Begin of the names of the other levels in a part's archive."""
 
 Place = tuple[int, int, int]
 """Easting, northing and height in units of the last decimal."""
@@ -107,6 +109,8 @@ class Part:
     """Sum of the angles in plan of the faces around each of them (radians), ``(R,)``."""
     surfaces: tuple[PartSurface, PartSurface]
     """Road and ground."""
+    levels: tuple[tuple[int, Part], ...] = ()
+    """Number and part of each other level, which has a road alone."""
 
     def encode(self) -> bytes:
         """Return the part as NumPy archive, for `decode`."""
@@ -114,6 +118,8 @@ class Part:
         for number, surface in enumerate(self.surfaces):
             arrays[f"points{number}"] = np.frombuffer(surface.points, np.uint8)
             arrays |= {f"{name}{number}": getattr(surface, name) for name in ("corners", "rim", "limits")}
+        for number, other in self.levels:
+            arrays[f"{LEVEL}{number}"] = np.frombuffer(other.encode(), np.uint8)
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its flags are named like no array
         return buffer.getvalue()
@@ -128,7 +134,12 @@ class Part:
                 )
                 for k in range(2)
             )
-            return cls(str(npz["crs"]), npz["places"], npz["angles"], (road, ground))
+            levels = tuple(
+                (int(name.removeprefix(LEVEL)), cls.decode(npz[name].tobytes()))
+                for name in npz.files
+                if name.startswith(LEVEL)
+            )
+            return cls(str(npz["crs"]), npz["places"], npz["angles"], (road, ground), levels)
 
 
 def part(mesh: Mesh, joined: bool = True) -> Part:
@@ -141,13 +152,15 @@ def part(mesh: Mesh, joined: bool = True) -> Part:
     joined : bool
         Whether it shares the vertices at its border with its neighbours (`Project.joined`).
     """
+    levels = tuple((number, part(mesh.at(number), joined)) for number in mesh.numbers[1:])
+    mesh = mesh.at(0)
     points = mesh.vertices + np.asarray(mesh.origin, np.float64)
     rim = _rim(mesh) if joined else np.zeros(0, np.intp)
     row = np.full(len(points), -1, np.int32)
     row[rim] = np.arange(len(rim))
     places = np.rint(points[rim] * 10**DECIMALS).astype(np.int64)
     road, ground = (_part_surface(mesh, faces, points, row) for faces in (mesh.road, ~mesh.road))
-    return Part(mesh.crs, places, _angles(mesh)[rim], (road, ground))
+    return Part(mesh.crs, places, _angles(mesh)[rim], (road, ground), levels)
 
 
 def _part_surface(mesh: Mesh, faces: Bools, points: Floats, row: NDArray[np.int32]) -> PartSurface:
@@ -210,11 +223,16 @@ def join(
         If no mesh has a face, or if two meshes have different CRSs.
     """
     with ExitStack() as stack:
-        road, ground = (
-            _Surface(name, meaning, _temporary(stack, folder), _temporary(stack, folder))
-            for name, meaning in CLASSES
-        )
-        system = _collect(parts_of_meshes, (road, ground))
+
+        def surfaces_of(number: int) -> list[_Surface]:
+            level = f" level {number}" if number else ""
+            return [
+                _Surface(name + level, meaning + level, _temporary(stack, folder), _temporary(stack, folder))
+                for name, meaning in CLASSES
+            ]
+
+        surfaces = {0: surfaces_of(0)}
+        system = _collect(parts_of_meshes, surfaces, surfaces_of)
         if compress:
             # Name and time of the archive are left out: equal inputs give equal bytes.
             packed = gzip.GzipFile(filename="", mode="wb", fileobj=file, compresslevel=6, mtime=0)
@@ -226,8 +244,9 @@ def join(
             project=_quoted(project.name),
         )
         file.write(head.encode())
-        for surface in (road, ground):
-            surface.copy_to(file)
+        for number in sorted(surfaces, key=lambda number: (number != 0, number)):
+            for surface in surfaces[number]:
+                surface.copy_to(file)
         file.write(b"</Surfaces>\n</LandXML>\n")
 
 
@@ -235,10 +254,22 @@ def _temporary(stack: ExitStack, folder: Path | None) -> IO[bytes]:
     return stack.enter_context(tempfile.TemporaryFile(dir=folder))
 
 
-def _collect(parts_of_meshes: Iterable[Part], surfaces: tuple[_Surface, _Surface]) -> str:
-    """Add the faces of all parts to the surfaces of road and ground; return the meshes' CRS."""
+def _collect(
+    parts_of_meshes: Iterable[Part],
+    surfaces: dict[int, list[_Surface]],
+    surfaces_of: Callable[[int], list[_Surface]],
+) -> str:
+    """Add the faces of all parts to the surfaces of their level; return the meshes' CRS.
+
+    Parameters
+    ----------
+    surfaces : dict
+        Road and ground of each level; those of further levels are added.
+    surfaces_of : callable
+        Makes those of a level.
+    """
     system = ""
-    open_vertices: dict[Place, _OpenVertex] = {}
+    open_vertices: dict[int, dict[Place, _OpenVertex]] = {}
     for one in parts_of_meshes:
         system = system or one.crs
         if one.crs != system:
@@ -246,15 +277,23 @@ def _collect(parts_of_meshes: Iterable[Part], surfaces: tuple[_Surface, _Surface
                 f"meshes in {crs.short(system)} and {crs.short(one.crs)} do not fit in one LandXML file;"
                 " export each CRS to a file of its own"
             )
-        at_rim = _at_rim(one, open_vertices)
-        for number, (surface, faces) in enumerate(zip(surfaces, one.surfaces, strict=True)):
-            surface.add(faces, number, at_rim)
-        for vertex in at_rim:
-            if vertex.angle > FULL_TURN:
-                open_vertices.pop(vertex.place, None)
-    if not any(surface.faces for surface in surfaces):
+        for level, own in ((0, one), *one.levels):
+            if level not in surfaces:
+                surfaces[level] = surfaces_of(level)
+            _add(own, surfaces[level], open_vertices.setdefault(level, {}))
+    if not any(surface.faces for surface in surfaces[0]):
         raise TaskError("no tile has a mesh with a face; choose an area with tiles that succeeded")
     return system
+
+
+def _add(own: Part, surfaces: Sequence[_Surface], open_vertices: dict[Place, _OpenVertex]) -> None:
+    """Add the faces of a part of one level to its surfaces."""
+    at_rim = _at_rim(own, open_vertices)
+    for number, (surface, faces) in enumerate(zip(surfaces, own.surfaces, strict=True)):
+        surface.add(faces, number, at_rim)
+    for vertex in at_rim:
+        if vertex.angle > FULL_TURN:
+            open_vertices.pop(vertex.place, None)
 
 
 @dataclass

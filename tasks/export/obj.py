@@ -37,6 +37,8 @@ COLOURS = {"road": (0.23, 0.23, 0.25), "terrain": (0.77, 0.745, 0.68)}
 def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None = None) -> bytes:
     """Return a mesh as OBJ with a group and a material for road and for terrain.
 
+    Decks and tubes are groups ``level_1``, by the number of their level, with the material of roads.
+
     Coordinates are rounded to 0.05 mm, texture coordinates to 5e-8 of the image. Faces are counter-clockwise
     from above. A class without faces has no group.
 
@@ -59,10 +61,13 @@ def encode(mesh: Mesh, materials: str, place: Georeference, photo: Bounds | None
     if photo:
         blocks.append(_rows("vt %.7f %.7f\n", texture_coordinates(mesh, photo).T))
     row = "f %d/%d %d/%d %d/%d\n" if photo else "f %d %d %d\n"
-    for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
+    ground = np.ones(len(mesh.faces), np.bool_) if mesh.level is None else mesh.level == 0
+    groups = [("road", "road", ground & mesh.road), ("terrain", "terrain", ground & ~mesh.road)]
+    groups += [(f"level_{number}", "road", mesh.level == number) for number in mesh.numbers[1:]]
+    for name, material, faces in groups:
         if faces.any():
             corners = mesh.faces[faces].T + 1
-            blocks.append(f"g {name}\nusemtl {name}\n")
+            blocks.append(f"g {name}\nusemtl {material}\n")
             blocks.append(_rows(row, np.repeat(corners, 2, axis=0) if photo else corners))
     return "".join(blocks).encode()
 

@@ -48,7 +48,8 @@ def encode(
     Parameters
     ----------
     mesh : Mesh
-        The mesh of the tile. A class without faces has a layer without an object.
+        The mesh of the tile. A class without faces has a layer without an object. A deck or tube has the
+        layer ``level 1``, by the number of its level.
     surface : NurbsSurface or None
         The surface of the tile; None if it is no NURBS. Its layer is then empty.
     bounds : tuple of float
@@ -72,9 +73,13 @@ def encode(
     layers = {name: _layer(rhino, model, name, colour) for name, colour in COLOURS.items()}
     if surface is not None:
         model.Objects.AddSurface(_surface(rhino, surface, bounds, place), layers["surface"])
-    for name, faces in (("road", mesh.road), ("terrain", ~mesh.road)):
+    ground = np.ones(len(mesh.faces), np.bool_) if mesh.level is None else mesh.level == 0
+    for name, faces in (("road", ground & mesh.road), ("terrain", ground & ~mesh.road)):
         if faces.any():
             model.Objects.AddMesh(_mesh(rhino, mesh, faces, place), layers[name])
+    for number in mesh.numbers[1:]:
+        layer = _layer(rhino, model, f"level {number}", COLOURS["road"])
+        model.Objects.AddMesh(_mesh(rhino, mesh, np.asarray(mesh.level == number), place), layer)
     return base64.b64decode(model.Encode())
 
 

@@ -1,6 +1,7 @@
 import io
 import json
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import cityjson
 from flexroad.tasks.types import Mesh
 from tests import validators
+from tests.crossing import Crossing
 
 ORIGIN = (295000.0, 5629000.0, 100.0)
 
@@ -54,15 +56,31 @@ def test_write_reads_back_within_half_a_millimetre():
         np.testing.assert_allclose(read(lines, kind), truth, rtol=0, atol=0.5e-3 + 1e-8)
 
 
+@pytest.mark.parametrize(("number", "kind"), [(1, "Bridge"), (-1, "Tunnel")])
+def test_write_deck_is_a_bridge_and_tube_a_tunnel(number, kind):
+    mesh, _ = Crossing((40.0, 30.0), number=number).mesh()
+    lines = written([mesh])
+    deck = mesh.at(number)
+    truth = (deck.vertices + deck.origin)[deck.faces]
+    np.testing.assert_allclose(read(lines, kind), truth, rtol=0, atol=0.5e-3 + 1e-8)
+    (item,) = (line["CityObjects"][line["id"]] for line in lines[1:] if line["id"] == f"t0-{kind.lower()}1")
+    assert item["attributes"]["level"] == number
+    assert item["geometry"][0]["semantics"]["surfaces"] == [{"type": "OuterFloorSurface"}]
+    ground = mesh.at(0)
+    faces = sum(len(read(lines, other)) for other in ("Road", "TINRelief"))
+    assert faces == len(ground.faces)
+
+
 @pytest.mark.slow
 def test_write_read_by_cjio_has_all_tiles_at_their_places(tmp_path):
-    meshes = [tile(0), tile(1)]
+    meshes = [tile(0), tile(1), replace(Crossing((40.0, 30.0)).mesh()[0], origin=tile(0).origin)]
     lines = "".join(json.dumps(line) + "\n" for line in written(meshes))
     command = [validators.program("cjio"), "--suppress_msg", "stdin", "save", "city.json"]
     subprocess.run(command, cwd=tmp_path, input=lines, text=True, check=True)
     city = json.loads((tmp_path / "city.json").read_text())
     kinds = [item["type"] for item in city["CityObjects"].values()]
-    assert (kinds.count("TINRelief"), kinds.count("Road")) == (1, 2)  # the second tile is all road
+    assert (kinds.count("TINRelief"), kinds.count("Road")) == (2, 3)  # the second tile is all road
+    assert kinds.count("Bridge") == 1
     transform = city["transform"]
     found = np.array(city["vertices"]) * transform["scale"] + transform["translate"]
     truth = np.concatenate([mesh.vertices + mesh.origin for mesh in meshes])

@@ -12,7 +12,9 @@ from pyproj import CRS
 from flexroad.tasks.errors import TaskError
 from flexroad.tasks.export import landxml
 from flexroad.tasks.export.landxml import Project
+from flexroad.tasks.sample import Options, sample
 from flexroad.tasks.types import Mesh
+from tests.crossing import Crossing
 
 WEST, SOUTH = 295500.0, 5629250.0
 PROJECT = Project("Aachen", datetime(2026, 5, 4, 3, 2, 1), "EPSG:7837")
@@ -177,3 +179,24 @@ def test_write_memory_grows_with_the_outline_only(tmp_path):
     peak(1)
     # An open vertex takes about 450 bytes. All 2,880 at borders of 90 tiles would take 1.3 MB.
     assert peak(30) - peak(2) < 0.5e6
+
+
+def test_write_decks_are_surfaces_of_their_level():
+    meshes = [sample(*t[:3], Options(), t.frame) for t in Crossing((60.0, 30.0)).tiles()]
+    read = surfaces(written(meshes))
+    assert list(read) == ["road", "ground", "road level 1"]
+    for name, number, road in (("road", 0, True), ("ground", 0, False), ("road level 1", 1, True)):
+        parts = [mesh.at(number) for mesh in meshes if number in mesh.numbers]
+        truth = np.concatenate([(m.vertices + m.origin)[m.faces[m.road == road]] for m in parts])
+        points, faces = read[name]
+        np.testing.assert_allclose(points[faces], truth, rtol=0, atol=0.6e-4)
+    points, _ = read["road level 1"]
+    assert len(np.unique(points, axis=0)) == len(points)
+
+
+def test_part_with_levels_is_read_back():
+    part = landxml.part(Crossing((40.0, 30.0)).mesh()[0])
+    ((number, deck),) = landxml.Part.decode(part.encode()).levels
+    assert number == 1
+    assert deck.surfaces[0].points == part.levels[0][1].surfaces[0].points
+    np.testing.assert_array_equal(deck.places, part.levels[0][1].places)

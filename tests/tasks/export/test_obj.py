@@ -6,6 +6,7 @@ from PIL import Image
 from flexroad.tasks.export import obj
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.types import Mesh
+from tests.crossing import Crossing
 
 ORIGIN = (295500.0, 5629250.0, 150.0)
 PLACE = Georeference("EPSG:25832", (295400.0, 5629200.0, 0.0), "EPSG:7837")
@@ -74,6 +75,17 @@ def test_encode_comments_have_the_place():
 def test_encode_class_without_faces_has_no_group(road_east, group):
     lines = obj.encode(hills(road_east=road_east), "tile.mtl", PLACE).decode().splitlines()
     assert [line for line in lines if line.startswith("g ")] == [f"g {group}"]
+
+
+def test_encode_deck_is_a_group_with_the_material_of_roads():
+    mesh, _ = Crossing((40.0, 30.0)).mesh()
+    text = obj.encode(mesh, "tile.mtl", PLACE).decode()
+    groups = {part.split()[0]: part.splitlines() for part in text.split("\ng ")[1:]}
+    assert list(groups) == ["road", "terrain", "level_1"]
+    assert groups["level_1"][1] == "usemtl road"
+    faces = [[int(k) - 1 for k in line.split()[1:]] for line in groups["level_1"][2:]]
+    np.testing.assert_array_equal(faces, mesh.faces[mesh.level == 1])
+    assert sum(len(lines) - 2 for lines in groups.values()) == len(mesh.faces)
 
 
 def test_encode_equal_meshes_give_equal_bytes():

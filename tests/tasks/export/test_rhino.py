@@ -8,6 +8,7 @@ from flexroad.tasks.export import rhino
 from flexroad.tasks.georeference import Georeference
 from flexroad.tasks.spline.surface import NurbsSurface, clamped_knots, uniform_knots
 from flexroad.tasks.types import Mesh
+from tests.crossing import Crossing
 
 BOUNDS = (295450.0, 5629200.0, 295800.0, 5629550.0)
 CORE = (295500.0, 5629250.0, 295750.0, 5629500.0)
@@ -73,6 +74,14 @@ def test_encode_meshes_read_back_are_exact():
         truth = (mesh.vertices + np.array([500, 150, 1500]))[mesh.faces[faces]]
         np.testing.assert_array_equal(points[corners], truth)
         assert part.IsValid
+
+
+def test_encode_deck_has_a_layer_of_its_own():
+    pytest.importorskip("rhino3dm")
+    mesh, _ = Crossing((40.0, 30.0)).mesh()
+    _, found = read(rhino.encode(mesh, None, CORE, PLACE))
+    faces = {"road": mesh.road & (mesh.level == 0), "terrain": ~mesh.road, "level 1": mesh.level == 1}
+    assert {name: len(part.Faces) for name, part in found.items()} == {k: v.sum() for k, v in faces.items()}
 
 
 def test_encode_document_has_place_and_layers():
