@@ -12,6 +12,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import XMLGenerator, escape
 from xml.sax.xmlreader import AttributesImpl
@@ -40,7 +41,7 @@ from flexroad.pipeline.worker.exports import (
     file_name,
     item_assets,
 )
-from flexroad.tasks.export.cog import BLOCK, Band
+from flexroad.tasks.export.cog import BLOCK, NAME_STYLE, Band, encode_style
 
 MAP = "tiles.geojson"
 MAP_COLUMNS = ("id", "state", "stale", "error", "seconds", "error_estimate_m", "flags", "finished")
@@ -131,7 +132,9 @@ def _union(bounds: Sequence[Bounds]) -> Bounds:
 
 
 def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
-    """Write a VRT for each raster of the main variant over the done tiles; return their kinds.
+    """Write a VRT and its style for QGIS for each raster of the main variant over the done tiles.
+
+    Their kinds are returned.
 
     Tiles without a common lattice, or without exported rasters, give none; older files are then removed.
 
@@ -144,6 +147,7 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
     written = []
     for kind in KINDS["cog"]:
         path = run.path / vrt_name(kind)
+        _write_style(run, kind, kind.band if grid else None)
         if grid is None or kind.band is None:
             remove(path)
             continue
@@ -152,6 +156,17 @@ def write_mosaics(run: Run, done: Sequence[Tile]) -> list[Kind]:
             _write_vrt(xml, grid, kind, kind.band, done, run.config.export.variants[0])
         written.append(kind)
     return written
+
+
+def _write_style(run: Run, kind: Kind, band: Band | None) -> None:
+    """Write the style of a mosaic for QGIS, or remove it; in a bucket QGIS would not look for it."""
+    if not isinstance(run.path, Path):
+        return
+    style = run.path / f"{kind.key}{NAME_STYLE}"
+    if band is None:
+        remove(style)
+    else:
+        write(style, encode_style(band), run.config.cluster.flush)
 
 
 def vrt_name(kind: Kind) -> str:

@@ -11,7 +11,7 @@
     RUN/failures.csv     one row per failure
     RUN/log.jsonl        one event per line
     RUN/collection.json  STAC collection of the done tiles
-    RUN/*.vrt            their rasters as mosaics
+    RUN/*.vrt            their rasters as mosaics; RUN/*.qml: their styles for QGIS
 """
 
 from __future__ import annotations

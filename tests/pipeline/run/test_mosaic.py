@@ -50,6 +50,17 @@ def test_mosaic_names_the_classes(done):
     assert names == ["outside", "measured", "dtm", "inferred"]
 
 
+def test_each_mosaic_has_its_style_beside_it(done):
+    """QGIS takes the style of the same name: heights as hillshade, classes with their meanings."""
+    styles = {path.stem: ET.parse(path).find("pipe/rasterrenderer") for path in done.path.glob("*.qml")}
+    assert {name: style.get("type") for name, style in styles.items()} == {
+        "height": "hillshade", "road": "paletted", "support": "paletted"
+    }  # fmt: skip
+    entries = {entry.get("value"): entry.get("label") for entry in styles["road"].iter("paletteEntry")}
+    assert entries["1"] == "Road that the surface follows"
+    assert {path.stem for path in done.path.glob("*.vrt")} == set(styles)
+
+
 def test_mosaic_of_some_tiles_has_nodata_elsewhere(done, tmp_path):
     moved = Run.open(shutil.copytree(done.path, tmp_path / "part"))
     tiles = [done.catalog.tiles[0], done.catalog.tiles[3]]
@@ -63,4 +74,4 @@ def test_tiles_of_different_lattices_have_no_mosaic(done, tmp_path):
     tiles = done.catalog.tiles
     shifted = replace(tiles[1], grid=replace(tiles[1].grid, west=tiles[1].grid.west + 0.5))
     assert write_mosaics(moved, [tiles[0], shifted]) == []
-    assert not list(moved.path.glob("*.vrt"))
+    assert not [*moved.path.glob("*.vrt"), *moved.path.glob("*.qml")]
